@@ -1,0 +1,60 @@
+"""Options, devices and dtypes shared by all tests."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+SCANS = Path(__file__).parents[2] / "shared" / "data"
+ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
+
+
+def pytest_addoption(parser):
+    parser.addoption("--device", default="cpu", help="cpu, cuda or all")
+    parser.addoption("--run-slow", action="store_true", help="run the tests marked slow too")
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("--run-slow"):
+        return
+    for item in items:
+        if "slow" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="slow; run with --run-slow"))
+
+
+def pytest_generate_tests(metafunc):
+    if "device" in metafunc.fixturenames:
+        asked = metafunc.config.getoption("--device")
+        names = ["cpu", "cuda"] if asked == "all" else [asked]
+        marks = [] if torch.cuda.is_available() else [pytest.mark.skip(reason="no CUDA device")]
+        metafunc.parametrize(
+            "device", [pytest.param(n, marks=marks if n == "cuda" else []) for n in names]
+        )
+    if "dtype" in metafunc.fixturenames:
+        metafunc.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
+
+
+@pytest.fixture
+def rng():
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def scan():
+    """Path of a real scan by name; the test is skipped where the scans are absent."""
+
+    def path_of(name):
+        path = SCANS / name
+        if not path.exists():
+            pytest.skip(f"needs the real scan {name}")
+        return path
+
+    return path_of
+
+
+@pytest.fixture
+def oracles_folder():
+    """Folder of reference values; the test is skipped where it is absent."""
+    if not ORACLES.exists():
+        pytest.skip("needs the reference values of other implementations")
+    return ORACLES

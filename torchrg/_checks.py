@@ -1,0 +1,111 @@
+"""Argument checks that never read tensor values, so they cost no device synchronisation."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg.errors import ShapeError
+
+
+def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
+    """Return a tensor as it is, and a NumPy array as a tensor that shares its memory.
+
+    Args:
+        caller: Name of the public function, the first word of the message.
+        name: Name of the argument.
+        values: What the user passed.
+
+    Returns:
+        A tensor; big-endian and read-only arrays are copied, everything else is shared.
+
+    Raises:
+        ShapeError: If ``values`` is neither a tensor nor a numeric NumPy array.
+
+    Example:
+        >>> as_tensor("f", "points", np.zeros((2, 3), dtype=np.float32)).dtype
+        torch.float32
+    """
+    if isinstance(values, Tensor):
+        return values
+    if isinstance(values, np.ndarray) and values.dtype.kind in "fiub":
+        native = values.astype(values.dtype.newbyteorder("="), copy=False)
+        return torch.from_numpy(np.require(native, requirements=["C", "W"]))
+    kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
+    raise ShapeError(f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}.")
+
+
+def check_floating(caller: str, **arguments: Tensor | None) -> None:
+    """Check that tensors hold float32 or float64, all the same.
+
+    Args:
+        caller: Name of the public function, the first word of the message.
+        **arguments: The tensors by argument name; None is skipped.
+
+    Raises:
+        ShapeError: If one does not, or if two differ in dtype or device.
+
+    Example:
+        >>> check_floating("f", points=torch.zeros(2, 3, dtype=torch.int64))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected points of float32 or float64, got int64.
+    """
+    given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
+    for name, tensor in given.items():
+        if tensor.dtype not in (torch.float32, torch.float64):
+            dtype = str(tensor.dtype).removeprefix("torch.")
+            raise ShapeError(f"{caller}: expected {name} of float32 or float64, got {dtype}.")
+    for what in ("dtype", "device"):
+        kinds = [str(getattr(tensor, what)).removeprefix("torch.") for tensor in given.values()]
+        if len(set(kinds)) > 1:
+            names = " and ".join(given)
+            raise ShapeError(
+                f"{caller}: expected {names} of one {what}, got {' and '.join(kinds)}."
+            )
+
+
+def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
+    """Check the axes of several tensors against patterns that share their letters.
+
+    A letter stands for one length, the same in every pattern; a number for that length; a leading
+    ``*`` for any leading axes, the same in every pattern. An argument that is None is skipped.
+
+    Args:
+        caller: Name of the public function, the first word of the message.
+        **arguments: For each argument name, its tensor and its pattern, as in ``(x, "* N 3")``.
+
+    Raises:
+        ShapeError: If a tensor does not match its pattern.
+
+    Example:
+        >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
+        >>> check_shapes("f", patches=(torch.zeros(5, 8, 2), "* K 3"))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected patches of shape (*, K, 3), got (5, 8, 2).
+    """
+    bound: dict[str, tuple[int, ...]] = {}
+    for name, (tensor, pattern) in arguments.items():
+        if tensor is None:
+            continue
+        shape, known = tuple(tensor.shape), dict(bound)
+        if not _bind(shape, pattern.split(), bound):
+            given = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in known.items())
+            expected = f"({', '.join(pattern.split())})" + (f" with {given}" if given else "")
+            raise ShapeError(f"{caller}: expected {name} of shape {expected}, got {shape}.")
+
+
+def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, ...]]) -> bool:
+    """Match a shape against axes, and note in ``bound`` the lengths met for the first time."""
+    fixed = axes[1:] if axes[0] == "*" else axes
+    split = len(shape) - len(fixed)
+    if split < 0 or (split > 0 and axes[0] != "*"):
+        return False
+    lengths = [(axis, (length,)) for axis, length in zip(fixed, shape[split:], strict=True)]
+    leading = [("*", shape[:split])] if axes[0] == "*" else []
+    return all(
+        length == ((int(axis),) if axis.isdigit() else bound.setdefault(axis, length))
+        for axis, length in [*leading, *lengths]
+    )

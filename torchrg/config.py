@@ -1,0 +1,209 @@
+"""All settings, their defaults and their meaning; files and flags hold only differences."""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from torchrg.errors import ConfigError
+
+NormalMethod = Literal[
+    "pca", "jet", "irls", "fastmcd", "mve", "detmcd", "detmm", "paper", "consensus"
+]
+DEFAULT_PRESET = "consensus"
+
+
+@dataclass(frozen=True)
+class NormalsConfig:
+    """How normals and curvature are estimated."""
+
+    method: NormalMethod = "paper"
+    """Estimator: one of the single fits of all points, or two stages (paper, consensus)."""
+    k: int = 50
+    """Number of neighbours, the point itself included. Smaller clouds use what they have."""
+    sharp_rule: Literal["qn", "percentile"] = "qn"
+    """Rule for sharp feature points: Qn of the angles to the neighbours' normals (eq. 9), or
+    their 25th percentile (Algorithm 1)."""
+    sharp_angle_deg: float = 5.0
+    """A point is sharp when its rule gives more than this angle."""
+    support_fraction: float = 0.5
+    """Share of the neighbours that the MCD fits, in [0.5, 1]; 0.5 resists most outliers."""
+    inlier_quantile: float = 0.975
+    """Neighbours within this chi-square quantile of the robust fit are inliers."""
+
+    def __post_init__(self) -> None:
+        _require(self, "k", ">= 3", self.k >= 3)
+        _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
+        _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
+        _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
+
+
+@dataclass(frozen=True)
+class GrowingConfig:
+    """How regions grow; the defaults are the paper's Algorithm 2."""
+
+    max_angle_deg: float = 5.0
+    """A neighbour joins when the angle between the normals is at most this."""
+    curvature_quantile: float = 0.95
+    """The curvature limit is this quantile of the curvatures of all valid points."""
+    seed_rule: Literal["curvature", "increment"] = "increment"
+    """A point that joined grows further when its curvature (PCL), or the difference of its
+    curvature to that of the point it joined (the paper), is at most the curvature limit."""
+    connectivity: float | None = 0.75
+    """Two points are connected when they share at least this fraction of their k neighbours.
+    None: not tested."""
+    connectivity_scope: Literal["region", "seed"] = "region"
+    """What an unconnected neighbour may not do: join the region (Algorithm 2), or only become a
+    seed (the paper's text)."""
+    coplanarity: bool = True
+    """Whether a neighbour joins only if its distance to the seed's plane is at most
+    median + 2 Qn of those of the neighbourhood (eq. 11)."""
+    coplanarity_scope: Literal["all", "connected"] = "all"
+    """Which neighbours that median and Qn are taken over: all, or those left by the
+    connectivity test (Algorithm 2)."""
+    min_size: int = 50
+    """Smaller regions are not labelled."""
+
+    def __post_init__(self) -> None:
+        _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
+        _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
+        within = self.connectivity is None or 0 <= self.connectivity <= 1
+        _require(self, "connectivity", "in [0, 1] or none", within)
+        _require(self, "min_size", ">= 1", self.min_size >= 1)
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """Everything that decides the result of :func:`torchrg.segment_planes`, and its memory."""
+
+    normals: NormalsConfig = field(default_factory=NormalsConfig)
+    """How normals and curvature are estimated."""
+    growing: GrowingConfig = field(default_factory=GrowingConfig)
+    """How regions grow."""
+    chunk_size: int = 16384
+    """Points handled at a time; bounds the memory of each stage, never changes a result."""
+
+    def __post_init__(self) -> None:
+        _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
+
+
+def preset_names() -> list[str]:
+    """Return the names of the presets that come with torchrg, sorted.
+
+    Example:
+        >>> "classic" in preset_names()
+        True
+    """
+    return sorted(path.stem for path in _preset_folder().glob("*.yaml"))
+
+
+def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
+    """Read settings from a preset or a YAML file; what it leaves out has its default.
+
+    Args:
+        name_or_file: A name from :func:`preset_names`, or the path of a ``.yaml`` file.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ConfigError: If there is no such preset or file, it is not YAML, or a key or value is wrong.
+
+    Example:
+        >>> load_config("classic").growing.seed_rule
+        'curvature'
+    """
+    import yaml
+
+    path = Path(name_or_file)
+    if path.suffix not in (".yaml", ".yml"):
+        path = _preset_folder() / f"{name_or_file}.yaml"
+        if not path.is_file():
+            raise ConfigError(
+                f"load_config: expected preset to be one of {', '.join(preset_names())} or a .yaml "
+                f"file, got {str(name_or_file)!r}."
+            )
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path}: expected YAML, got {reason}.") from error
+    return build_config(PipelineConfig, {} if values is None else values, where=str(path))
+
+
+def build_config(kind: type[Any], values: Any, *, where: str) -> Any:  # noqa: ANN401
+    """Make a settings object from nested mappings, and refuse keys and types it does not have.
+
+    Args:
+        kind: The dataclass.
+        values: Its values, as they came from a file.
+        where: File (and section) for messages.
+
+    Returns:
+        An instance of ``kind``.
+
+    Raises:
+        ConfigError: If a key is unknown or a value has the wrong type or range.
+
+    Example:
+        >>> build_config(GrowingConfig, {"max_angle": 5}, where="my.yaml: growing")
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ConfigError: my.yaml: growing: unknown key 'max_angle'; GrowingConfig has ...
+    """
+    hints = typing.get_type_hints(kind)
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where}: expected a mapping of settings, got {values!r}.")
+    filled: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in hints:
+            names = ", ".join(hints)
+            raise ConfigError(f"{where}: unknown key {key!r}; {kind.__name__} has {names}.")
+        if dataclasses.is_dataclass(hints[key]):
+            filled[key] = build_config(typing.cast(type, hints[key]), value, where=f"{where}: {key}")
+        else:
+            filled[key] = _checked(value, hints[key], f"{where}: {key}")
+    try:
+        return kind(**filled)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
+    """Return a value of the annotated type, or say what was expected."""
+    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for choice in choices:
+        if typing.get_origin(choice) is Literal:
+            if value in typing.get_args(choice):
+                return value
+        elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        elif type(value) is choice:
+            return value
+    allowed = [_spelled(choice) for choice in choices]
+    raise ConfigError(f"{where}: expected {' or '.join(allowed)}, got {value!r}.")
+
+
+def _spelled(choice: Any) -> str:  # noqa: ANN401
+    """Return a type as a user would write it."""
+    if typing.get_origin(choice) is Literal:
+        return "one of " + ", ".join(map(str, typing.get_args(choice)))
+    return "null" if choice is type(None) else str(choice.__name__)
+
+
+def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401
+    """Raise unless a setting is in its range."""
+    if not holds:
+        value = getattr(config, name)
+        raise ConfigError(f"{type(config).__name__}: expected {name} {requirement}, got {value!r}.")
+
+
+def _preset_folder() -> Path:
+    """Return the folder of the presets: inside an installed package, or beside it."""
+    inside = Path(__file__).parent / "presets"
+    return inside if inside.is_dir() else Path(__file__).parents[1] / "configs"

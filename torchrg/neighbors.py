@@ -1,0 +1,289 @@
+"""Exact nearest neighbours, and the canonical order of points that makes results order-free."""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.errors import ShapeError
+from torchrg.structures import Neighbors
+
+_QUERY_CHUNK = 65536
+_MORTON_BITS = 21
+
+
+def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
+    """Return an order of the points that depends on their coordinates alone.
+
+    Points are sorted along a Morton curve through the bounding box, within one cell of it
+    lexicographically; only exact duplicates keep the order they came in. It breaks ties between
+    equal distances, and points close in this order are close in space, which makes every later
+    gather faster.
+
+    Args:
+        points: Finite points, shape ``(N, 3)``.
+
+    Returns:
+        Row numbers, shape ``(N,)``, int64: ``points[order]`` is in canonical order.
+
+    Raises:
+        ShapeError: If the shape or dtype is not as above.
+
+    References:
+        [1] G. Morton. A computer oriented geodetic data base. IBM, 1966.
+
+    Example:
+        >>> canonical_order(torch.tensor([[3.0, 0, 0], [1, 0, 0], [2, 0, 0]])).tolist()
+        [1, 2, 0]
+    """
+    tensor = as_tensor("canonical_order", "points", points)
+    check_shapes("canonical_order", points=(tensor, "N 3"))
+    check_floating("canonical_order", points=tensor)
+    coordinates = tensor.detach().cpu().numpy()
+    if len(coordinates) == 0:
+        return torch.zeros(0, dtype=torch.int64, device=tensor.device)
+    codes = _morton_codes(coordinates)
+    order = np.argsort(codes, kind="stable")
+    codes = codes[order]
+    same = codes[1:] == codes[:-1]
+    if same.any():
+        tied = np.zeros(len(order), dtype=bool)
+        tied[1:] |= same
+        tied[:-1] |= same
+        rows = order[tied]
+        x, y, z = coordinates[rows].T
+        order[tied] = rows[np.lexsort((z, y, x, codes[tied]))]
+    return torch.from_numpy(order).to(tensor.device)
+
+
+def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.uint64]:
+    """Return the Morton code of each point in the cube about the cloud."""
+    low = coordinates.min(axis=0).astype(np.float64)
+    extent = float((coordinates.max(axis=0) - low).max())
+    codes = np.zeros(len(coordinates), dtype=np.uint64)
+    if extent == 0:
+        return codes
+    for axis in range(3):
+        relative = (coordinates[:, axis] - low[axis]) / extent
+        codes |= _spread_bits((relative * (2**_MORTON_BITS - 1)).astype(np.uint64)) << axis
+    return codes
+
+
+def _spread_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Put two zero bits between the bits of 21-bit numbers."""
+    for shift, pattern in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << shift) & pattern
+    return values
+
+
+def search_knn(
+    points: Tensor | NDArray[np.floating],
+    k: int,
+    *,
+    max_distance: float | None = None,
+    offset: Tensor | None = None,
+    canonical: bool = False,
+) -> Neighbors:
+    """Find the ``k`` nearest points of every point, exactly.
+
+    Convention:
+        ``k`` counts the point itself, which always stands first, duplicates or not. The others are
+        sorted by distance; equal distances by :func:`canonical_order`, never by the input order.
+        The search runs on the CPU with as many threads as torch uses.
+
+    Args:
+        points: Points, shape ``(N, 3)``, finite.
+        k: Number of neighbours, the point itself included.
+        max_distance: Neighbours farther than this do not count (``valid`` False, index: the point
+            itself): a hybrid search. In the unit of the cloud. Default: no limit.
+        offset: Ends of the clouds of a ragged batch, shape ``(B,)``, ascending, the last one ``N``
+            (Pointcept's convention); no neighbour crosses clouds. Default: one cloud.
+        canonical: Whether the points already are in canonical order; saves two passes.
+
+    Returns:
+        Indices of shape ``(N, k)``, int32, on the device of the points.
+
+    Raises:
+        ShapeError: If a shape or dtype is wrong, a point is not finite, or a cloud has fewer than
+            ``k`` points.
+
+    Example:
+        >>> search_knn(torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 2).indices.tolist()
+        [[0, 1], [1, 0], [2, 1]]
+    """
+    tensor = as_tensor("search_knn", "points", points)
+    check_shapes("search_knn", points=(tensor, "N 3"))
+    check_floating("search_knn", points=tensor)
+    coordinates = tensor.detach().cpu().numpy()
+    num_bad = len(coordinates) - int(np.isfinite(coordinates).all(axis=1).sum())
+    if num_bad:
+        raise ShapeError(
+            f"search_knn: expected finite points, got {num_bad:,} of {len(coordinates):,} with NaN "
+            "or Inf; leave them out first."
+        )
+    bounds = _cloud_bounds(offset, len(coordinates))
+    indices = np.empty((len(coordinates), k), dtype=np.int32)
+    outside = None if max_distance is None else np.empty(indices.shape, dtype=bool)
+    for start, stop in bounds:
+        if not 1 <= k <= stop - start:
+            raise ShapeError(
+                f"search_knn: expected k from 1 to the number of points ({stop - start:,}), got "
+                f"{k}; lower k or pass a larger cloud."
+            )
+        cloud = coordinates[start:stop]
+        order = None if canonical else canonical_order(cloud).numpy()
+        _search_cloud(
+            cloud if order is None else cloud[order],
+            order,
+            start,
+            math.inf if max_distance is None else max_distance,
+            indices[start:stop],
+            None if outside is None else outside[start:stop],
+        )
+    valid = None if outside is None else torch.from_numpy(~outside).to(tensor.device)
+    return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
+
+
+def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int]]:
+    """Return first and last row of each cloud of a ragged batch."""
+    if offset is None:
+        return [(0, num_points)]
+    ends = [int(end) for end in offset]
+    if not ends or ends[-1] != num_points or any(b < a for a, b in zip([0, *ends], ends)):
+        raise ShapeError(
+            f"search_knn: expected offset to ascend to the number of points ({num_points}), got "
+            f"{ends}."
+        )
+    return [(start, stop) for start, stop in zip([0, *ends[:-1]], ends) if stop > start]
+
+
+def _search_cloud(
+    points: NDArray[np.floating],
+    order: NDArray[np.int64] | None,
+    first_row: int,
+    max_distance: float,
+    indices: NDArray[np.int32],
+    outside: NDArray[np.bool_] | None,
+) -> None:
+    """Search one cloud in canonical order and write results in the caller's order.
+
+    The tree holds each distinct place once, and duplicates are put back afterwards: a place with
+    many points costs no more than a place with one.
+    """
+    from scipy.spatial import cKDTree
+
+    k = indices.shape[1]
+    is_first = np.ones(len(points), dtype=bool)
+    is_first[1:] = (points[1:] != points[:-1]).any(axis=1)
+    starts = np.flatnonzero(is_first)
+    counts = np.diff(starts, append=len(points))
+    places = points[starts]
+    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+    for begin in range(0, len(places), _QUERY_CHUNK):
+        stop = min(begin + _QUERY_CHUNK, len(places))
+        distances, found = _query(tree, places[begin:stop], min(k, len(places)))
+        rows = np.arange(starts[begin], starts[begin] + counts[begin:stop].sum())
+        if len(places) < len(points):
+            distances, found = _restore_duplicates(distances, found, starts, counts, begin, rows, k)
+        if outside is not None:
+            too_far = distances > max_distance
+            found = np.where(too_far, rows[:, None], found)
+        into = rows if order is None else order[rows]
+        indices[into] = (found if order is None else order[found]) + first_row
+        if outside is not None:
+            outside[into] = too_far
+
+
+def _query(
+    tree: "scipy.spatial.cKDTree",  # type: ignore[name-defined]  # noqa: F821
+    queries: NDArray[np.floating],
+    k: int,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the k nearest of distinct points by (distance, row), ties at the last place too."""
+    workers = torch.get_num_threads()
+    width = min(k + 1, tree.n)
+    distances, rows = tree.query(queries, np.arange(1, width + 1), workers=workers)
+    _sort_ties(distances, rows, np.arange(len(queries)))
+    open_end = np.flatnonzero(distances[:, k - 1] == distances[:, width - 1]) if width > k else []
+    distances, rows = distances[:, :k], rows[:, :k]
+    while len(open_end):
+        width = min(2 * width, tree.n)
+        far, more = tree.query(queries[open_end], np.arange(1, width + 1), workers=workers)
+        _sort_ties(far, more, np.arange(len(open_end)))
+        distances[open_end], rows[open_end] = far[:, :k], more[:, :k]
+        still = (far[:, k - 1] == far[:, -1]) if width < tree.n else np.zeros(len(far), dtype=bool)
+        open_end = open_end[still]
+    return distances, rows
+
+
+def _sort_ties(
+    distances: NDArray[np.float64], rows: NDArray[np.int64], queries: NDArray[np.int64]
+) -> None:
+    """Sort equal distances by row number, in place."""
+    tied = queries[(distances[:, 1:] == distances[:, :-1]).any(axis=1)]
+    if len(tied):
+        by_row = np.argsort(rows[tied], axis=1)
+        near = np.take_along_axis(distances[tied], by_row, axis=1)
+        by_both = np.take_along_axis(by_row, np.argsort(near, axis=1, kind="stable"), axis=1)
+        rows[tied] = np.take_along_axis(rows[tied], by_both, axis=1)
+
+
+def _restore_duplicates(
+    distances: NDArray[np.float64],
+    places: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    first_place: int,
+    rows: NDArray[np.int64],
+    k: int,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Replace distinct places by all their points, the nearest k of them, the point itself first."""
+    before = np.minimum(np.cumsum(counts[places], axis=1), k)
+    taken = np.diff(before, axis=1, prepend=0).ravel()
+    position = np.arange(len(places) * k) - np.repeat(
+        np.cumsum(taken) - taken, taken
+    )
+    found = (np.repeat(starts[places.ravel()], taken) + position).reshape(len(places), k)
+    far = np.repeat(distances.ravel(), taken).reshape(len(places), k)
+    own_place = np.repeat(np.arange(len(places)), counts[first_place : first_place + len(places)])
+    found, far = found[own_place], far[own_place]
+    rank = rows - starts[first_place + own_place]
+    later = np.flatnonzero(rank)
+    if len(later):
+        shift = np.arange(k) <= rank[later, None]
+        found[later] = np.where(shift, np.roll(found[later], 1, axis=1), found[later])
+        found[later, 0] = rows[later]
+    return far, found
+
+
+def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
+    """Return the coordinates of neighbours about the point itself.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        indices: Rows of the neighbours, shape ``(n, K)``; the first column is the point itself.
+
+    Returns:
+        Differences to the first neighbour, shape ``(n, K, 3)``. In memory each coordinate is
+        contiguous, so that ``patches.unbind(-1)`` gives fast columns.
+
+    Example:
+        >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
+        >>> gather_patches(points, torch.tensor([[0, 1]])).tolist()
+        [[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]]
+    """
+    flat = indices.reshape(-1)
+    patches = points.new_empty((3, *indices.shape))
+    for axis in range(3):
+        column = points[:, axis].index_select(0, flat).view(indices.shape)
+        torch.sub(column, column[:, :1], out=patches[axis])
+    return patches.movedim(0, -1)

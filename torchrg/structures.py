@@ -1,0 +1,103 @@
+"""What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+UNLABELED = -1
+"""Label of a point that belongs to no region."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A cloud as it was read: its coordinates untouched, and points fit for float32 arithmetic.
+
+    Args:
+        coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64. Non-finite
+            rows are kept.
+        fields: Further values of each point by name, each of shape ``(N, ...)``: for example
+            ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8).
+        grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
+        source: The file it came from, for messages.
+
+    Example:
+        >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
+        >>> cloud.points.tolist()
+        [[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]
+    """
+
+    coordinates: NDArray[np.floating]
+    fields: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
+    grid_shape: tuple[int, int] | None = None
+    source: str = ""
+
+    def __len__(self) -> int:
+        return len(self.coordinates)
+
+    @cached_property
+    def finite(self) -> NDArray[np.bool_]:
+        """Which points have three finite coordinates, shape ``(N,)``."""
+        finite: NDArray[np.bool_] = np.isfinite(self.coordinates).all(axis=1)
+        return finite
+
+    @cached_property
+    def origin(self) -> NDArray[np.float64]:
+        """Origin of :attr:`points`, shape ``(3,)``: zero, or the middle of a far cloud's box.
+
+        A cloud is far when moving it to its middle makes its largest coordinate less than a
+        quarter as large; a near cloud is left where it is, so that float32 files keep their
+        coordinates bit for bit.
+        """
+        kept = self.coordinates[self.finite]
+        if len(kept) == 0:
+            return np.zeros(3)
+        low, high = kept.min(axis=0).astype(np.float64), kept.max(axis=0).astype(np.float64)
+        middle = low + (high - low) / 2
+        reach, half_extent = np.abs([low, high]).max(), (high - low).max() / 2
+        return middle if half_extent * 4 < reach else np.zeros(3)
+
+    @cached_property
+    def points(self) -> Tensor:
+        """Coordinates about :attr:`origin`, shape ``(N, 3)``, float32; non-finite rows stay so."""
+        if self.coordinates.dtype == np.float32 and not self.origin.any():
+            return torch.from_numpy(np.ascontiguousarray(self.coordinates))
+        local = self.coordinates.astype(np.float64) - self.origin
+        return torch.from_numpy(local.astype(np.float32))
+
+
+class Neighbors(NamedTuple):
+    """The nearest points of each point; see :func:`torchrg.search_knn`.
+
+    Attributes:
+        indices: Rows of the neighbours, shape ``(N, K)``, int32. The first column is the point
+            itself, the rest is sorted by distance. Where ``valid`` is False: the point itself.
+        valid: Which entries are neighbours, shape ``(N, K)``, bool; None when all are.
+    """
+
+    indices: Tensor
+    valid: Tensor | None = None
+
+
+class NormalFit(NamedTuple):
+    """Normals and what else the fit of a plane to each neighbourhood gives.
+
+    Attributes:
+        normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero where not ``valid``.
+        curvature: Surface variation in [0, 1/3], shape ``(*)``; 0 where not ``valid``.
+        valid: Whether there is a plane, shape ``(*)``, bool.
+        sharp: Sharp feature points, shape ``(*)``, bool; None for methods of one stage.
+        residual_rms: Root mean square distance of the fitted points to the plane, shape ``(*)``, in the
+            unit of the cloud; 0 where not ``valid``.
+    """
+
+    normals: Tensor
+    curvature: Tensor
+    valid: Tensor
+    sharp: Tensor | None = None
+    residual_rms: Tensor | None = None
