@@ -1,6 +1,7 @@
-"""Exact nearest neighbours, and the canonical order of points that makes results order-free."""
+"""Exact nearest neighbours."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,80 +10,10 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
+from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
 _QUERY_CHUNK = 65536
-_MORTON_BITS = 21
-
-
-def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
-    """Return an order of the points that depends on their coordinates alone.
-
-    Points are sorted along a Morton curve through the bounding box, within one cell of it
-    lexicographically; only exact duplicates keep the order they came in. It breaks ties between
-    equal distances, and points close in this order are close in space, which makes every later
-    gather faster.
-
-    Args:
-        points: Finite points, shape ``(N, 3)``.
-
-    Returns:
-        Row numbers, shape ``(N,)``, int64: ``points[order]`` is in canonical order.
-
-    Raises:
-        ShapeError: If the shape or dtype is not as above.
-
-    References:
-        [1] G. Morton. A computer oriented geodetic data base. IBM, 1966.
-
-    Example:
-        >>> canonical_order(torch.tensor([[3.0, 0, 0], [1, 0, 0], [2, 0, 0]])).tolist()
-        [1, 2, 0]
-    """
-    tensor = as_tensor("canonical_order", "points", points)
-    check_shapes("canonical_order", points=(tensor, "N 3"))
-    check_floating("canonical_order", points=tensor)
-    coordinates = tensor.detach().cpu().numpy()
-    if len(coordinates) == 0:
-        return torch.zeros(0, dtype=torch.int64, device=tensor.device)
-    codes = _morton_codes(coordinates)
-    order = np.argsort(codes, kind="stable")
-    codes = codes[order]
-    same = codes[1:] == codes[:-1]
-    if same.any():
-        tied = np.zeros(len(order), dtype=bool)
-        tied[1:] |= same
-        tied[:-1] |= same
-        rows = order[tied]
-        x, y, z = coordinates[rows].T
-        order[tied] = rows[np.lexsort((z, y, x, codes[tied]))]
-    return torch.from_numpy(order).to(tensor.device)
-
-
-def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """Return the Morton code of each point in the cube about the cloud."""
-    low = coordinates.min(axis=0).astype(np.float64)
-    extent = float((coordinates.max(axis=0) - low).max())
-    codes = np.zeros(len(coordinates), dtype=np.uint64)
-    if extent == 0:
-        return codes
-    for axis in range(3):
-        relative = (coordinates[:, axis] - low[axis]) / extent
-        codes |= _spread_bits((relative * (2**_MORTON_BITS - 1)).astype(np.uint64)) << axis
-    return codes
-
-
-def _spread_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Put two zero bits between the bits of 21-bit numbers."""
-    for shift, pattern in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        values = (values | values << shift) & pattern
-    return values
 
 
 def search_knn(
@@ -204,7 +135,7 @@ def _search_cloud(
 
 
 def _query(
-    tree: "scipy.spatial.cKDTree",  # type: ignore[name-defined]  # noqa: F821
+    tree: Any,  # noqa: ANN401
     queries: NDArray[np.floating],
     k: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -249,9 +180,7 @@ def _restore_duplicates(
     """Replace distinct places by all their points, the nearest k of them, the point itself first."""
     before = np.minimum(np.cumsum(counts[places], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
-    position = np.arange(len(places) * k) - np.repeat(
-        np.cumsum(taken) - taken, taken
-    )
+    position = np.arange(len(places) * k) - np.repeat(np.cumsum(taken) - taken, taken)
     found = (np.repeat(starts[places.ravel()], taken) + position).reshape(len(places), k)
     far = np.repeat(distances.ravel(), taken).reshape(len(places), k)
     own_place = np.repeat(np.arange(len(places)), counts[first_place : first_place + len(places)])
@@ -263,27 +192,3 @@ def _restore_duplicates(
         found[later] = np.where(shift, np.roll(found[later], 1, axis=1), found[later])
         found[later, 0] = rows[later]
     return far, found
-
-
-def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
-    """Return the coordinates of neighbours about the point itself.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        indices: Rows of the neighbours, shape ``(n, K)``; the first column is the point itself.
-
-    Returns:
-        Differences to the first neighbour, shape ``(n, K, 3)``. In memory each coordinate is
-        contiguous, so that ``patches.unbind(-1)`` gives fast columns.
-
-    Example:
-        >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
-        >>> gather_patches(points, torch.tensor([[0, 1]])).tolist()
-        [[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]]
-    """
-    flat = indices.reshape(-1)
-    patches = points.new_empty((3, *indices.shape))
-    for axis in range(3):
-        column = points[:, axis].index_select(0, flat).view(indices.shape)
-        torch.sub(column, column[:, :1], out=patches[axis])
-    return patches.movedim(0, -1)

@@ -1,0 +1,117 @@
+"""The canonical order of points, which makes every result independent of the input order."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+
+_MORTON_BITS = 21
+
+
+def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
+    """Return an order of the points that depends on their coordinates alone.
+
+    Points are sorted along a Morton curve through the bounding box, within one cell of it
+    lexicographically; only exact duplicates keep the order they came in. It breaks ties between
+    equal distances, and points close in this order are close in space, which makes every later
+    gather faster.
+
+    Args:
+        points: Finite points, shape ``(N, 3)``.
+
+    Returns:
+        Row numbers, shape ``(N,)``, int64: ``points[order]`` is in canonical order.
+
+    Raises:
+        ShapeError: If the shape or dtype is not as above.
+
+    References:
+        [1] G. Morton. A computer oriented geodetic data base. IBM, 1966.
+
+    Example:
+        >>> canonical_order(torch.tensor([[3.0, 0, 0], [1, 0, 0], [2, 0, 0]])).tolist()
+        [1, 2, 0]
+    """
+    tensor = as_tensor("canonical_order", "points", points)
+    check_shapes("canonical_order", points=(tensor, "N 3"))
+    check_floating("canonical_order", points=tensor)
+    coordinates = tensor.detach().cpu().numpy()
+    if len(coordinates) == 0:
+        return torch.zeros(0, dtype=torch.int64, device=tensor.device)
+    codes = _morton_codes(coordinates)
+    order = np.argsort(codes, kind="stable")
+    codes = codes[order]
+    same = codes[1:] == codes[:-1]
+    if same.any():
+        tied = np.zeros(len(order), dtype=bool)
+        tied[1:] |= same
+        tied[:-1] |= same
+        rows = order[tied]
+        x, y, z = coordinates[rows].T
+        order[tied] = rows[np.lexsort((z, y, x, codes[tied]))]
+    return torch.from_numpy(order).to(tensor.device)
+
+
+def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.uint64]:
+    """Return the Morton code of each point in the cube about the cloud."""
+    low = coordinates.min(axis=0).astype(np.float64)
+    extent = float((coordinates.max(axis=0) - low).max())
+    codes = np.zeros(len(coordinates), dtype=np.uint64)
+    if extent == 0:
+        return codes
+    for axis in range(3):
+        relative = (coordinates[:, axis] - low[axis]) / extent
+        codes |= _spread_bits((relative * (2**_MORTON_BITS - 1)).astype(np.uint64)) << axis
+    return codes
+
+
+def _spread_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Put two zero bits between the bits of 21-bit numbers."""
+    for shift, pattern in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << shift) & pattern
+    return values
+
+
+def finite_rows(points: Tensor) -> Tensor:
+    """Return the rows of the finite points, in canonical order.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+
+    Returns:
+        Row numbers, shape ``(n,)``, int64.
+
+    Example:
+        >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
+        [2, 0]
+    """
+    rows = points.isfinite().all(dim=-1).nonzero().squeeze(-1)
+    return rows[canonical_order(points[rows])]
+
+
+def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
+    """Return values at the rows they belong to, and a filling at all others.
+
+    Args:
+        values: Shape ``(n, ...)``.
+        rows: Row of each value, shape ``(n,)``.
+        num_points: Length of the result.
+        fill: What the other rows hold.
+
+    Returns:
+        Shape ``(num_points, ...)``.
+
+    Example:
+        >>> restore_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()
+        [8, -1, 7]
+    """
+    result = values.new_full((num_points, *values.shape[1:]), fill)
+    return result.index_copy_(0, rows, values)

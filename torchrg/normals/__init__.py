@@ -1,0 +1,95 @@
+"""Normals and curvature of clouds: one call for every estimator."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.config import NormalMethod, NormalsConfig
+from torchrg.errors import ConfigError
+from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.normals.detmcd import fit_normals_detmcd
+from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.sharp import find_sharp_points
+from torchrg.normals.staged import estimate_paper
+from torchrg.structures import Neighbors, NormalFit
+
+__all__ = [
+    "ESTIMATORS",
+    "estimate_normals",
+    "find_sharp_points",
+    "fit_normals_detmcd",
+    "fit_normals_pca",
+]
+
+Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
+
+ESTIMATORS: dict[str, Estimator] = {"paper": estimate_paper}
+"""Estimators by name: points, their neighbours, settings, chunk size -> fit."""
+
+
+def estimate_normals(
+    points: Tensor | NDArray[np.floating],
+    *,
+    method: NormalMethod | None = None,
+    k: int | None = None,
+    neighbors: Neighbors | None = None,
+    max_distance: float | None = None,
+    config: NormalsConfig | None = None,
+    chunk_size: int = 16384,
+) -> NormalFit:
+    """Estimate normal and curvature of every point of a cloud.
+
+    Args:
+        points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
+        method: A name from :data:`ESTIMATORS`. Default: that of ``config``.
+        k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud with
+            fewer points uses those it has.
+        neighbors: Neighbours found before, for finite points. Default: searched.
+        max_distance: Neighbours farther than this do not count: a hybrid search. In the unit of the
+            cloud. Default: no limit.
+        config: Further settings. Default: :class:`torchrg.config.NormalsConfig`.
+        chunk_size: Points handled at a time; bounds memory, changes no result.
+
+    Returns:
+        The fit in the order of the points.
+
+    Raises:
+        ConfigError: If ``method`` is unknown or a setting is out of range.
+        ShapeError: If a shape or dtype is not as above.
+
+    Example:
+        >>> floor = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+        >>> floor[:, 2] = 1.5
+        >>> estimate_normals(floor, method="pca", k=20).normals.abs()[0]
+        tensor([0., 0., 1.])
+    """
+    tensor = as_tensor("estimate_normals", "points", points)
+    check_shapes("estimate_normals", points=(tensor, "N 3"))
+    check_floating("estimate_normals", points=tensor)
+    settings = config or NormalsConfig()
+    changes = {"method": method, "k": k}
+    given = {name: value for name, value in changes.items() if value is not None}
+    settings = dataclasses.replace(settings, **given)  # type: ignore[arg-type]
+    if settings.method not in ESTIMATORS:
+        names = ", ".join(sorted(ESTIMATORS))
+        raise ConfigError(
+            f"estimate_normals: expected method to be one of {names}, got {settings.method!r}."
+        )
+    estimate = ESTIMATORS[settings.method]
+    if neighbors is not None:
+        return estimate(tensor, neighbors, settings, chunk_size)
+    rows = finite_rows(tensor)
+    cloud = tensor[rows]
+    if len(cloud) == 0:
+        neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=tensor.device))
+    else:
+        size = min(settings.k, len(cloud))
+        neighbors = search_knn(cloud, size, max_distance=max_distance, canonical=True)
+    fit = estimate(cloud, neighbors, settings, chunk_size)
+    parts = [None if part is None else restore_rows(part, rows, len(tensor)) for part in fit]
+    return NormalFit(*parts)  # type: ignore[arg-type]

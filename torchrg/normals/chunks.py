@@ -1,0 +1,68 @@
+"""Run an estimator of patches over the points of a cloud, a block at a time."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrg.neighbors import gather_patches
+from torchrg.structures import Neighbors, NormalFit
+
+FitPatches = Callable[[Tensor, Tensor | None, Tensor], NormalFit]
+"""Patches ``(n, K, 3)``, mask ``(n, K)`` or None, resolution ``(n,)`` -> fit."""
+
+
+def fit_points(
+    points: Tensor,
+    neighbors: Neighbors,
+    fit: FitPatches,
+    *,
+    rows: Tensor | None = None,
+    chunk_size: int = 16384,
+) -> NormalFit:
+    """Fit the neighbourhoods of some points of a cloud, with bounded memory.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        neighbors: Neighbours of all points.
+        fit: Estimator of a block of patches.
+        rows: Points to fit, shape ``(n,)``. Default: all.
+        chunk_size: Patches in memory at a time; changes no result.
+
+    Returns:
+        Normals, curvature, validity and residual of those points.
+
+    Example:
+        >>> from torchrg.normals.pca import fit_normals_pca
+        >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
+        >>> fit = lambda patches, mask, size: fit_normals_pca(patches, mask, resolution=size)
+        >>> fit_points(points, neighbors, fit).normals.abs()[0]
+        tensor([0., 0., 1.])
+    """
+    num_rows = len(points) if rows is None else len(rows)
+    blocks = []
+    for start in range(0, max(num_rows, 1), chunk_size):
+        block = (
+            slice(start, start + chunk_size) if rows is None else rows[start : start + chunk_size]
+        )
+        indices = neighbors.indices[block]
+        mask = None if neighbors.valid is None else neighbors.valid[block]
+        patches = gather_patches(points, indices)
+        result = fit(patches, mask, coordinate_resolution(points[block]))
+        blocks.append((result.normals, result.curvature, result.valid, result.residual_rms))
+    normals, curvature, valid, residual = (
+        torch.cat([part[i] for part in blocks])
+        for i in range(4)  # type: ignore[misc]
+    )
+    return NormalFit(normals, curvature, valid, residual_rms=residual)
+
+
+def coordinate_resolution(points: Tensor) -> Tensor:
+    """Return the rounding of coordinate differences at each point, shape ``(N,)``.
+
+    Example:
+        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
+        tensor([True])
+    """
+    return points.abs().amax(dim=-1) * (4 * torch.finfo(points.dtype).eps)

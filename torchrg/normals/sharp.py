@@ -1,0 +1,116 @@
+"""Sharp feature points: where the normals of a neighbourhood disagree."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchrg.errors import ConfigError
+from torchrg.linalg import sq_chord_to_deg
+from torchrg.robust.scale import QN_FACTOR, qn_exceeds
+from torchrg.structures import Neighbors
+
+
+def find_sharp_points(
+    normals: Tensor,
+    neighbors: Neighbors,
+    *,
+    valid: Tensor | None = None,
+    rule: Literal["qn", "percentile"] = "qn",
+    angle_deg: float = 5.0,
+    chunk_size: int = 16384,
+) -> Tensor:
+    r"""Tell sharp feature points from regular ones by the angles to their neighbours' normals.
+
+    With ``a_j`` the angle between the normals of a point and of its j-th neighbour (the point itself
+    included, with angle 0), a point is sharp if ``Qn(a) > angle_deg`` (``"qn"``, eq. 9), or if the
+    25th percentile of ``a``, the ``ceil(K/4)``-th smallest, exceeds it (``"percentile"``,
+    Algorithm 1).
+
+    Args:
+        normals: Unit normals of any sign, shape ``(N, 3)``.
+        neighbors: Neighbours of each point.
+        valid: Points that have a normal, shape ``(N,)``; the others do not count as neighbours and
+            are sharp themselves, so that a robust fit may find them one. Default: all.
+        rule: See above.
+        angle_deg: Limit in degrees.
+        chunk_size: Points handled at a time.
+
+    Returns:
+        Shape ``(N,)``, bool.
+
+    Raises:
+        ConfigError: If ``rule`` is unknown.
+
+    Example:
+        >>> normals = torch.tensor([[0.0, 0, 1]] * 3 + [[1.0, 0, 0]] * 3)
+        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2, 3], [2, 3, 4, 5]]))
+        >>> find_sharp_points(normals, neighbors)
+        tensor([False,  True])
+    """
+    if rule not in ("qn", "percentile"):
+        raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
+    columns = normals.T.contiguous()
+    sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
+    for start in range(0, len(sharp), chunk_size):
+        block = slice(start, start + chunk_size)
+        indices = neighbors.indices[block]
+        counted = None if neighbors.valid is None else neighbors.valid[block]
+        if valid is not None:
+            has_normal = valid.index_select(0, indices.reshape(-1)).view(indices.shape)
+            counted = has_normal if counted is None else counted & has_normal
+        sq_chords = _sq_chords(columns, indices)
+        if rule == "qn":
+            sharp[block] = _qn_exceeds(sq_chords, counted, angle_deg)
+        else:
+            sharp[block] = _percentile_exceeds(sq_chords, counted, angle_deg)
+    return sharp if valid is None else sharp | ~valid
+
+
+def _sq_chords(columns: Tensor, indices: Tensor) -> Tensor:
+    """Return squared chords between the normals of points and of their neighbours, without sign."""
+    flat = indices.reshape(-1)
+    gathered = [column.index_select(0, flat).view(indices.shape) for column in columns]
+    own = [component[:, :1] for component in gathered]
+    dot = own[0] * gathered[0]
+    for a, b in zip(own[1:], gathered[1:], strict=True):
+        dot += a * b
+    sign = torch.where(dot < 0, -1.0, 1.0).to(columns.dtype)
+    result = torch.zeros_like(dot)
+    for a, b in zip(own, gathered, strict=True):
+        difference = b * sign - a
+        result += difference.mul_(difference)
+    return result
+
+
+def _sq_chord_of(angle_deg: float) -> float:
+    """Return the squared chord of an angle."""
+    return (2 * math.sin(math.radians(angle_deg) / 2)) ** 2
+
+
+def _qn_exceeds(sq_chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
+    """Return whether Qn of the angles exceeds the limit.
+
+    If the majority of the angles lies within one difference of zero, all their pairs do, and they are
+    enough: most points of a room are settled by counting, and only the rest needs angles.
+    """
+    near = sq_chords <= _sq_chord_of(angle_deg / QN_FACTOR)
+    if counted is None:
+        majority: Tensor | int = sq_chords.shape[-1] // 2 + 1
+    else:
+        near &= counted
+        majority = counted.sum(dim=-1) // 2 + 1
+    exceeds = near.sum(dim=-1) < majority
+    rows = exceeds.nonzero().squeeze(-1)
+    mask = None if counted is None else counted[rows]
+    exceeds[rows] = qn_exceeds(sq_chord_to_deg(sq_chords[rows]), angle_deg, mask=mask)
+    return exceeds
+
+
+def _percentile_exceeds(sq_chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
+    """Return whether fewer than a quarter of the angles are within the limit."""
+    within = sq_chords <= _sq_chord_of(angle_deg)
+    if counted is None:
+        return within.sum(dim=-1) * 4 < sq_chords.shape[-1]
+    return (within & counted).sum(dim=-1) * 4 < counted.sum(dim=-1)
