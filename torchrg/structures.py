@@ -1,6 +1,6 @@
 """What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -91,13 +91,70 @@ class NormalFit(NamedTuple):
         normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(*)``; 0 where not ``valid``.
         valid: Whether there is a plane, shape ``(*)``, bool.
+        residual_rms: Root mean square distance of the fitted points to the plane, shape ``(*)``,
+            in the unit of the cloud; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(*)``, bool; None for methods of one stage.
-        residual_rms: Root mean square distance of the fitted points to the plane, shape ``(*)``, in the
-            unit of the cloud; 0 where not ``valid``.
     """
 
     normals: Tensor
     curvature: Tensor
     valid: Tensor
+    residual_rms: Tensor
     sharp: Tensor | None = None
-    residual_rms: Tensor | None = None
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
+        """Return a fit whose tensors are changed by one function, None left alone.
+
+        Example:
+            >>> three = torch.zeros(3)
+            >>> NormalFit(torch.zeros(3, 3), three, three, three).each(lambda x: x[:2]).valid
+            tensor([0., 0.])
+        """
+        sharp = None if self.sharp is None else change(self.sharp)
+        return NormalFit(*(change(part) for part in self[:4]), sharp=sharp)
+
+
+class Planes(NamedTuple):
+    """The plane table: one row for each region, in the order of the labels.
+
+    Lengths are in the unit of the cloud. Values are computed in float64 and given in the dtype of the
+    points.
+
+    Attributes:
+        normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not zero
+            positive.
+        offset: Signed distance of the plane from the origin, shape ``(M,)``: a point x of the plane has
+            ``normal . x = offset``.
+        centroid: Mean of the region's points, shape ``(M, 3)``.
+        area: Area that the points cover on the plane, shape ``(M,)``.
+        count: Number of points, shape ``(M,)``, int64.
+        rms: Root mean square distance of the points to the plane, shape ``(M,)``.
+    """
+
+    normal: Tensor
+    offset: Tensor
+    centroid: Tensor
+    area: Tensor
+    count: Tensor
+    rms: Tensor
+
+
+class Segmentation(NamedTuple):
+    """What :func:`torchrg.segment_planes` returns: labels, normals, and the plane table.
+
+    Attributes:
+        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or
+            :data:`UNLABELED`.
+        normals: Unit normals of arbitrary sign, shape ``(N, 3)``; zero where not ``valid``.
+        curvature: Surface variation in [0, 1/3], shape ``(N,)``; 0 where not ``valid``.
+        sharp: Sharp feature points, shape ``(N,)``, bool.
+        valid: Points that are finite and have a normal, shape ``(N,)``, bool.
+        planes: The plane table, M rows.
+    """
+
+    labels: Tensor
+    normals: Tensor
+    curvature: Tensor
+    sharp: Tensor
+    valid: Tensor
+    planes: Planes
