@@ -6,10 +6,11 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from torchrg.errors import ConfigError
 
+Settings = TypeVar("Settings")
 NormalMethod = Literal[
     "pca", "jet", "irls", "fastmcd", "mve", "detmcd", "detmm", "paper", "consensus"
 ]
@@ -136,7 +137,7 @@ def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
     return build_config(PipelineConfig, {} if values is None else values, where=str(path))
 
 
-def build_config(kind: type[Any], values: Any, *, where: str) -> Any:  # noqa: ANN401
+def build_config(kind: type[Settings], values: object, *, where: str) -> Settings:
     """Make a settings object from nested mappings, and refuse keys and types it does not have.
 
     Args:
@@ -165,7 +166,9 @@ def build_config(kind: type[Any], values: Any, *, where: str) -> Any:  # noqa: A
             names = ", ".join(hints)
             raise ConfigError(f"{where}: unknown key {key!r}; {kind.__name__} has {names}.")
         if dataclasses.is_dataclass(hints[key]):
-            filled[key] = build_config(typing.cast(type, hints[key]), value, where=f"{where}: {key}")
+            filled[key] = build_config(
+                typing.cast(type, hints[key]), value, where=f"{where}: {key}"
+            )
         else:
             filled[key] = _checked(value, hints[key], f"{where}: {key}")
     try:

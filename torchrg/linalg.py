@@ -41,7 +41,8 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 
     Args:
         patches: Points, shape ``(*, K, P)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything. Default: all.
+        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything. Default:
+            all.
 
     Returns:
         The mean ``(*, P)`` and the covariance ``(*, P, P)``. A patch without points has zeros.
@@ -94,17 +95,17 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     r"""Eigen-decompose symmetric 3x3 matrices by a fixed number of Jacobi rotations.
 
-    Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise, so it
-    runs at the speed of memory on any device, where ``torch.linalg.eigh`` on tiny matrices is slow
-    on the CPU and much slower on a GPU. Cyclic Jacobi keeps eigenvectors orthogonal to rounding even
-    for equal eigenvalues, which closed formulas with ``acos`` do not.
+    Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise, so
+    it runs at the speed of memory on any device, where ``torch.linalg.eigh`` on tiny matrices is
+    slow on the CPU and much slower on a GPU. Cyclic Jacobi keeps eigenvectors orthogonal to
+    rounding even for equal eigenvalues, which closed formulas with ``acos`` do not.
 
     Args:
         matrices: Symmetric matrices, shape ``(*, 3, 3)``; only the upper triangle is read.
 
     Returns:
-        Eigenvalues in ascending order ``(*, 3)`` and unit eigenvectors as columns ``(*, 3, 3)``. Signs
-        are arbitrary. Gradients do not flow well through repeated eigenvalues.
+        Eigenvalues in ascending order ``(*, 3)`` and unit eigenvectors as columns ``(*, 3, 3)``.
+        Signs are arbitrary. Gradients do not flow well through repeated eigenvalues.
 
     Raises:
         ShapeError: If the shape or dtype is not as above.

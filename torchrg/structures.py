@@ -111,7 +111,8 @@ class NormalFit(NamedTuple):
             tensor([0., 0.])
         """
         sharp = None if self.sharp is None else change(self.sharp)
-        return NormalFit(*(change(part) for part in self[:4]), sharp=sharp)
+        normals, curvature, valid, residual_rms = (change(part) for part in self[:4])
+        return NormalFit(normals, curvature, valid, residual_rms, sharp)
 
 
 class Planes(NamedTuple):

@@ -1,5 +1,6 @@
 """Exact nearest neighbours."""
 
+import itertools
 import math
 from typing import Any
 
@@ -89,12 +90,13 @@ def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int
     if offset is None:
         return [(0, num_points)]
     ends = [int(end) for end in offset]
-    if not ends or ends[-1] != num_points or any(b < a for a, b in zip([0, *ends], ends)):
+    bounds = list(itertools.pairwise([0, *ends]))
+    if not ends or ends[-1] != num_points or any(stop < start for start, stop in bounds):
         raise ShapeError(
             f"search_knn: expected offset to ascend to the number of points ({num_points}), got "
             f"{ends}."
         )
-    return [(start, stop) for start, stop in zip([0, *ends[:-1]], ends) if stop > start]
+    return [(start, stop) for start, stop in bounds if stop > start]
 
 
 def _search_cloud(
@@ -144,7 +146,7 @@ def _query(
     width = min(k + 1, tree.n)
     distances, rows = tree.query(queries, np.arange(1, width + 1), workers=workers)
     _sort_ties(distances, rows, np.arange(len(queries)))
-    open_end = np.flatnonzero(distances[:, k - 1] == distances[:, width - 1]) if width > k else []
+    open_end = np.flatnonzero((distances[:, k - 1] == distances[:, -1]) & (width > k))
     distances, rows = distances[:, :k], rows[:, :k]
     while len(open_end):
         width = min(2 * width, tree.n)
@@ -177,7 +179,7 @@ def _restore_duplicates(
     rows: NDArray[np.int64],
     k: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Replace distinct places by all their points, the nearest k of them, the point itself first."""
+    """Replace places by all their points: the nearest k, the point itself first."""
     before = np.minimum(np.cumsum(counts[places], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
     position = np.arange(len(places) * k) - np.repeat(np.cumsum(taken) - taken, taken)

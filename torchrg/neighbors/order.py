@@ -63,12 +63,15 @@ def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.uint64]:
         return codes
     for axis in range(3):
         relative = (coordinates[:, axis] - low[axis]) / extent
-        codes |= _spread_bits((relative * (2**_MORTON_BITS - 1)).astype(np.uint64)) << axis
+        codes |= _spread_bits((relative * (2**_MORTON_BITS - 1)).astype(np.uint64)) << np.uint64(
+            axis
+        )
     return codes
 
 
 def _spread_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Put two zero bits between the bits of 21-bit numbers."""
+    result = values
     for shift, pattern in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -76,8 +79,8 @@ def _spread_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        values = (values | values << shift) & pattern
-    return values
+        result = (result | result << np.uint64(shift)) & np.uint64(pattern)
+    return result
 
 
 def finite_rows(points: Tensor) -> Tensor:

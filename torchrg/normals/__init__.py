@@ -47,8 +47,8 @@ def estimate_normals(
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
         method: A name from :data:`ESTIMATORS`. Default: that of ``config``.
-        k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud with
-            fewer points uses those it has.
+        k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud
+            with fewer points uses those it has.
         neighbors: Neighbours found before, for finite points. Default: searched.
         max_distance: Neighbours farther than this do not count: a hybrid search. In the unit of the
             cloud. Default: no limit.
@@ -91,5 +91,4 @@ def estimate_normals(
         size = min(settings.k, len(cloud))
         neighbors = search_knn(cloud, size, max_distance=max_distance, canonical=True)
     fit = estimate(cloud, neighbors, settings, chunk_size)
-    parts = [None if part is None else restore_rows(part, rows, len(tensor)) for part in fit]
-    return NormalFit(*parts)  # type: ignore[arg-type]
+    return fit.each(lambda part: restore_rows(part, rows, len(tensor)))

@@ -49,13 +49,11 @@ def fit_points(
         indices = neighbors.indices[block]
         mask = None if neighbors.valid is None else neighbors.valid[block]
         patches = gather_patches(points, indices)
-        result = fit(patches, mask, coordinate_resolution(points[block]))
-        blocks.append((result.normals, result.curvature, result.valid, result.residual_rms))
-    normals, curvature, valid, residual = (
-        torch.cat([part[i] for part in blocks])
-        for i in range(4)  # type: ignore[misc]
+        blocks.append(fit(patches, mask, coordinate_resolution(points[block])))
+    normals, curvature, valid, residual_rms = (
+        torch.cat(parts) for parts in list(zip(*blocks, strict=True))[:4]
     )
-    return NormalFit(normals, curvature, valid, residual_rms=residual)
+    return NormalFit(normals, curvature, valid, residual_rms)
 
 
 def coordinate_resolution(points: Tensor) -> Tensor:

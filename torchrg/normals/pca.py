@@ -13,8 +13,8 @@ def fit_normals_pca(
 ) -> NormalFit:
     r"""Fit a plane to each patch by least squares and return its normal.
 
-    The normal is the eigenvector of the smallest eigenvalue ``l0`` of the covariance [1], eq. (1); the
-    curvature is the surface variation ``l0 / (l0 + l1 + l2)`` [2], eq. (2).
+    The normal is the eigenvector of the smallest eigenvalue ``l0`` of the covariance [1], eq. (1);
+    the curvature is the surface variation ``l0 / (l0 + l1 + l2)`` [2], eq. (2).
 
     Convention:
         The sign of a normal is arbitrary. Gradients flow through normals, curvature and residual,
@@ -70,8 +70,8 @@ def _spans_a_plane(
 ) -> Tensor:
     """Return whether the second direction of each patch is more than rounding.
 
-    A covariance holds squares, so its own rounding hides widths below 1e-3 of the length in float32;
-    the few patches as narrow as that are decided in double precision.
+    A covariance holds squares, so its own rounding hides widths below 1e-3 of the length in
+    float32; the few patches as narrow as that are decided in double precision.
     """
     num_points = patches.shape[-2]
     longest, second = values[..., 2], values[..., 1]

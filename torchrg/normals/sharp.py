@@ -23,9 +23,9 @@ def find_sharp_points(
 ) -> Tensor:
     r"""Tell sharp feature points from regular ones by the angles to their neighbours' normals.
 
-    With ``a_j`` the angle between the normals of a point and of its j-th neighbour (the point itself
-    included, with angle 0), a point is sharp if ``Qn(a) > angle_deg`` (``"qn"``, eq. 9), or if the
-    25th percentile of ``a``, the ``ceil(K/4)``-th smallest, exceeds it (``"percentile"``,
+    With ``a_j`` the angle between the normals of a point and of its j-th neighbour (the point
+    itself included, with angle 0), a point is sharp if ``Qn(a) > angle_deg`` (``"qn"``, eq. 9), or
+    if the 25th percentile of ``a``, the ``ceil(K/4)``-th smallest, exceeds it (``"percentile"``,
     Algorithm 1).
 
     Args:
@@ -92,7 +92,8 @@ def _sq_chord_of(angle_deg: float) -> float:
 def _qn_exceeds(sq_chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
     """Return whether Qn of the angles exceeds the limit.
 
-    If the majority of the angles lies within one difference of zero, all their pairs do, and they are
+    If the majority of the angles lies within one difference of zero, all their pairs do, and they
+    are
     enough: most points of a room are settled by counting, and only the rest needs angles.
     """
     near = sq_chords <= _sq_chord_of(angle_deg / QN_FACTOR)

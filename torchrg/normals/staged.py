@@ -53,15 +53,14 @@ def replace_rows(fit: NormalFit, rows: Tensor, refined: NormalFit) -> NormalFit:
 
     Example:
         >>> import torch
-        >>> flat = NormalFit(torch.zeros(3, 3), torch.zeros(3), torch.zeros(3, dtype=torch.bool))
-        >>> one = NormalFit(torch.ones(1, 3), torch.ones(1), torch.ones(1, dtype=torch.bool))
+        >>> flat = NormalFit(torch.zeros(3, 3), *torch.zeros(3, 3))
+        >>> one = NormalFit(torch.ones(1, 3), *torch.ones(3, 1))
         >>> replace_rows(flat, torch.tensor([1]), one).curvature
         tensor([0., 1., 0.])
     """
-    parts = zip(fit, refined, strict=True)
-    return NormalFit(
-        *(old if old is None or new is None else old.index_copy(0, rows, new) for old, new in parts)  # type: ignore[arg-type]
-    )
+    merged = [old.index_copy(0, rows, new) for old, new in zip(fit[:4], refined[:4], strict=True)]
+    normals, curvature, valid, residual_rms = merged
+    return NormalFit(normals, curvature, valid, residual_rms, fit.sharp)
 
 
 def _fit_pca(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
