@@ -118,14 +118,14 @@ class NormalFit(NamedTuple):
 class Planes(NamedTuple):
     """The plane table: one row for each region, in the order of the labels.
 
-    Lengths are in the unit of the cloud. Values are computed in float64 and given in the dtype of the
-    points.
+    Lengths are in the unit of the cloud. Values are computed in float64 and given in the dtype of
+    the points.
 
     Attributes:
-        normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not zero
-            positive.
-        offset: Signed distance of the plane from the origin, shape ``(M,)``: a point x of the plane has
-            ``normal . x = offset``.
+        normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not
+            zero positive.
+        offset: Signed distance of the plane from the origin, shape ``(M,)``: a point x of the plane
+            has ``normal . x = offset``.
         centroid: Mean of the region's points, shape ``(M, 3)``.
         area: Area that the points cover on the plane, shape ``(M,)``.
         count: Number of points, shape ``(M,)``, int64.
