@@ -1,0 +1,8 @@
+"""Synthetic indoor scenes with exact labels and normals, for demos, tests and benchmarks."""
+
+from torchrg.scenes.layout import RoomLayout
+from torchrg.scenes.rooms import build_room, make_room
+from torchrg.scenes.sampling import sample_scene
+from torchrg.scenes.scene import Scene, SceneModel
+
+__all__ = ["RoomLayout", "Scene", "SceneModel", "build_room", "make_room", "sample_scene"]

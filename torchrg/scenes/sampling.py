@@ -1,0 +1,227 @@
+"""Clouds sampled from a scene: spread, noise, outliers, order."""
+
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchrg.errors import ConfigError
+from torchrg.scenes.frames import Array, dot
+from torchrg.scenes.scene import Scene, SceneModel
+from torchrg.structures import UNLABELED
+
+NoiseDirection = Literal["normal", "isotropic", "ray"]
+Density = Literal["uniform", "falloff"]
+Order = Literal["random", "face"]
+
+Floats = NDArray[np.float32]
+
+_NEAR = 1.0  # density stops growing nearer to the scanner than this, metres
+
+
+def sample_scene(
+    model: SceneModel,
+    num_points: int,
+    *,
+    noise: float = 0.0,
+    seed: int = 0,
+    noise_direction: NoiseDirection = "normal",
+    density: Density = "uniform",
+    outlier_fraction: float = 0.0,
+    order: Order = "random",
+    colors: bool = False,
+) -> Scene:
+    """Sample the visible surface of a scene.
+
+    Each point is drawn independently and evenly from all of the surface that has free space in
+    front of it, so the number of points of a face is proportional to its visible area. What is
+    hidden from the scanner by other objects is sampled as well.
+
+    Convention:
+        The same seed gives the same places on the surface whatever the noise, so the noise of a
+        cloud is its difference to the cloud with ``noise=0``.
+
+    Args:
+        model: The scene.
+        num_points: Number of points.
+        noise: Standard deviation of the noise, in metres.
+        seed: Two calls with equal arguments give equal clouds, on every platform.
+        noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
+            every direction. ``"ray"``: along the line to the nearest viewpoint of the scene.
+        density: ``"uniform"``, or ``"falloff"``: proportional to 1/r^2 with r the distance to the
+            nearest viewpoint of the scene, and even within a metre of it.
+        outlier_fraction: Share of points spread over the box around the scene instead, which
+            belong to no face.
+        order: ``"random"``, or ``"face"``: one face after the other, outliers last.
+        colors: Whether to colour the points by object.
+
+    Returns:
+        The cloud and its truth.
+
+    Raises:
+        ConfigError: If a setting is not allowed.
+
+    Example:
+        >>> from torchrg.scenes import build_room
+        >>> sample_scene(build_room(seed=3), 1000, noise=0.002).points.shape
+        torch.Size([1000, 3])
+    """
+    _check_settings(
+        num_points,
+        noise,
+        outlier_fraction,
+        noise_direction=(noise_direction, NoiseDirection),
+        density=(density, Density),
+        order=(order, Order),
+    )
+    places, shake, paint = (random_stream(seed, number) for number in range(3))
+    num_outliers = round(num_points * outlier_fraction)
+    points, normals, labels = _draw_places(model, num_points - num_outliers, density, places)
+    if noise > 0:
+        points += np.float32(noise) * _displacements(model, points, normals, noise_direction, shake)
+    if num_outliers:
+        low, high = model.bounds
+        stray = low + places.random((num_outliers, 3)) * (high - low)
+        points = np.concatenate([points, stray.astype(np.float32)])
+        normals = np.concatenate([normals, np.zeros((num_outliers, 3), dtype=np.float32)])
+        labels = np.concatenate([labels, np.full(num_outliers, UNLABELED)])
+    if order == "random":
+        shuffled = places.permutation(num_points)
+        points, normals, labels = points[shuffled], normals[shuffled], labels[shuffled]
+    return label_points(model, points, labels, normals, paint if colors else None)
+
+
+def random_stream(seed: int, number: int) -> np.random.Generator:
+    """Return one of several independent random generators that belong to a seed."""
+    return np.random.Generator(np.random.PCG64([seed, number]))
+
+
+def label_points(
+    model: SceneModel,
+    points: Floats,
+    labels: NDArray[np.int64],
+    normals: Floats,
+    paint: np.random.Generator | None,
+) -> Scene:
+    """Return points of known faces as a cloud with the tables of its scene.
+
+    Args:
+        model: The scene.
+        points: Shape ``(N, 3)``, float32.
+        labels: Faces, or ``UNLABELED``, shape ``(N,)``.
+        normals: Shape ``(N, 3)``, float32.
+        paint: Generator of the colours; None for none.
+
+    Returns:
+        The cloud and its truth.
+    """
+    colors = None if paint is None else torch.from_numpy(_colors(model, labels, paint))
+    face_normals, face_offsets = model.planes
+    return Scene(
+        points=torch.from_numpy(points),
+        labels=torch.from_numpy(labels),
+        normals=torch.from_numpy(normals),
+        planar=torch.tensor([surface.planar for surface in model.surfaces]),
+        face_normals=torch.from_numpy(face_normals),
+        face_offsets=torch.from_numpy(face_offsets),
+        face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),
+        kinds=tuple(surface.kind for surface in model.surfaces),
+        objects=torch.from_numpy(model.objects),
+        colors=colors,
+    )
+
+
+def _draw_places(
+    model: SceneModel, num_points: int, density: Density, rng: np.random.Generator
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return points, normals and faces of exactly ``num_points`` places, face after face."""
+    areas = np.array([surface.area for surface in model.surfaces])
+    drawn: list[tuple[Floats, Floats]] = []
+    faces: list[NDArray[np.int64]] = []
+    missing, share_kept = num_points, 1.0
+    while missing > 0:
+        num_tried = int(missing / share_kept * 1.02) + 16
+        num_kept = 0
+        for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
+            points = model.surfaces[face].sample(rng, int(count))
+            normals = model.surfaces[face].normals_at(points)
+            kept = model.visible(face, points, normals)
+            if density == "falloff":
+                nearest = np.maximum(_to_viewpoint(model, points)[1], _NEAR)
+                kept &= rng.random(len(points)) * (nearest * nearest) < _NEAR * _NEAR
+            drawn.append((_float32(points[kept]), _float32(normals[kept])))
+            faces.append(np.full(len(drawn[-1][0]), face))
+            num_kept += len(drawn[-1][0])
+        missing -= num_kept
+        share_kept = max(num_kept, 1) / num_tried
+    labels = np.concatenate(faces)
+    # A random subset: to keep the first would leave the last faces short of points.
+    chosen = rng.permutation(len(labels))[:num_points]
+    chosen = chosen[np.argsort(labels[chosen], kind="stable")]
+    points, normals = (np.concatenate(rows)[chosen] for rows in zip(*drawn, strict=True))
+    return points, normals, labels[chosen]
+
+
+def _displacements(
+    model: SceneModel,
+    points: Floats,
+    normals: Floats,
+    direction: NoiseDirection,
+    rng: np.random.Generator,
+) -> Floats:
+    """Return displacements of unit standard deviation, shape ``(N, 3)``."""
+    if direction == "isotropic":
+        return rng.standard_normal(points.shape, dtype=np.float32)
+    lengths = rng.standard_normal((len(points), 1), dtype=np.float32)
+    along = normals if direction == "normal" else _float32(_to_viewpoint(model, points)[0])
+    return lengths * along
+
+
+def _to_viewpoint(model: SceneModel, points: Floats | Array) -> tuple[Array, Array]:
+    """Return unit vectors to the nearest viewpoint, shape ``(N, 3)``, and its distances."""
+    lines = model.viewpoints[0] - points
+    distances = np.sqrt(dot(lines, lines))
+    for viewpoint in model.viewpoints[1:]:
+        others = viewpoint - points
+        lengths = np.sqrt(dot(others, others))
+        nearer = lengths < distances
+        lines[nearer], distances[nearer] = others[nearer], lengths[nearer]
+    return lines / distances[:, None], distances
+
+
+def _colors(
+    model: SceneModel, labels: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return a colour for each point: that of its object, grey for outliers, a little uneven."""
+    palette = rng.integers(60, 230, size=(len(model.parts) + 1, 3))
+    object_of = np.append(model.objects, len(model.parts))
+    shades: NDArray[np.int64] = palette[object_of[labels]] + rng.integers(
+        -12, 13, size=(len(labels), 1)
+    )
+    return shades.astype(np.uint8)
+
+
+def _float32(values: Array) -> Floats:
+    """Return values rounded to float32, in rows of their own."""
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _check_settings(
+    num_points: int, noise: float, outlier_fraction: float, **choices: tuple[str, object]
+) -> None:
+    """Refuse settings out of range; ``choices`` are pairs of a value and its Literal type."""
+    if num_points < 1:
+        raise ConfigError(f"sample_scene: expected num_points >= 1, got {num_points}.")
+    if not 0 <= noise < float("inf"):
+        raise ConfigError(f"sample_scene: expected noise >= 0 metres, got {noise}.")
+    if not 0 <= outlier_fraction < 1:
+        raise ConfigError(
+            f"sample_scene: expected outlier_fraction in [0, 1), got {outlier_fraction}."
+        )
+    for name, (value, allowed) in choices.items():
+        if value not in get_args(allowed):
+            options = ", ".join(get_args(allowed))
+            raise ConfigError(
+                f"sample_scene: expected {name} to be one of {options}, got {value!r}."
+            )
