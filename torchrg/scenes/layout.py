@@ -8,7 +8,7 @@ import numpy as np
 from torchrg.scenes.frames import Array, dot
 from torchrg.scenes.scene import Part, plane_table
 
-_FLOOR_CELL = (2.1, 1.6)  # a table with room to turn, metres
+_FLOOR_CELL = (1.85, 1.35)  # a table with room to turn, metres
 _WALL_CELL = 1.9  # a window or a cabinet with wall on both sides
 _AISLE = 0.75  # along the walls, for doors and cabinets
 _PARALLEL = 1 - 0.02**2 / 2  # cosine of about one degree
@@ -20,7 +20,7 @@ Place = tuple[float, float]
 class RoomLayout:
     """What is in a room; lengths in metres. The defaults make 153 faces, 35 of them 4 cm wide."""
 
-    size: tuple[float, float, float] = (10.0, 8.0, 3.0)
+    size: tuple[float, float, float] = (9.0, 7.0, 2.8)
     """Length, width, height."""
     num_doors: int = 2
     num_windows: int = 3

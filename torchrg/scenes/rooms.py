@@ -158,7 +158,7 @@ class _Builder:
 
         def draw() -> Part:
             holes.append(self._draw_door(middle) if kind == "door" else self._draw_window(middle))
-            return recess(self.walls[wall], holes[-1], self._between(0.05, 0.15), kind)
+            return recess(self.walls[wall], holes[-1], self._between(0.06, 0.16), kind)
 
         self._place(draw)
         self.holes[wall].append(holes[-1])
@@ -194,7 +194,7 @@ class _Builder:
 
         def draw() -> Part:
             height = 0.74 if self.layout.equal_tables else self._between(0.66, 0.84)
-            size = (self._between(1.4, 1.65), self._between(0.7, 0.85), height)
+            size = (self._between(1.25, 1.5), self._between(0.65, 0.8), height)
             drawn.append((self._standing(middle, turn_deg=12), height))
             thickness, post = self.layout.plate_thickness, self._between(0.2, 0.35)
             return table(drawn[-1][0], size, thickness=thickness, post=post)
@@ -204,7 +204,7 @@ class _Builder:
             self._place(lambda: self._draw_small_box(*drawn[-1]))
 
     def _draw_small_box(self, table_frame: Frame, height: float) -> Part:
-        place = table_frame.moved(self._between(-0.4, 0.4), self._between(-0.1, 0.1), height)
+        place = table_frame.moved(self._between(-0.35, 0.35), self._between(-0.08, 0.08), height)
         frame = Frame.upright(place.origin, self._between(-90, 90))
         size = (self._between(0.2, 0.35), self._between(0.2, 0.3), self._between(0.15, 0.4))
         return block("box", frame, size, without=("bottom",))
