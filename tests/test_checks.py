@@ -1,0 +1,59 @@
+"""Argument checks say what was expected and what came."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._optional import require
+from torchrg.errors import MissingDependencyError, ShapeError, TorchrgError
+
+
+def test_letters_are_shared_between_arguments():
+    patches = torch.zeros(5, 8, 3)
+    check_shapes("f", patches=(patches, "* K 3"), mask=(torch.zeros(5, 8), "* K"))
+    with pytest.raises(
+        ShapeError, match=r"f: expected mask of shape \(\*, K\) with \*=\(5,\), K=8"
+    ):
+        check_shapes("f", patches=(patches, "* K 3"), mask=(torch.zeros(5, 7), "* K"))
+
+
+def test_repeated_letters_must_agree():
+    with pytest.raises(ShapeError, match="expected m of shape"):
+        check_shapes("f", m=(torch.zeros(2, 3), "P P"))
+
+
+def test_missing_axes_are_refused():
+    with pytest.raises(ShapeError, match="expected points of shape"):
+        check_shapes("f", points=(torch.zeros(3), "N 3"))
+
+
+def test_arrays_become_tensors_that_share_memory():
+    array = np.zeros((4, 3), dtype=np.float32)
+    tensor = as_tensor("f", "points", array)
+    array[0, 0] = 7
+    assert tensor[0, 0] == 7
+
+
+def test_foreign_byte_order_and_read_only_arrays_are_accepted():
+    array = np.arange(6, dtype=">f8").reshape(2, 3)
+    array.setflags(write=False)
+    assert as_tensor("f", "points", array).tolist() == [[0, 1, 2], [3, 4, 5]]
+
+
+@pytest.mark.parametrize("values", [[[1.0, 2, 3]], np.array(["a"]), np.array([None])])
+def test_other_things_are_refused(values):
+    with pytest.raises(ShapeError, match="expected points to be a tensor or a NumPy array"):
+        as_tensor("f", "points", values)
+
+
+def test_mixed_precision_is_refused():
+    with pytest.raises(ShapeError, match="a and b of one dtype, got float32 and float64"):
+        check_floating("f", a=torch.zeros(1), b=torch.zeros(1, dtype=torch.float64))
+
+
+def test_missing_package_names_the_extra():
+    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[las\]'") as info:
+        require("no_such_package", extra="las", purpose="read LAS files")
+    assert isinstance(info.value, TorchrgError)
+    assert isinstance(info.value, ImportError)

@@ -1,0 +1,92 @@
+"""Settings: presets load, differences only, unknown keys and wrong values are refused."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from torchrg.config import (
+    GrowingConfig,
+    NormalsConfig,
+    PipelineConfig,
+    load_config,
+    preset_names,
+)
+from torchrg.errors import ConfigError
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_preset_loads_by_name_and_by_path(path):
+    assert path.stem in preset_names()
+    assert load_config(path.stem) == load_config(path)
+
+
+def test_presets_are_those_of_the_contract():
+    assert {"classic", "detmm", "paper", "consensus"} <= set(preset_names())
+    assert load_config() == load_config("consensus")
+    assert load_config("classic").growing.connectivity is None
+    assert load_config("paper").growing == GrowingConfig()
+
+
+def test_a_file_holds_differences_only(tmp_path):
+    path = tmp_path / "my.yaml"
+    path.write_text("growing: {max_angle_deg: 7}\n")
+    expected = dataclasses.replace(GrowingConfig(), max_angle_deg=7.0)
+    assert load_config(path) == PipelineConfig(growing=expected)
+    path.write_text("")
+    assert load_config(path) == PipelineConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "growing: {max_angle: 5}",
+            "growing: unknown key 'max_angle'; GrowingConfig has max_angle_",
+        ),
+        ("normals: {k: 2}", "normals: NormalsConfig: expected k >= 3, got 2"),
+        ("normals: {k: 3.5}", "normals: k: expected int, got 3.5"),
+        ("normals: {k: true}", "normals: k: expected int, got True"),
+        ("normals: {method: ransac}", "expected one of pca, jet"),
+        ("growing: {connectivity: yes}", "expected float or null, got True"),
+        ("growing: 5", "growing: expected a mapping of settings, got 5"),
+        ("growing: [", "expected YAML"),
+        ("- 1", "expected a mapping"),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path, text, message):
+    path = tmp_path / "my.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as info:
+        load_config(path)
+    assert str(info.value).startswith(str(path))
+
+
+def test_unknown_preset_lists_the_known_ones():
+    with pytest.raises(ConfigError, match=r"one of classic, .* got 'clasic'"):
+        load_config("clasic")
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read: No such file"):
+        load_config(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (NormalsConfig, {"support_fraction": 0.4}, r"support_fraction in \[0.5, 1\], got 0.4"),
+        (NormalsConfig, {"sharp_angle_deg": -1.0}, r"sharp_angle_deg in \[0, 90\]"),
+        (NormalsConfig, {"inlier_quantile": 1.0}, r"inlier_quantile in \(0, 1\)"),
+        (GrowingConfig, {"max_angle_deg": 91.0}, r"max_angle_deg in \[0, 90\]"),
+        (GrowingConfig, {"curvature_quantile": 1.1}, "curvature_quantile in"),
+        (GrowingConfig, {"connectivity": 2.0}, "connectivity in"),
+        (GrowingConfig, {"min_size": 0}, "min_size >= 1"),
+        (PipelineConfig, {"chunk_size": 0}, "chunk_size >= 1"),
+    ],
+)
+def test_values_out_of_range_are_refused(kind, values, message):
+    with pytest.raises(ConfigError, match=message):
+        kind(**values)

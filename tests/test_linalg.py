@@ -1,0 +1,87 @@
+"""Covariances, 3x3 eigenvectors and angles against NumPy and torch.linalg."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.linalg import covariance, eigh3, sq_chord_to_deg, unsigned_angle_deg
+
+EIGEN_TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-14}
+
+
+def random_symmetric(rng, dtype, count=500):
+    half = torch.randn(count, 3, 3, generator=rng, dtype=torch.float64)
+    spread = 10 ** (-6 * torch.rand(count, 1, 3, generator=rng, dtype=torch.float64))
+    return ((half * spread) @ (half * spread).mT).to(dtype)
+
+
+@pytest.mark.parametrize("unit", [1e-18, 1.0, 1e18])
+def test_eigenvalues_and_vectors_agree_with_lapack(rng, dtype, unit):
+    matrices = random_symmetric(rng, torch.float64).to(dtype) * unit
+    values, vectors = eigh3(matrices)
+    expected, _ = torch.linalg.eigh(matrices.double())
+    largest = expected[:, 2:]
+    assert ((values.double() - expected) / largest).abs().max() < EIGEN_TOLERANCE[dtype]
+    residual = matrices.double() @ vectors.double() - vectors.double() * values.double()[:, None]
+    assert (residual.abs().amax(dim=(1, 2)) / largest[:, 0]).max() < 4 * EIGEN_TOLERANCE[dtype]
+    identity = vectors.double().mT @ vectors.double()
+    assert (identity - torch.eye(3)).abs().max() < 4 * EIGEN_TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize(
+    "diagonal", [(0.0, 0, 0), (1, 1, 1), (1, 1, 2), (1, 2, 2), (0, 0, 5), (0, 5, 5)]
+)
+def test_repeated_eigenvalues_give_orthonormal_vectors(dtype, diagonal):
+    rotation = torch.linalg.qr(torch.tensor([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]).double())[0]
+    matrix = (rotation @ torch.diag(torch.tensor(diagonal).double()) @ rotation.mT).to(dtype)
+    values, vectors = eigh3(matrix)
+    assert torch.allclose(values.double(), torch.tensor(diagonal).double().sort().values, atol=1e-5)
+    assert (vectors.mT @ vectors - torch.eye(3, dtype=dtype)).abs().max() < 1e-6
+
+
+def test_eigenvectors_do_not_depend_on_the_batch(rng):
+    matrices = random_symmetric(rng, torch.float32, count=257)
+    values, vectors = eigh3(matrices)
+    for start in (0, 1, 3, 100):
+        part_values, part_vectors = eigh3(matrices[start : start + 77])
+        assert torch.equal(part_values, values[start : start + 77])
+        assert torch.equal(part_vectors, vectors[start : start + 77])
+
+
+def test_covariance_is_that_of_numpy(rng):
+    patches = torch.randn(7, 12, 4, generator=rng, dtype=torch.float64) + 1e6
+    mean, matrix = covariance(patches)
+    for row in range(7):
+        points = patches[row].numpy()
+        assert np.allclose(mean[row], points.mean(axis=0), rtol=1e-14)
+        assert np.allclose(matrix[row], np.cov(points, rowvar=False, bias=True), rtol=1e-9)
+
+
+def test_masked_points_do_not_count_whatever_they_hold(rng):
+    patches = torch.randn(5, 10, 3, generator=rng, dtype=torch.float64)
+    mask = torch.rand(5, 10, generator=rng) < 0.6
+    mask[4] = False
+    spoiled = torch.where(mask[..., None], patches, torch.nan)
+    mean, matrix = covariance(spoiled, mask)
+    for row in range(4):
+        kept = patches[row][mask[row]]
+        assert torch.allclose(mean[row], kept.mean(dim=0))
+        assert torch.allclose(matrix[row], torch.cov(kept.T, correction=0))
+    assert not mean[4].any()
+    assert not matrix[4].any()
+
+
+def test_angles_are_those_of_the_arc_cosine():
+    angles = torch.linspace(0, 180, 1801, dtype=torch.float64)
+    a = torch.tensor([1.0, 0, 0], dtype=torch.float64).expand(len(angles), 3)
+    radians = torch.deg2rad(angles)
+    b = torch.stack([radians.cos(), radians.sin(), torch.zeros_like(radians)], dim=-1)
+    expected = torch.minimum(angles, 180 - angles)
+    assert (unsigned_angle_deg(a, b) - expected).abs().max() < 1e-7
+    assert (unsigned_angle_deg(a.float(), b.float()) - expected).abs().max() < 2e-5
+
+
+def test_small_angles_keep_their_digits_in_float32():
+    for degrees in (1e-4, 1e-3, 1e-2):
+        sq_chord = torch.tensor((2 * np.sin(np.radians(degrees) / 2)) ** 2, dtype=torch.float32)
+        assert sq_chord_to_deg(sq_chord).item() == pytest.approx(degrees, rel=1e-6)

@@ -1,0 +1,72 @@
+"""Command line: ``torchrg COMMAND ...``; each command parses, calls, and prints."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+COMMANDS = {
+    "segment": "label the planes of scans",
+    "score": "compare labels and normals with a truth",
+    "sample": "make a synthetic room with its truth",
+    "info": "say what a file holds",
+}
+"""Commands by name, each with a module of the same name, and what they do."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code.
+
+    Args:
+        argv: Arguments after ``torchrg``. Default: those of the process.
+
+    Returns:
+        0 done; 2 wrong use or bad input; 3 some items of a batch failed; 130 interrupted.
+    """
+    from torchrg.cli.console import USAGE_ERROR, fail
+
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else USAGE_ERROR
+    name, *rest = arguments
+    if name == "--version":
+        from torchrg import __version__
+
+        print(f"torchrg {__version__}")
+        return 0
+    if name not in COMMANDS:
+        return fail(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
+    return _run(name, rest)
+
+
+def _overview() -> str:
+    """Return the help that lists the commands."""
+    rows = "\n".join(f"  {name:<9}{purpose}" for name, purpose in COMMANDS.items())
+    return (
+        "usage: torchrg COMMAND ...\n\n"
+        "Normals, curvature and plane labels for indoor point clouds.\n\n"
+        f"{rows}\n\ntorchrg COMMAND --help says more. torchrg --version prints the version."
+    )
+
+
+def _run(name: str, arguments: list[str]) -> int:
+    """Run one command; a user's mistake becomes one line on stderr, never a traceback."""
+    from torchrg.cli.console import INTERRUPTED, fail
+    from torchrg.errors import TorchrgError
+
+    try:
+        code: int = importlib.import_module(f"torchrg.cli.{name}").run(arguments)
+    except TorchrgError as error:
+        return fail(str(error))
+    except MemoryError:
+        return fail("out of memory; lower --chunk-size, or split the cloud.")
+    except BrokenPipeError:
+        # The reader of our output went away, and Python would complain again when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return fail(f"{error.filename or name}: {error.strerror or error}.")
+    except KeyboardInterrupt:
+        return fail("interrupted; every file written is complete.", code=INTERRUPTED)
+    return code

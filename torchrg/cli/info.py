@@ -1,0 +1,59 @@
+"""``torchrg info``: what a file holds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from torchrg.cli.console import parse
+from torchrg.io import read_cloud
+from torchrg.neighbors import finite_rows, search_knn
+from torchrg.structures import Cloud
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Say what a file holds: points, extent, spacing, duplicates, fields."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """Cloud to read."""
+
+
+def run(argv: list[str]) -> int:
+    """Parse the arguments and print what the file holds."""
+    arguments = parse(Arguments, argv, prog="torchrg info")
+    for name, value in describe_cloud(read_cloud(arguments.file)).items():
+        print(f"{name:<12}{value}")
+    return 0
+
+
+def describe_cloud(cloud: Cloud) -> dict[str, str]:
+    """Return the facts about a cloud, by name."""
+    facts = {"points": f"{len(cloud):,} of {cloud.coordinates.dtype}"}
+    if cloud.grid_shape:
+        facts["grid"] = f"{cloud.grid_shape[0]} rows x {cloud.grid_shape[1]} columns"
+    kept = cloud.coordinates[cloud.finite]
+    facts["not finite"] = f"{len(cloud) - len(kept):,}"
+    if len(kept):
+        low, high = kept.min(axis=0), kept.max(axis=0)
+        facts["lowest"] = " ".join(f"{value:.6g}" for value in low)
+        facts["highest"] = " ".join(f"{value:.6g}" for value in high)
+        facts["extent"] = " ".join(f"{value:.6g}" for value in high - low)
+        num_places = len(np.unique(kept, axis=0))
+        facts["duplicates"] = f"{len(kept) - num_places:,}"
+        facts["spacing"] = _median_spacing(cloud)
+    for name, values in cloud.fields.items():
+        shape = " x ".join(map(str, values.shape[1:])) or "1"
+        facts[name] = f"{shape} {values.dtype}"
+    return facts
+
+
+def _median_spacing(cloud: Cloud) -> str:
+    """Return the median distance to the nearest other place, in the unit of the cloud."""
+    points = cloud.points[finite_rows(cloud.points)].unique(dim=0)
+    if len(points) < 2:
+        return "none"
+    nearest = points[search_knn(points, 2).indices[:, 1].long()]
+    return f"{float((points - nearest).norm(dim=1).median()):.4g} (median to the nearest point)"

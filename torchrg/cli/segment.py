@@ -1,0 +1,133 @@
+"""``torchrg segment``: plane labels of scans."""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.cli.provenance import describe_run
+from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
+from torchrg.errors import ConfigError, TorchrgError
+from torchrg.io import read_cloud, write_cloud
+from torchrg.pipeline import segment_planes
+from torchrg.structures import Cloud, Segmentation
+
+STAGES = ("neighbors", "normals", "regions", "planes")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Label the planes of scans, and write labels, normals, curvature and a table of planes.
+
+    Settings come from the preset, then from --config, then from the flags given here.
+    """
+
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
+    out: Path
+    """File to write, its format by suffix; for several inputs a directory."""
+    preset: str = DEFAULT_PRESET
+    """Settings to start from: classic, detmm, paper or consensus."""
+    config: Path | None = None
+    """YAML file with settings that differ from the defaults; replaces the preset."""
+    normals: NormalsConfig = dataclasses.field(default_factory=NormalsConfig)
+    """How normals and curvature are estimated."""
+    growing: GrowingConfig = dataclasses.field(default_factory=GrowingConfig)
+    """How regions grow."""
+    chunk_size: int = PipelineConfig.chunk_size
+    """Points handled at a time; bounds memory, never changes a result."""
+    threads: int | None = None
+    """Threads to use. Default: as torch decides, usually one a core."""
+
+
+def run(argv: list[str]) -> int:
+    """Parse the arguments, segment each input and write its result."""
+    arguments = parse(Arguments, argv, prog="torchrg segment", default=_starting_point(argv))
+    settings = PipelineConfig(arguments.normals, arguments.growing, arguments.chunk_size)
+    if arguments.threads is not None:
+        if arguments.threads < 1:
+            raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
+        torch.set_num_threads(arguments.threads)
+    outputs = output_paths(arguments.inputs, arguments.out)
+    failed = 0
+    for source, target in zip(arguments.inputs, outputs, strict=True):
+        try:
+            _segment_file(source, target, settings)
+        except TorchrgError as error:
+            if len(outputs) == 1:
+                raise
+            failed += 1
+            fail(str(error))
+    if failed:
+        return fail(
+            f"{failed} of {len(outputs)} inputs failed, the others are written.", code=SOME_FAILED
+        )
+    return 0
+
+
+def _starting_point(argv: list[str]) -> Arguments:
+    """Return the arguments' defaults: those of the preset or the file that is asked for."""
+    values = {"--preset": DEFAULT_PRESET, "--config": ""}
+    for position, argument in enumerate(argv):
+        name, equals, value = argument.partition("=")
+        if name in values:
+            values[name] = value if equals else "".join(argv[position + 1 : position + 2])
+    settings = load_config(values["--config"] or values["--preset"])
+    return Arguments(
+        inputs=tyro.MISSING,
+        out=tyro.MISSING,
+        normals=settings.normals,
+        growing=settings.growing,
+        chunk_size=settings.chunk_size,
+    )
+
+
+def _segment_file(source: Path, target: Path, settings: PipelineConfig) -> None:
+    """Segment one file, with a progress bar on a terminal."""
+    begin = time.perf_counter()
+    cloud = read_cloud(source)
+    _check_points(cloud)
+    with tqdm(total=len(STAGES), desc=source.name, unit="stage", leave=False, disable=None) as bar:
+
+        def advance(stage: str) -> None:
+            bar.set_postfix_str(stage)
+            bar.update(stage != STAGES[0])
+
+        seg = segment_planes(cloud.points, settings, on_stage=advance)
+    write_cloud(target, cloud, seg, provenance=describe_run(source, settings))
+    _report(source, target, cloud, seg, time.perf_counter() - begin)
+
+
+def _check_points(cloud: Cloud) -> None:
+    """Warn of points that cannot be used."""
+    num_bad = len(cloud) - int(cloud.finite.sum())
+    if num_bad:
+        warn(
+            f"{cloud.source}: {num_bad:,} of {len(cloud):,} points are not finite; they stay in "
+            "place, unlabelled."
+        )
+
+
+def _report(source: Path, target: Path, cloud: Cloud, seg: Segmentation, seconds: float) -> None:
+    """Print one line about a result, and a warning if it is empty."""
+    num_planes = len(seg.planes.count)
+    if num_planes == 0:
+        places = "all points are equal" if _is_one_place(cloud) else "no region is large enough"
+        warn(f"{source}: no plane found: {places}.")
+    share = float((seg.labels >= 0).double().mean()) * 100
+    print(
+        f"{source}: {len(cloud):,} points, {num_planes:,} planes, {share:.1f} % of the points "
+        f"labelled, {seconds:.1f} s -> {target}"
+    )
+
+
+def _is_one_place(cloud: Cloud) -> bool:
+    """Return whether all finite points are the same."""
+    kept = cloud.coordinates[cloud.finite]
+    return bool((kept == kept[0]).all())
