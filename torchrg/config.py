@@ -65,6 +65,9 @@ class GrowingConfig:
     coplanarity_scope: Literal["all", "connected"] = "all"
     """Which neighbours that median and Qn are taken over: all, or those left by the
     connectivity test (Algorithm 2)."""
+    coplanarity_floor: float = 0.005
+    """Least value of that Qn, as a fraction of the distance to the farthest neighbour: exact and
+    quantised surfaces, where most residuals are equal, have Qn = 0."""
     min_size: int = 50
     """Smaller regions are not labelled."""
 
@@ -73,6 +76,7 @@ class GrowingConfig:
         _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
         within = self.connectivity is None or 0 <= self.connectivity <= 1
         _require(self, "connectivity", "in [0, 1] or none", within)
+        _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
 
 

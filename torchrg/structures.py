@@ -136,7 +136,7 @@ class Planes(NamedTuple):
     offset: Tensor
     centroid: Tensor
     area: Tensor
-    count: Tensor
+    count: Tensor  # type: ignore[assignment]
     rms: Tensor
 
 

@@ -1,0 +1,6 @@
+"""Regions: which neighbours join, growth, and the table of planes."""
+
+from torchrg.regions.grow import grow_regions
+from torchrg.regions.planes import summarize_planes
+
+__all__ = ["grow_regions", "summarize_planes"]

@@ -1,0 +1,139 @@
+"""Which neighbours may join a region: tests of single edges, each a function of tensors."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchrg.robust import median, qn
+
+
+def sq_chord_limit(max_angle_deg: float) -> float:
+    """Return the squared chord of the unit sphere that an angle spans.
+
+    Args:
+        max_angle_deg: Angle in [0, 180].
+
+    Returns:
+        ``(2 sin(a / 2))^2``.
+
+    Example:
+        >>> round(sq_chord_limit(60.0), 6)
+        1.0
+    """
+    return (2 * math.sin(math.radians(max_angle_deg) / 2)) ** 2
+
+
+def sq_chords(normals: Tensor, neighbor_normals: Tensor, *, signed: bool = False) -> Tensor:
+    """Return the squared distance on the unit sphere between normals and those of the neighbours.
+
+    Built from ``+ - *`` alone, hence the same to the last bit in every chunk; and exact where the
+    normals are equal, so that an angle limit of 0 accepts them.
+
+    Args:
+        normals: Unit normals of the points, as three columns, shape ``(3, n)``.
+        neighbor_normals: Unit normals of their neighbours, shape ``(3, n, K)``.
+        signed: Whether opposite normals are far apart (in [0, 4]) or equal (in [0, 2]).
+
+    Returns:
+        Shape ``(n, K)``.
+
+    Example:
+        >>> a = torch.tensor([[0.0], [0.0], [1.0]])
+        >>> sq_chords(a, -a[:, :, None]), sq_chords(a, -a[:, :, None], signed=True)
+        (tensor([[0.]]), tensor([[4.]]))
+    """
+    own = normals[:, :, None]
+    if signed:
+        first, second, third = (neighbor_normals[axis] - own[axis] for axis in range(3))
+    else:
+        dot = neighbor_normals[0] * own[0]
+        dot += neighbor_normals[1] * own[1]
+        dot += neighbor_normals[2] * own[2]
+        sign = torch.where(dot < 0, -1.0, 1.0).to(own.dtype)
+        first, second, third = (neighbor_normals[axis] - own[axis] * sign for axis in range(3))
+    result = first.mul_(first)
+    result += second.mul_(second)
+    result += third.mul_(third)
+    return result
+
+
+def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:
+    """Return the distance of neighbours to the plane through each point, below eq. (10).
+
+    Args:
+        patches: Neighbours about the point itself, shape ``(n, K, 3)``.
+        normals: Unit normals of the points, shape ``(n, 3)``.
+
+    Returns:
+        ``|(p_j - p_i) . n_i|``, shape ``(n, K)``.
+
+    Example:
+        >>> patches = torch.tensor([[[0.0, 0, 0], [1, 2, 3]]])
+        >>> plane_residuals(patches, torch.tensor([[0.0, 0, 1]])).tolist()
+        [[0.0, 3.0]]
+    """
+    x, y, z = patches.unbind(dim=-1)
+    a, b, c = normals[:, :, None].unbind(dim=1)
+    result = x * a
+    result += y * b
+    result += z * c
+    return result.abs_()
+
+
+def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return the largest residual of a coplanar neighbour, eq. (11).
+
+    :math:`\gamma_{th} = \mathrm{median}(\gamma) + 2 \max(Q_n(\gamma), \mathrm{floor})`. The paper
+    has no floor. Without one, the limit of a neighbourhood where most residuals are equal (exact
+    or quantised coordinates) is their median, and the wall shatters.
+
+    Args:
+        residuals: Distances of the neighbours to the point's plane, shape ``(n, K)``.
+        floor: Least scale of the residuals, shape ``(n,)``.
+        mask: Which neighbours count, shape ``(n, K)``, bool. Default: all.
+
+    Returns:
+        Limits, shape ``(n,)``, in the unit of the residuals.
+
+    Example:
+        >>> residuals = torch.tensor([[0.0, 1, 1, 2, 9], [0, 0, 0, 0, 1]])
+        >>> coplanarity_limits(residuals, torch.tensor([0.0, 0.25])).tolist()
+        [5.44379997253418, 0.5]
+    """
+    scale = torch.maximum(qn(residuals, mask=mask), floor)
+    return median(residuals, mask=mask) + 2 * scale
+
+
+def patch_radii(patches: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the distance from each point to its farthest neighbour.
+
+    Args:
+        patches: Neighbours about the point itself, shape ``(n, K, 3)``.
+        mask: Which neighbours count, shape ``(n, K)``, bool. Default: all.
+
+    Returns:
+        Shape ``(n,)``.
+
+    Example:
+        >>> patch_radii(torch.tensor([[[0.0, 0, 0], [0, 3, 4]]])).tolist()
+        [5.0]
+    """
+    sq_distances = patch_sq_distances(patches)
+    if mask is not None:
+        sq_distances = torch.where(mask, sq_distances, 0.0)
+    return sq_distances.amax(dim=-1).sqrt()
+
+
+def patch_sq_distances(patches: Tensor) -> Tensor:
+    """Return the squared distance from each point to its neighbours, shape ``(n, K)``.
+
+    Example:
+        >>> patch_sq_distances(torch.tensor([[[0.0, 0, 0], [0, 3, 4]]])).tolist()
+        [[0.0, 25.0]]
+    """
+    x, y, z = patches.unbind(dim=-1)
+    result = x * x
+    result += y * y
+    result += z * z
+    return result

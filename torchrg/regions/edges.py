@@ -1,0 +1,154 @@
+"""The accepted edges of a block of points: all criteria, the cheap ones first."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg.config import GrowingConfig
+from torchrg.neighbors import gather_patches
+from torchrg.regions.criteria import (
+    coplanarity_limits,
+    patch_radii,
+    plane_residuals,
+    sq_chord_limit,
+    sq_chords,
+)
+from torchrg.regions.sharing import shares_at_least
+from torchrg.structures import Neighbors
+
+
+class GrowingCloud(NamedTuple):
+    """What growth reads: a cloud in canonical order with everything known about its points.
+
+    Attributes:
+        points: Shape ``(N, 3)``.
+        normals: Unit normals, shape ``(N, 3)``.
+        curvature: Shape ``(N,)``.
+        neighbors: Neighbours of each point.
+        valid: Points that may belong to a region, shape ``(N,)``, bool.
+    """
+
+    points: Tensor
+    normals: Tensor
+    curvature: Tensor
+    neighbors: Neighbors
+    valid: Tensor
+
+
+class EdgeBlock(NamedTuple):
+    """Edges from a block of points to their neighbours.
+
+    Attributes:
+        joins: Whether the neighbour joins the region of the point, shape ``(n, K)``, bool.
+        connected: Whether the two are connected, shape ``(n, K)``, bool; only settled where
+            ``joins``. None where connectivity is not tested.
+    """
+
+    joins: Tensor
+    connected: Tensor | None
+
+
+def accept_edges(cloud: GrowingCloud, config: GrowingConfig, rows: slice) -> EdgeBlock:
+    """Tell which neighbours of a block of points may join the points' regions.
+
+    Args:
+        cloud: The cloud, in canonical order.
+        config: Settings; each criterion that is on has to hold.
+        rows: The block.
+
+    Returns:
+        The edges of the block. Those of or to points that are not valid, and those of points to
+        themselves, are never accepted.
+    """
+    indices = cloud.neighbors.indices[rows]
+    counted = None if cloud.neighbors.valid is None else cloud.neighbors.valid[rows]
+    joins = _is_candidate(cloud, rows, indices)
+    if counted is not None:
+        joins &= counted
+    joins &= _within_angle(cloud.normals, rows, indices, config)
+    connected: Tensor | None = None
+    min_shared = min_shared_neighbors(config.connectivity, indices.shape[1])
+    if config.coplanarity and config.coplanarity_scope == "connected":
+        everyone = torch.ones_like(joins) if counted is None else counted
+        connected = _connected(cloud.neighbors, rows, everyone, min_shared)
+        joins &= _coplanar(cloud, rows, indices, connected, joins, config)
+    elif config.coplanarity:
+        joins &= _coplanar(cloud, rows, indices, counted, joins, config)
+    if config.connectivity is None:
+        return EdgeBlock(joins, None)
+    if connected is None:
+        connected = _connected(cloud.neighbors, rows, joins, min_shared)
+    if config.connectivity_scope == "region":
+        joins &= connected
+    return EdgeBlock(joins, connected)
+
+
+def min_shared_neighbors(connectivity: float | None, k: int) -> int:
+    """Return the least number of common neighbours of connected points, eq. (10).
+
+    Args:
+        connectivity: Fraction of the k neighbours, or None.
+        k: Number of neighbours, the point itself included.
+
+    Returns:
+        ``ceil(connectivity * k)``, of the decimal fraction that was written (0.07 * 100 is 7, not
+        the 7.000000000000001 of binary arithmetic); 0 for None.
+
+    Example:
+        >>> min_shared_neighbors(0.75, 50), min_shared_neighbors(0.07, 100)
+        (38, 7)
+    """
+    return 0 if connectivity is None else math.ceil(round(connectivity * k, 9))
+
+
+def _is_candidate(cloud: GrowingCloud, rows: slice, indices: Tensor) -> Tensor:
+    """Return which entries lead from a valid point to another valid point, shape ``(n, K)``."""
+    target_valid = cloud.valid.index_select(0, indices.reshape(-1)).view(indices.shape)
+    own = torch.arange(len(cloud.points), device=indices.device)[rows, None]
+    return target_valid & cloud.valid[rows, None] & (indices != own)
+
+
+def _within_angle(normals: Tensor, rows: slice, indices: Tensor, config: GrowingConfig) -> Tensor:
+    """Return which neighbours' normals are within the angle limit, shape ``(n, K)``."""
+    if config.max_angle_deg >= 90:
+        return torch.ones_like(indices, dtype=torch.bool)
+    flat = indices.reshape(-1)
+    gathered = torch.stack(
+        [normals[:, axis].index_select(0, flat).view(indices.shape) for axis in range(3)]
+    )
+    return sq_chords(normals[rows].T, gathered) <= sq_chord_limit(config.max_angle_deg)
+
+
+def _coplanar(
+    cloud: GrowingCloud,
+    rows: slice,
+    indices: Tensor,
+    counted: Tensor | None,
+    asked: Tensor,
+    config: GrowingConfig,
+) -> Tensor:
+    """Return which of the asked edges are coplanar by eq. (11), shape ``(n, K)``."""
+    needed = asked.any(dim=1).nonzero().squeeze(-1)
+    patches = gather_patches(cloud.points, indices[needed])
+    mask = None if counted is None else counted[needed]
+    residuals = plane_residuals(patches, cloud.normals[rows][needed])
+    floor = config.coplanarity_floor * patch_radii(patches, mask)
+    limits = coplanarity_limits(residuals, floor, mask)
+    result = torch.zeros_like(asked)
+    result[needed] = residuals <= limits[:, None]
+    return result
+
+
+def _connected(neighbors: Neighbors, rows: slice, asked: Tensor, min_shared: int) -> Tensor:
+    """Return which of the asked edges join points with enough common neighbours, ``(n, K)``."""
+    start, stop, _ = rows.indices(len(neighbors.indices))
+    found = shares_at_least(
+        neighbors.indices.cpu().numpy(),
+        slice(start, stop),
+        asked.cpu().numpy(),
+        min_shared,
+        counted=None if neighbors.valid is None else neighbors.valid.cpu().numpy(),
+    )
+    return torch.from_numpy(found).to(asked.device)

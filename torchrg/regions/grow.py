@@ -1,0 +1,250 @@
+"""Region growing: from points, normals and neighbours to labels."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.config import GrowingConfig
+from torchrg.errors import ShapeError
+from torchrg.neighbors import canonical_order
+from torchrg.regions.components import claim_leftovers, first_to_reach
+from torchrg.regions.edges import GrowingCloud, accept_edges
+from torchrg.regions.frontier import grow_in_turn
+from torchrg.regions.graph import pack_edges
+from torchrg.structures import UNLABELED, Neighbors
+
+_Blocks = Iterator[tuple[NDArray[np.int32], NDArray[np.bool_]]]
+
+
+def grow_regions(
+    points: Tensor | NDArray[np.floating],
+    normals: Tensor | NDArray[np.floating],
+    curvature: Tensor | NDArray[np.floating],
+    neighbors: Neighbors,
+    config: GrowingConfig | None = None,
+    *,
+    valid: Tensor | None = None,
+    canonical: bool = False,
+    chunk_size: int = 16384,
+) -> Tensor:
+    """Grow regions of similar normals, in the order of ascending curvature (Algorithm 2) [1].
+
+    A region starts at the free point of least curvature. Each of its seeds claims those of its free
+    neighbours that pass the criteria of the settings; a claimed point becomes a seed if the seed
+    rule holds.
+
+    Convention:
+        All limits are inclusive. The curvature limit is the value at place
+        ``floor(curvature_quantile * (n - 1))`` of the sorted curvatures of the n valid points.
+        Equal curvatures are taken in canonical order. Labels are 0 to M-1 by descending size,
+        regions of equal size by their first point in canonical order. They do not depend on the
+        order of the points (exact duplicates may swap) or on chunk size.
+
+    Args:
+        points: Finite points, shape ``(N, 3)``.
+        normals: Unit normals, shape ``(N, 3)``; their sign does not matter.
+        curvature: Surface variation, shape ``(N,)``.
+        neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
+        config: Settings. Default: the paper's.
+        valid: Points that have a normal, shape ``(N,)``, bool; the others join no region, and no
+            region passes through them. Default: all. Points whose normal or curvature is not
+            finite never join.
+        canonical: Whether the points already are in canonical order; saves a copy.
+        chunk_size: Points handled at a time.
+
+    Returns:
+        Labels, shape ``(N,)``, int64; :data:`torchrg.UNLABELED` for points of no region and of
+        regions smaller than ``min_size``.
+
+    Raises:
+        ShapeError: If a shape, dtype or device is not as above.
+
+    References:
+        [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
+        smoothness constraint. ISPRS Commission V Symposium, 2006.
+
+    Example:
+        >>> points = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
+        >>> normals, curvature = torch.eye(3)[[2] * 16], torch.zeros(16)
+        >>> neighbors = Neighbors(torch.arange(16).expand(16, 16))
+        >>> grow_regions(points, normals, curvature, neighbors, GrowingConfig(min_size=9)).unique()
+        tensor([0])
+    """
+    cloud = _checked_cloud(points, normals, curvature, neighbors, valid)
+    config = GrowingConfig() if config is None else config
+    device = cloud.points.device
+    if len(cloud.points) == 0:
+        return torch.empty(0, dtype=torch.int64, device=device)
+    order = None if canonical else canonical_order(cloud.points)
+    if order is not None:
+        cloud = _reordered(cloud, order)
+    heads = _grow(cloud, config, chunk_size)
+    labels = torch.from_numpy(number_by_size(heads, config.min_size)).to(device)
+    return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+
+
+def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
+    """Return the lower quantile of curvatures: one of the values, as PCL's users take it.
+
+    Args:
+        curvature: Curvatures of the valid points, shape ``(n,)``.
+        quantile: Share in [0, 1].
+
+    Returns:
+        The value at place ``floor(quantile * (n - 1))`` when sorted, a scalar; 0 where n is 0.
+
+    Example:
+        >>> curvature_limit(torch.tensor([0.3, 0.1, 0.2]), 0.95).item() < 0.21
+        True
+    """
+    if len(curvature) == 0:
+        return curvature.new_zeros(())
+    return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
+
+
+def number_by_size(heads: NDArray[np.int32], min_size: int) -> NDArray[np.int64]:
+    """Number regions by descending size, those of equal size by their first point.
+
+    Args:
+        heads: Any number that is the same in a region and another elsewhere, below N; -1 for none.
+        min_size: Smaller regions get :data:`torchrg.UNLABELED`.
+
+    Returns:
+        Labels, shape ``(N,)``.
+
+    Example:
+        >>> number_by_size(np.array([3, 1, 1, 3, -1, 2, 1]), 2).tolist()
+        [1, 0, 0, 1, -1, -1, 0]
+    """
+    placed = np.flatnonzero(heads >= 0)
+    sizes = np.bincount(heads[placed], minlength=len(heads))
+    firsts = np.full(len(heads), len(heads))
+    firsts[heads[placed][::-1]] = placed[::-1]
+    kept = np.flatnonzero(sizes >= max(min_size, 1))
+    kept = kept[np.lexsort((firsts[kept], -sizes[kept]))]
+    # The last entry is what a head of -1 finds.
+    numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int64)
+    numbers[kept] = np.arange(len(kept))
+    return numbers[heads]
+
+
+def _checked_cloud(
+    points: Tensor | NDArray[np.floating],
+    normals: Tensor | NDArray[np.floating],
+    curvature: Tensor | NDArray[np.floating],
+    neighbors: Neighbors,
+    valid: Tensor | None,
+) -> GrowingCloud:
+    """Check what the user passed, and settle which points are valid."""
+    caller = "grow_regions"
+    points = as_tensor(caller, "points", points).detach()
+    normals = as_tensor(caller, "normals", normals).detach()
+    curvature = as_tensor(caller, "curvature", curvature).detach()
+    valid = None if valid is None else as_tensor(caller, "valid", valid)
+    check_shapes(
+        caller,
+        points=(points, "N 3"),
+        normals=(normals, "N 3"),
+        curvature=(curvature, "N"),
+        neighbors=(neighbors.indices, "N K"),
+        neighbors_valid=(neighbors.valid, "N K"),
+        valid=(valid, "N"),
+    )
+    check_floating(caller, points=points, normals=normals, curvature=curvature)
+    if valid is not None and valid.dtype != torch.bool:
+        raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
+    if neighbors.indices.device != points.device:
+        raise ShapeError(
+            f"{caller}: expected points and neighbors on one device, got {points.device} and "
+            f"{neighbors.indices.device}."
+        )
+    finite = normals.isfinite().all(dim=1) & curvature.isfinite()
+    return GrowingCloud(
+        points, normals, curvature, neighbors, finite if valid is None else finite & valid
+    )
+
+
+def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
+    """Return the cloud with its points, and the rows its neighbours name, in another order."""
+    row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
+    row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
+    indices = cloud.neighbors.indices[order]
+    indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
+    mask = cloud.neighbors.valid
+    return GrowingCloud(
+        cloud.points[order],
+        cloud.normals[order],
+        cloud.curvature[order],
+        Neighbors(indices, None if mask is None else mask[order]),
+        cloud.valid[order],
+    )
+
+
+def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
+    """Return the head of each point's region, by whichever way the settings allow."""
+    num_points, k = cloud.neighbors.indices.shape
+    curvature, valid = cloud.curvature.cpu().numpy(), cloud.valid.cpu().numpy()
+    order = np.argsort(curvature, kind="stable").astype(np.int32)
+    order = order[valid[order]]
+    limit = curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
+    if config.seed_rule == "increment" or (
+        config.connectivity is not None and config.connectivity_scope == "seed"
+    ):
+        blocks = _coded_blocks(cloud, config, limit, chunk_size)
+        return grow_in_turn(pack_edges(blocks, num_points, num_points * k), order, valid)
+    spreads = cloud.curvature <= limit
+    seeds = order[spreads.cpu().numpy()[order]]
+    others: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
+    blocks = _joining_blocks(cloud, config, spreads, chunk_size, others)
+    capacity = num_points * k + 2 * len(seeds)
+    heads = first_to_reach(pack_edges(blocks, num_points, capacity), seeds, num_points)
+    # A point that does not spread claims at most its k - 1 neighbours.
+    if config.min_size <= k:
+        sources, targets = (np.concatenate(parts) for parts in zip(*others, strict=True))
+        claim_leftovers(sources, targets, heads, order)
+    return heads
+
+
+def _joining_blocks(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    spreads: Tensor,
+    chunk_size: int,
+    others: list[tuple[NDArray[np.int32], NDArray[np.int32]]],
+) -> _Blocks:
+    """Yield neighbours and which of them join, for points that spread; put by the other edges."""
+    for rows in _chunks(len(cloud.points), chunk_size):
+        joins = accept_edges(cloud, config, rows).joins
+        targets = cloud.neighbors.indices[rows].cpu().numpy()
+        spreading = spreads[rows, None]
+        sources, columns = (joins & ~spreading).cpu().numpy().nonzero()
+        others.append(((sources + rows.start).astype(np.int32), targets[sources, columns]))
+        yield targets, (joins & spreading).cpu().numpy()
+
+
+def _coded_blocks(
+    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, chunk_size: int
+) -> _Blocks:
+    """Yield neighbours with the mark of those that become seeds, and which of them join."""
+    for rows in _chunks(len(cloud.points), chunk_size):
+        block = accept_edges(cloud, config, rows)
+        indices = cloud.neighbors.indices[rows]
+        target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
+        if config.seed_rule == "increment":
+            spreads = (target - cloud.curvature[rows, None]).abs() <= limit
+        else:
+            spreads = target <= limit
+        if block.connected is not None and config.connectivity_scope == "seed":
+            spreads &= block.connected
+        codes = indices.to(torch.int32) * 2 + spreads
+        yield codes.cpu().numpy(), block.joins.cpu().numpy()
+
+
+def _chunks(num_points: int, chunk_size: int) -> Iterator[slice]:
+    """Yield the rows of successive blocks."""
+    for start in range(0, num_points, chunk_size):
+        yield slice(start, min(start + chunk_size, num_points))
