@@ -4,5 +4,15 @@ from torchrg.scenes.layout import RoomLayout
 from torchrg.scenes.rooms import build_room, make_room
 from torchrg.scenes.sampling import sample_scene
 from torchrg.scenes.scene import Scene, SceneModel
+from torchrg.scenes.shapes import SHAPES, make_shape
 
-__all__ = ["RoomLayout", "Scene", "SceneModel", "build_room", "make_room", "sample_scene"]
+__all__ = [
+    "SHAPES",
+    "RoomLayout",
+    "Scene",
+    "SceneModel",
+    "build_room",
+    "make_room",
+    "make_shape",
+    "sample_scene",
+]

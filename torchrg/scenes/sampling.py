@@ -94,6 +94,8 @@ def sample_scene(
 
 def random_stream(seed: int, number: int) -> np.random.Generator:
     """Return one of several independent random generators that belong to a seed."""
+    if seed < 0:
+        raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
     return np.random.Generator(np.random.PCG64([seed, number]))
 
 
@@ -144,13 +146,13 @@ def _draw_places(
         num_tried = int(missing / share_kept * 1.02) + 16
         num_kept = 0
         for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
-            points = model.surfaces[face].sample(rng, int(count))
-            normals = model.surfaces[face].normals_at(points)
-            kept = model.visible(face, points, normals)
+            tried = model.surfaces[face].sample(rng, int(count))
+            outwards = model.surfaces[face].normals_at(tried)
+            kept = model.visible(face, tried, outwards)
             if density == "falloff":
-                nearest = np.maximum(_to_viewpoint(model, points)[1], _NEAR)
-                kept &= rng.random(len(points)) * (nearest * nearest) < _NEAR * _NEAR
-            drawn.append((_float32(points[kept]), _float32(normals[kept])))
+                nearest = np.maximum(_to_viewpoint(model, tried)[1], _NEAR)
+                kept &= rng.random(len(tried)) * (nearest * nearest) < _NEAR * _NEAR
+            drawn.append((_float32(tried[kept]), _float32(outwards[kept])))
             faces.append(np.full(len(drawn[-1][0]), face))
             num_kept += len(drawn[-1][0])
         missing -= num_kept
@@ -159,7 +161,8 @@ def _draw_places(
     # A random subset: to keep the first would leave the last faces short of points.
     chosen = rng.permutation(len(labels))[:num_points]
     chosen = chosen[np.argsort(labels[chosen], kind="stable")]
-    points, normals = (np.concatenate(rows)[chosen] for rows in zip(*drawn, strict=True))
+    points = np.concatenate([rows for rows, _ in drawn])[chosen]
+    normals = np.concatenate([rows for _, rows in drawn])[chosen]
     return points, normals, labels[chosen]
 
 

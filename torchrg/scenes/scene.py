@@ -66,7 +66,7 @@ class SceneModel:
 
     Args:
         parts: The objects; their surfaces in order are the faces.
-        viewpoints: Places in free space where a scanner may stand, shape ``(V, 3)``.
+        viewpoints: Places in free space where a scanner may stand, shape ``(V, 3)``, at least one.
     """
 
     parts: tuple[Part, ...]

@@ -1,0 +1,114 @@
+"""Cones, cylinders and discs."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from torchrg.scenes.frames import Array, Frame, cos_sin
+from torchrg.scenes.turns import (
+    FULL_TURN,
+    SLACK,
+    Turn,
+    draw_angles,
+    solve_quadratic,
+    turned_box,
+    within_turn,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Cone:
+    """A straight line turned about an axis: a cylinder, a cone, a disc or a ring.
+
+    Args:
+        kind: What it is part of.
+        frame: The third axis is the axis of the turn.
+        start: Distance from the axis and height of one end of the line.
+        end: The same of the other end. The normal points to the right of the way from start to
+            end, seen with the axis up and on the left: a cylinder whose end is above its start
+            has its normals outwards.
+        turn: First and last angle about the axis, from the first axis, in radians.
+
+    Example:
+        >>> pipe = Cone("pipe", Frame.upright(np.zeros(3)), (0.5, 0), (0.5, 2))
+        >>> pipe.normals_at(np.array([[0, 0.5, 1.0]])).tolist()
+        [[0.0, 1.0, 0.0]]
+    """
+
+    kind: str
+    frame: Frame
+    start: tuple[float, float]
+    end: tuple[float, float]
+    turn: Turn = (0.0, FULL_TURN)
+
+    @property
+    def planar(self) -> bool:
+        """Whether it lies in a plane, as a disc does."""
+        return self.start[1] == self.end[1]
+
+    @cached_property
+    def area(self) -> float:
+        """Its area, covered parts included."""
+        (r0, z0), (r1, z1) = self.start, self.end
+        slant = float(np.sqrt((r1 - r0) ** 2 + (z1 - z0) ** 2))
+        return (self.turn[1] - self.turn[0]) * (r0 + r1) / 2 * slant
+
+    @cached_property
+    def bounds(self) -> Array:
+        """Lowest and highest coordinates of a box around it, shape ``(2, 3)``."""
+        heights = sorted((self.start[1], self.end[1]))
+        radii = sorted((self.start[0], self.end[0]))
+        return turned_box(self.frame, radii, heights, self.turn)
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Return points spread evenly over it, shape ``(count, 3)``."""
+        (r0, z0), (r1, z1) = self.start, self.end
+        share = rng.random(count)
+        # The further from the axis, the longer the circle.
+        radius = np.sqrt(r0 * r0 + share * (r1 * r1 - r0 * r0))
+        step = share if r0 == r1 else (radius - r0) / (r1 - r0)
+        cosine, sine = cos_sin(draw_angles(rng, count, self.turn))
+        local = np.stack([radius * cosine, radius * sine, z0 + step * (z1 - z0)], axis=1)
+        return self.frame.to_world(local)
+
+    def normals_at(self, points: Array) -> Array:
+        """Return the unit normals at points on it, shape ``(N, 3)``."""
+        (r0, z0), (r1, z1) = self.start, self.end
+        local = self.frame.to_local(points)
+        slant = np.sqrt((r1 - r0) ** 2 + (z1 - z0) ** 2)
+        outwards, upwards = (z1 - z0) / slant, (r0 - r1) / slant
+        radius = np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2)
+        away = outwards / np.where(radius > 0, radius, 1)
+        axial = np.full_like(away, upwards)
+        return self.frame.turned(np.stack([local[:, 0] * away, local[:, 1] * away, axial], axis=1))
+
+    def intersect(self, origins: Array, directions: Array) -> Array:
+        """Return how far along each ray it is first met, shape ``(N,)``; infinite where never."""
+        start = self.frame.to_local(origins)
+        step = self.frame.turned_back(directions)
+        (r0, z0), (r1, z1) = self.start, self.end
+        if self.planar:
+            distance = (z0 - start[:, 2]) / np.where(step[:, 2] == 0, np.nan, step[:, 2])
+            return self._nearest(start, step, [distance])
+        # On the cone the radius is r0 + slope (z - z0).
+        slope = (r1 - r0) / (z1 - z0)
+        radius = r0 + slope * (start[:, 2] - z0)
+        rise = slope * step[:, 2]
+        a = step[:, 0] ** 2 + step[:, 1] ** 2 - rise**2
+        b = start[:, 0] * step[:, 0] + start[:, 1] * step[:, 1] - radius * rise
+        c = start[:, 0] ** 2 + start[:, 1] ** 2 - radius**2
+        return self._nearest(start, step, solve_quadratic(a, b, c))
+
+    def _nearest(self, start: Array, step: Array, distances: list[Array]) -> Array:
+        """Return the least of the distances that lies on the piece."""
+        (r0, z0), (r1, z1) = self.start, self.end
+        nearest = np.full(len(start), np.inf)
+        for distance in distances:
+            x, y, z = (start + distance[:, None] * step).T
+            rise = np.sqrt(x * x + y * y) - r0 if self.planar else z - z0
+            along = rise / (r1 - r0 if self.planar else z1 - z0)
+            on_line = (along >= -SLACK) & (along <= 1 + SLACK)
+            hit = on_line & within_turn(x, y, self.turn) & (distance > 0)
+            nearest = np.where(hit, np.fmin(nearest, distance), nearest)
+        return nearest
