@@ -1,0 +1,202 @@
+"""The command line: the main job, and one line for every mistake."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from torchrg.cli import COMMANDS, main
+from torchrg.io import read_cloud
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    path = tmp_path_factory.mktemp("room") / "room.npz"
+    assert main(["sample", str(path), "--num-points", "6000", "--seed", "2"]) == 0
+    return path
+
+
+def error_line(capsys):
+    """Return the single line that a command wrote on stderr."""
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+def test_sample_segment_score(room, tmp_path, capsys):
+    out = tmp_path / "seg.npz"
+    assert main(["segment", str(room), "--out", str(out), "--preset", "classic"]) == 0
+    assert "6,000 points" in capsys.readouterr().out
+    assert main(["score", str(out), str(room), "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    external = {"precision", "recall", "f1", "pairs", "regions", "faces", "mean_best_iou", "ari"}
+    assert external | {"precision_iou50", "recall_iou50"} <= set(scores["labels"])
+    assert {"msae", "rms"} <= set(scores["normals"])
+
+
+def test_result_holds_what_the_contract_says(room, tmp_path):
+    out = tmp_path / "seg.npz"
+    main(["segment", str(room), "--out", str(out), "--preset", "classic"])
+    with np.load(out, allow_pickle=False) as result, np.load(room) as source:
+        expected = {"points", "labels", "normals", "curvature", "sharp", "valid", "provenance"}
+        expected |= {f"plane_{name}" for name in ("normal", "offset", "centroid", "area", "count")}
+        assert expected | {"plane_rms"} <= set(result.files)
+        assert np.array_equal(result["points"], source["points"])
+        provenance = json.loads(str(result["provenance"]))
+        num_planes = len(result["plane_count"])
+        assert result["labels"].max() == num_planes - 1
+        on_plane = np.einsum("ij,ij->i", result["plane_normal"], result["plane_centroid"])
+        assert np.allclose(on_plane, result["plane_offset"], atol=1e-6)
+    assert provenance["config"]["normals"]["method"] == "pca"
+    assert set(provenance["versions"]) >= {"torchrg", "torch"}
+
+
+def test_equal_runs_write_equal_bytes(room, tmp_path):
+    for name in ("a.npz", "b.npz"):
+        main(["segment", str(room), "--out", str(tmp_path / name), "--preset", "classic"])
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_flags_win_over_the_file_and_the_file_over_the_defaults(room, tmp_path):
+    config = tmp_path / "my.yaml"
+    config.write_text("normals: {method: pca, k: 30}\ngrowing: {min_size: 77}\n")
+    out = tmp_path / "seg.npz"
+    command = ["segment", str(room), "--out", str(out), "--config", str(config)]
+    assert main([*command, "--growing.min-size", "10", "--growing.max-angle-deg=7"]) == 0
+    with np.load(out) as result:
+        used = json.loads(str(result["provenance"]))["config"]
+    assert (used["normals"]["k"], used["normals"]["method"]) == (30, "pca")
+    assert (used["growing"]["min_size"], used["growing"]["max_angle_deg"]) == (10, 7.0)
+
+
+def test_several_inputs_go_to_a_directory_and_a_bad_one_stops_no_other(room, tmp_path, capsys):
+    bad = tmp_path / "bad.pcd"
+    bad.write_bytes(b"not a cloud")
+    out = tmp_path / "out"
+    command = ["segment", str(bad), str(room), "--out", str(out), "--preset", "classic"]
+    assert main(command) == 3
+    assert sorted(path.name for path in out.iterdir()) == ["room.npz"]
+    assert "1 of 2 inputs failed" in capsys.readouterr().err
+
+
+def test_points_that_are_not_finite_are_counted(room, tmp_path, capsys):
+    points = read_cloud(room).coordinates.copy()
+    points[[3, 9]] = np.nan
+    np.savez(tmp_path / "holes.npz", points=points)
+    command = ["segment", str(tmp_path / "holes.npz"), "--out", str(tmp_path / "seg.npz")]
+    assert main([*command, "--preset", "classic"]) == 0
+    assert "2 of 6,000 points are not finite" in error_line(capsys)
+    with np.load(tmp_path / "seg.npz") as result:
+        assert np.array_equal(result["points"], points, equal_nan=True)
+        assert result["labels"][[3, 9]].tolist() == [-1, -1]
+
+
+def test_equal_points_give_no_region_and_a_warning(tmp_path, capsys):
+    np.save(tmp_path / "one.npy", np.ones((300, 3), dtype=np.float32))
+    command = ["segment", str(tmp_path / "one.npy"), "--out", str(tmp_path / "seg.npz")]
+    assert main(command) == 0
+    assert "no plane found: all points are equal" in error_line(capsys)
+
+
+@pytest.fixture
+def mistakes(tmp_path, room):
+    """Files that cannot be read, by name."""
+    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+    header += "WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
+
+    def pcd(name, fields, promised, held):
+        text = header.format(fields=fields, n=promised).encode()
+        (tmp_path / name).write_bytes(text + bytes(12 * held))
+
+    pcd("short.pcd", "x y z", 100, 7)
+    pcd("huge.pcd", "x y z", 10**12, 7)
+    pcd("fields.pcd", "a b c", 7, 7)
+    pcd("empty.pcd", "x y z", 0, 0)
+    ply = "ply\nformat binary_little_endian 1.0\nelement vertex 100\n"
+    ply += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    (tmp_path / "short.ply").write_bytes(ply.encode() + bytes(50))
+    np.savez(tmp_path / "pickled.npz", points=np.array([{"a": 1}], dtype=object))
+    np.save(tmp_path / "nan.npy", np.full((100, 3), np.nan, dtype=np.float32))
+    (tmp_path / "wrong.yaml").write_text("growing: {max_angle: 3}\n")
+    (tmp_path / "folder.pcd").mkdir()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("file", "flags", "message"),
+    [
+        ("none.pcd", [], "none.pcd"),
+        ("folder.pcd", [], "directory"),
+        ("room.xlsx", [], "suffix"),
+        ("short.pcd", [], "short.pcd"),
+        ("short.ply", [], "short.ply"),
+        ("huge.pcd", [], "huge.pcd"),
+        ("fields.pcd", [], "x, y"),
+        ("empty.pcd", [], "no points"),
+        ("pickled.npz", [], "pickle"),
+        ("nan.npy", [], "finite"),
+        ("ROOM", ["--preset", "clasic"], "classic, consensus"),
+        ("ROOM", ["--config", "wrong.yaml"], "unknown key 'max_angle'"),
+        ("ROOM", ["--config", "none.yaml"], "No such file"),
+        ("ROOM", ["--normals.k", "2"], "expected k >= 3, got 2"),
+        ("ROOM", ["--normals.k", "many"], "--normals.k"),
+        ("ROOM", ["--no-such-flag"], "no-such-flag"),
+        ("ROOM", ["--threads", "0"], "--threads >= 1"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(
+    mistakes, room, monkeypatch, capsys, file, flags, message
+):
+    monkeypatch.chdir(mistakes)
+    source = str(room) if file == "ROOM" else file
+    assert main(["segment", source, "--out", "seg.npz", *flags]) == 2
+    line = error_line(capsys)
+    assert message in line
+    assert "Traceback" not in line
+    assert not os.path.lexists("seg.npz")
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [("seg.docx", "suffix"), ("no/such/seg.npz", "does not exist"), ("folder.pcd/x.npz", None)],
+)
+def test_the_output_is_checked_before_the_work(mistakes, room, monkeypatch, capsys, out, message):
+    monkeypatch.chdir(mistakes)
+    code = main(["segment", str(room), "--out", out, "--preset", "classic"])
+    assert code == (2 if message else 0)
+    if message:
+        assert message in error_line(capsys)
+
+
+def test_scores_need_the_same_points(room, tmp_path, capsys):
+    np.savez(tmp_path / "other.npz", points=np.zeros((5, 3)), labels=np.zeros(5, dtype=int))
+    assert main(["score", str(tmp_path / "other.npz"), str(room)]) == 2
+    assert "expected as many points as" in error_line(capsys)
+
+
+def test_unknown_command_lists_the_known_ones(capsys):
+    assert main(["segmnet"]) == 2
+    line = error_line(capsys)
+    assert all(name in line for name in COMMANDS)
+
+
+def test_help_names_every_command(capsys):
+    assert main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_has_help(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    assert stop.value.code == 0
+    assert f"torchrg {name}" in capsys.readouterr().out
+
+
+def test_info_says_what_a_file_holds(room, capsys):
+    assert main(["info", str(room)]) == 0
+    shown = capsys.readouterr().out
+    assert "6,000 of float32" in shown
+    assert "labels" in shown

@@ -1,0 +1,168 @@
+"""The whole method: right planes, and the same answer however the cloud is given."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.config import PipelineConfig, load_config
+from torchrg.errors import ShapeError
+from torchrg.io import read_cloud
+from torchrg.metrics import score_labels
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+from torchrg.structures import UNLABELED
+
+PRESETS = ["classic", "paper", "consensus"]
+
+
+def small(config):
+    """Return settings that suit a cloud of a few thousand points."""
+    return PipelineConfig(
+        dataclasses.replace(config.normals, k=20),
+        dataclasses.replace(config.growing, min_size=20),
+        config.chunk_size,
+    )
+
+
+@pytest.fixture(scope="module")
+def room():
+    return make_room(8000, 0.003, 1)
+
+
+@pytest.fixture(scope="module", params=PRESETS)
+def config(request):
+    return small(load_config(request.param))
+
+
+def same_partition(a, b):
+    """Return whether two labellings are equal but for the names of regions of equal size."""
+    forward = dict(zip(a.tolist(), b.tolist(), strict=True))
+    return all(forward[x] == y for x, y in zip(a.tolist(), b.tolist(), strict=True)) and (
+        len(set(forward.values())) == len(forward)
+    )
+
+
+def test_box_faces_are_found(config):
+    generator = np.random.default_rng(0)
+    points = generator.random((12000, 3)) * [4, 3, 2.5]
+    face = generator.integers(0, 6, len(points))
+    points[np.arange(len(points)), face // 2] = (face % 2) * np.array([4, 3, 2.5])[face // 2]
+    seg = segment_planes(points, config)
+    scores = score_labels(seg.labels, torch.from_numpy(face))
+    assert scores.recall_iou50 == pytest.approx(100)
+    assert len(seg.planes.count) == 6
+    found = torch.stack([seg.planes.normal.abs().argmax(dim=1), seg.planes.offset.round().long()])
+    assert found.unique(dim=1).shape[1] == 6
+
+
+def test_order_changes_nothing(room, config):
+    shuffled = torch.randperm(len(room.points), generator=torch.Generator().manual_seed(3))
+    plain = segment_planes(room.points, config)
+    other = segment_planes(room.points[shuffled], config)
+    assert torch.equal(other.labels, plain.labels[shuffled])
+    assert torch.equal(other.normals, plain.normals[shuffled])
+    assert torch.equal(other.curvature, plain.curvature[shuffled])
+    assert torch.equal(other.sharp, plain.sharp[shuffled])
+    assert all(torch.equal(a, b) for a, b in zip(other.planes, plain.planes, strict=True))
+
+
+def test_chunks_and_threads_change_nothing(room, config):
+    plain = segment_planes(room.points, config)
+    threads = torch.get_num_threads()
+    try:
+        for chunk_size, num_threads in ((97, 1), (1024, 2), (100_000, 2)):
+            torch.set_num_threads(num_threads)
+            other = segment_planes(room.points, dataclasses.replace(config, chunk_size=chunk_size))
+            assert torch.equal(other.labels, plain.labels)
+            assert torch.equal(other.normals, plain.normals)
+            assert torch.equal(other.curvature, plain.curvature)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("unit", [2.0**-13, 1000.0])
+def test_unit_changes_nothing(room, config, unit):
+    plain = segment_planes(room.points.double(), config)
+    other = segment_planes(room.points.double() * unit, config)
+    agreement = score_labels(other.labels, plain.labels).ari
+    assert agreement > (0.999 if unit == 1000.0 else 1 - 1e-12)
+    assert torch.allclose(other.planes.area.sum(), plain.planes.area.sum() * unit**2, rtol=1e-2)
+
+
+def test_origin_changes_nothing_in_double_precision(room, config):
+    # Coordinates on a grid of 2^-20 m are moved without rounding.
+    points = (room.points.double() * 2**20).round() / 2**20
+    plain = segment_planes(points, config)
+    other = segment_planes(points + torch.tensor([5e5, 4e6, 100.0]), config)
+    assert score_labels(other.labels, plain.labels).ari > 0.999
+
+
+def test_arrays_and_tensors_give_the_same(room, config):
+    assert torch.equal(
+        segment_planes(room.points.numpy(), config).labels,
+        segment_planes(room.points, config).labels,
+    )
+
+
+def test_points_that_are_not_finite_stay_in_place(room, config):
+    spoiled = room.points.clone()
+    spoiled[5] = torch.nan
+    spoiled[100, 2] = torch.inf
+    seg = segment_planes(spoiled, config)
+    kept = torch.ones(len(spoiled), dtype=torch.bool)
+    kept[[5, 100]] = False
+    assert seg.labels[~kept].tolist() == [UNLABELED] * 2
+    assert not seg.valid[~kept].any()
+    assert not seg.normals[~kept].any()
+    assert torch.equal(seg.labels[kept], segment_planes(room.points[kept], config).labels)
+
+
+@pytest.mark.parametrize("size", [0, 1, 2])
+def test_clouds_too_small_for_a_plane_have_none(config, size):
+    seg = segment_planes(torch.rand(size, 3), config)
+    assert seg.labels.tolist() == [UNLABELED] * size
+    assert not seg.valid.any()
+    assert len(seg.planes.count) == 0
+
+
+def test_clouds_smaller_than_k_use_what_they_have(config):
+    triangle = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    seg = segment_planes(triangle, config)
+    assert bool(seg.valid.all())
+    assert torch.equal(seg.normals.abs(), torch.tensor([[0.0, 0, 1]] * 3))
+
+
+def test_equal_points_give_no_region(config):
+    seg = segment_planes(torch.ones(500, 3), config)
+    assert not seg.valid.any()
+    assert bool((seg.labels == UNLABELED).all())
+
+
+def test_labels_are_sorted_by_size(room, config):
+    seg = segment_planes(room.points, config)
+    counts = torch.bincount(seg.labels[seg.labels >= 0])
+    assert torch.equal(counts, seg.planes.count)
+    assert bool((counts.diff() <= 0).all())
+
+
+def test_stages_are_announced_in_order(room, config):
+    stages = []
+    segment_planes(room.points, config, on_stage=stages.append)
+    assert stages == ["neighbors", "normals", "regions", "planes", "done"]
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ShapeError, match=r"expected points of shape \(N, 3\), got \(5, 2\)"):
+        segment_planes(torch.rand(5, 2))
+    with pytest.raises(ShapeError, match="expected points of float32 or float64, got int64"):
+        segment_planes(torch.ones(5, 3, dtype=torch.int64))
+
+
+def test_tutorial_scan_gives_the_regions_of_pcl(scan):
+    # PCL 1.13: NormalEstimationOMP and RegionGrowing, k = 50, 5 degrees, 95th percentile.
+    cloud = read_cloud(scan("region_growing_tutorial.pcd"))
+    seg = segment_planes(cloud.points, load_config("classic"))
+    assert len(seg.planes.count) == 53
+    assert int(seg.planes.count[0]) == 58031
