@@ -1,0 +1,34 @@
+"""Modules give what the functions give."""
+
+import pytest
+import torch
+
+from torchrg import nn as modules
+from torchrg.errors import ConfigError
+from torchrg.linalg import covariance
+from torchrg.robust import qn
+
+
+def test_modules_are_the_functions(rng):
+    patches = torch.randn(6, 30, 3, generator=rng)
+    assert torch.equal(modules.Covariance()(patches)[1], covariance(patches)[1])
+    assert torch.equal(modules.Qn()(patches[..., 0]), qn(patches[..., 0]))
+    corrected = modules.Qn(finite_sample=True)(patches[..., 0])
+    assert torch.equal(corrected, qn(patches[..., 0], finite_sample=True))
+
+
+def test_both_decompositions_agree(rng):
+    matrix = covariance(torch.randn(50, 30, 3, generator=rng, dtype=torch.float64))[1]
+    ours, lapack = modules.Eigh()(matrix), modules.Eigh("linalg")(matrix)
+    assert torch.allclose(ours[0], lapack[0])
+    assert torch.allclose((ours[1] * lapack[1]).sum(dim=-2).abs(), torch.ones(50, 3).double())
+
+
+def test_unknown_decomposition_is_refused():
+    with pytest.raises(ConfigError, match="expected method to be jacobi or linalg, got 'svd'"):
+        modules.Eigh("svd")
+
+
+def test_settings_are_shown():
+    assert repr(modules.Qn(finite_sample=True)) == "Qn(dim=-1, finite_sample=True)"
+    assert repr(modules.Eigh()) == "Eigh(method='jacobi')"

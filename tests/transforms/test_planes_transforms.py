@@ -1,0 +1,85 @@
+"""Transforms call the functions, rename keys, and never change what they are given."""
+
+import pickle
+
+import pytest
+import torch
+
+from torchrg.config import load_config
+from torchrg.errors import ConfigError
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+from torchrg.transforms import EstimateNormals, GrowRegions, SegmentPlanes
+
+
+@pytest.fixture(scope="module")
+def coord():
+    return make_room(4000, 0.003, 0).points
+
+
+def test_segment_planes_is_the_function(coord):
+    sample = SegmentPlanes("classic")({"coord": coord, "name": "room"})
+    seg = segment_planes(coord, load_config("classic"))
+    assert torch.equal(sample["plane"], seg.labels)
+    assert torch.equal(sample["normal"], seg.normals)
+    assert torch.equal(sample["curvature"], seg.curvature)
+    assert sample["name"] == "room"
+
+
+def test_two_steps_give_what_one_gives(coord):
+    config = load_config("classic")
+    steps = torch.nn.Sequential(EstimateNormals(config.normals), GrowRegions(config.growing))
+    whole = SegmentPlanes(config)({"coord": coord})
+    assert torch.equal(steps({"coord": coord})["plane"], whole["plane"])
+
+
+def test_the_given_sample_is_not_changed(coord):
+    sample = {"coord": coord.clone()}
+    SegmentPlanes("classic")(sample)
+    assert list(sample) == ["coord"]
+    assert torch.equal(sample["coord"], coord)
+
+
+def test_keys_can_be_renamed(coord):
+    keys = {"coord": "pos", "plane": "superpoint"}
+    sample = SegmentPlanes("classic", keys=keys)({"pos": coord})
+    assert set(sample) == {"pos", "superpoint", "normal", "curvature"}
+
+
+def test_transforms_survive_pickling(coord):
+    transform = SegmentPlanes("classic", keys={"coord": "pos"})
+    copy = pickle.loads(pickle.dumps(transform))
+    assert torch.equal(copy({"pos": coord})["plane"], transform({"pos": coord})["plane"])
+
+
+def test_points_that_are_not_finite_are_left_out(coord):
+    spoiled = coord.clone()
+    spoiled[7] = torch.nan
+    config = load_config("classic")
+    steps = torch.nn.Sequential(EstimateNormals(config.normals), GrowRegions(config.growing))
+    expected = segment_planes(spoiled, config).labels
+    assert torch.equal(steps({"coord": spoiled})["plane"], expected)
+    assert expected[7] == -1
+
+
+@pytest.mark.parametrize("transform", [EstimateNormals(), GrowRegions(), SegmentPlanes("classic")])
+def test_empty_clouds_pass(transform):
+    empty = torch.empty(0, 3)
+    sample = {"coord": empty, "normal": empty, "curvature": torch.empty(0)}
+    result = transform(sample)
+    assert all(len(value) == 0 for value in result.values())
+
+
+def test_a_missing_key_is_named(coord):
+    with pytest.raises(ConfigError, match="expected a sample with 'coord', got pos"):
+        EstimateNormals()({"pos": coord})
+
+
+def test_an_unknown_key_is_refused():
+    with pytest.raises(ConfigError, match="expected keys to rename coord, normal"):
+        SegmentPlanes("classic", keys={"points": "pos"})
+
+
+def test_settings_are_shown():
+    assert "max_angle_deg=7.0" in repr(GrowRegions(max_angle_deg=7.0))
+    assert "method='pca'" in repr(EstimateNormals(method="pca"))
