@@ -73,9 +73,9 @@ def accept_edges(cloud: GrowingCloud, config: GrowingConfig, rows: slice) -> Edg
     if config.coplanarity and config.coplanarity_scope == "connected":
         everyone = torch.ones_like(joins) if counted is None else counted
         connected = _connected(cloud.neighbors, rows, everyone, min_shared)
-        joins &= _coplanar(cloud, rows, indices, connected, joins, config)
+        joins &= _coplanar(cloud, rows, indices, joins, config.coplanarity_floor, connected)
     elif config.coplanarity:
-        joins &= _coplanar(cloud, rows, indices, counted, joins, config)
+        joins &= _coplanar(cloud, rows, indices, joins, config.coplanarity_floor, None)
     if config.connectivity is None:
         return EdgeBlock(joins, None)
     if connected is None:
@@ -125,17 +125,17 @@ def _coplanar(
     cloud: GrowingCloud,
     rows: slice,
     indices: Tensor,
-    counted: Tensor | None,
     asked: Tensor,
-    config: GrowingConfig,
+    floor_fraction: float,
+    left: Tensor | None,
 ) -> Tensor:
-    """Return which of the asked edges are coplanar by eq. (11), shape ``(n, K)``."""
+    """Return which of the asked edges are coplanar by eq. (11), over the neighbours ``left``."""
     needed = asked.any(dim=1).nonzero().squeeze(-1)
     patches = gather_patches(cloud.points, indices[needed])
-    mask = None if counted is None else counted[needed]
+    counted = None if cloud.neighbors.valid is None else cloud.neighbors.valid[rows][needed]
     residuals = plane_residuals(patches, cloud.normals[rows][needed])
-    floor = config.coplanarity_floor * patch_radii(patches, mask)
-    limits = coplanarity_limits(residuals, floor, mask)
+    floor = floor_fraction * patch_radii(patches, counted)
+    limits = coplanarity_limits(residuals, floor, counted if left is None else left[needed])
     result = torch.zeros_like(asked)
     result[needed] = residuals <= limits[:, None]
     return result

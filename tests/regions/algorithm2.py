@@ -1,0 +1,108 @@
+"""Algorithm 2 of the paper, line by line, for small clouds: the oracle of region growing.
+
+Written from the paper and independent of the library: plain Python numbers, lists and loops. Where
+the paper leaves a choice, the argument has the name and the meaning of the library's setting.
+"""
+
+import math
+
+
+def segment(
+    points,
+    normals,
+    curvature,
+    knn,
+    *,
+    valid=None,
+    k=None,
+    max_angle_deg=5.0,
+    curvature_quantile=0.95,
+    seed_rule="increment",
+    connectivity=0.75,
+    connectivity_scope="region",
+    coplanarity=True,
+    coplanarity_scope="all",
+    coplanarity_floor=0.005,
+    min_size=50,
+):
+    """Return a label for each point; all arguments are lists, points in order of preference.
+
+    ``k`` is the number of neighbours asked for where some lists are shorter.
+    """
+    num_points = len(points)
+    valid = [True] * num_points if valid is None else valid
+    ascending = sorted(c for c, v in zip(curvature, valid, strict=True) if v)
+    sigma_th = ascending[int(curvature_quantile * (len(ascending) - 1))] if ascending else 0.0
+    available = {i for i in range(num_points) if valid[i]}
+    regions = []
+    while available:
+        p_min = min(available, key=lambda i: (curvature[i], i))
+        seeds, region = [p_min], [p_min]
+        available.remove(p_min)
+        for seed in seeds:
+            neighbors = list(knn[seed])
+            connected = [
+                connectivity is None
+                or num_shared(knn, seed, j) >= connectivity * (k or len(knn[seed]))
+                for j in neighbors
+            ]
+            gamma = [residual(points, normals, seed, j) for j in neighbors]
+            if not coplanarity:
+                gamma_th = math.inf
+            else:
+                used = gamma
+                if coplanarity_scope == "connected":
+                    used = [g for g, c in zip(gamma, connected, strict=True) if c]
+                radius = max(math.dist(points[seed], points[j]) for j in neighbors)
+                gamma_th = median(used) + 2 * max(qn(used), coplanarity_floor * radius)
+            for j, is_connected, gamma_j in zip(neighbors, connected, gamma, strict=True):
+                if j not in available:
+                    continue
+                if connectivity_scope == "region" and not is_connected:
+                    continue
+                if gamma_j <= gamma_th and angle_deg(normals[seed], normals[j]) <= max_angle_deg:
+                    region.append(j)
+                    available.remove(j)
+                    if connectivity_scope == "seed" and not is_connected:
+                        continue
+                    if seed_rule == "curvature" and curvature[j] <= sigma_th:
+                        seeds.append(j)
+                    if seed_rule == "increment" and abs(curvature[j] - curvature[seed]) <= sigma_th:
+                        seeds.append(j)
+        regions.append(region)
+    regions.sort(key=lambda region: (-len(region), min(region)))
+    labels = [-1] * num_points
+    for label, region in enumerate(r for r in regions if len(r) >= min_size):
+        for i in region:
+            labels[i] = label
+    return labels
+
+
+def num_shared(knn, i, j):
+    return len(set(knn[i]) & set(knn[j]))
+
+
+def angle_deg(a, b):
+    cosine = abs(sum(x * y for x, y in zip(a, b, strict=True)))
+    return math.degrees(math.acos(min(1.0, cosine)))
+
+
+def residual(points, normals, i, j):
+    return abs(sum((points[j][c] - points[i][c]) * normals[i][c] for c in range(3)))
+
+
+def median(values):
+    ordered = sorted(values)
+    middle = len(ordered) // 2
+    if len(ordered) % 2:
+        return ordered[middle]
+    return (ordered[middle - 1] + ordered[middle]) / 2
+
+
+def qn(values):
+    n = len(values)
+    if n < 2:
+        return 0.0
+    h = n // 2 + 1
+    differences = sorted(abs(values[i] - values[j]) for i in range(n) for j in range(i))
+    return 2.2219 * differences[h * (h - 1) // 2 - 1]

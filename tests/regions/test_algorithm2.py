@@ -1,0 +1,106 @@
+"""The library's labels against a literal Algorithm 2, for every combination of settings."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from pypcd4 import PointCloud
+
+from tests.regions import algorithm2, growing_clouds
+from torchrg.config import GrowingConfig
+from torchrg.neighbors import search_knn
+from torchrg.regions import grow_regions
+
+RULES = [
+    {
+        "seed_rule": seed_rule,
+        "connectivity": connectivity,
+        "connectivity_scope": scope,
+        "coplanarity": coplanarity_scope is not None,
+        "coplanarity_scope": coplanarity_scope or "all",
+    }
+    for seed_rule, (connectivity, scope), coplanarity_scope in itertools.product(
+        ["curvature", "increment"],
+        [(None, "region"), (0.5, "region"), (0.5, "seed")],
+        [None, "all", "connected"],
+    )
+]
+VARIANTS = [
+    {"k": 8, "max_angle_deg": 10.0, "curvature_quantile": 0.8, "min_size": 1},
+    {"k": 12, "max_angle_deg": 25.0, "curvature_quantile": 0.5, "min_size": 5, "ties": 4},
+    {"k": 6, "max_angle_deg": 5.0, "curvature_quantile": 0.95, "min_size": 7, "f32": True},
+]
+
+
+def expected_labels(points, normals, curvature, neighbors, config, valid=None):
+    counted = torch.ones_like(neighbors.indices, dtype=torch.bool)
+    counted = counted if neighbors.valid is None else neighbors.valid
+    knn = [row[c].tolist() for row, c in zip(neighbors.indices, counted, strict=True)]
+    settings = {
+        f.name: getattr(config, f.name)
+        for f in dataclasses.fields(config)
+        if f.name in algorithm2.segment.__kwdefaults__
+    }
+    return algorithm2.segment(
+        points.tolist(),
+        normals.tolist(),
+        curvature.tolist(),
+        knn,
+        k=neighbors.indices.shape[1],
+        valid=None if valid is None else valid.tolist(),
+        **settings,
+    )
+
+
+def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
+    dtype = torch.float32 if f32 else torch.float64
+    cloud = growing_clouds.prepare(coordinates, k, dtype=dtype, ties=ties)
+    for rules in RULES:
+        config = GrowingConfig(**rules, **settings)
+        labels = grow_regions(*cloud, config, canonical=True, chunk_size=64)
+        assert labels.tolist() == expected_labels(*cloud, config), config
+
+
+@pytest.mark.parametrize("variant", range(len(VARIANTS)))
+@pytest.mark.parametrize("kind", growing_clouds.KINDS)
+def test_labels_equal_the_literal_algorithm(kind, variant):
+    rng = np.random.default_rng(variant)
+    check_all_rules(growing_clouds.KINDS[kind](rng), **VARIANTS[variant])
+
+
+@pytest.mark.parametrize("name", ["region_growing_tutorial.pcd", "room_scan1.pcd"])
+@pytest.mark.parametrize("corner", [0.3, 0.6])
+def test_labels_equal_the_literal_algorithm_on_crops_of_scans(scan, name, corner):
+    points = PointCloud.from_path(scan(name)).numpy(("x", "y", "z"))
+    points = points[np.isfinite(points).all(axis=1)]
+    center = points[int(corner * len(points))]
+    nearest = np.argsort(((points - center) ** 2).sum(axis=1), kind="stable")[:250]
+    check_all_rules(points[nearest], k=10, max_angle_deg=8.0, curvature_quantile=0.9, min_size=3)
+
+
+@pytest.mark.parametrize("rules", RULES[::4])
+def test_invalid_points_neither_join_nor_conduct(rules):
+    rng = np.random.default_rng(5)
+    cloud = growing_clouds.prepare(growing_clouds.room(rng, 250, 0.005), 8)
+    valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.7)
+    config = GrowingConfig(**rules, min_size=2, max_angle_deg=15.0)
+    labels = grow_regions(*cloud, config, valid=valid, canonical=True)
+    assert labels.tolist() == expected_labels(*cloud, config, valid)
+    assert (labels[~valid] == -1).all()
+
+
+@pytest.mark.parametrize("rules", RULES[::3])
+def test_neighbors_beyond_the_search_radius_do_not_count(rules):
+    rng = np.random.default_rng(6)
+    points, normals, curvature, neighbors = growing_clouds.prepare(
+        growing_clouds.room(rng, 250, 0.005), 10
+    )
+    limited = search_knn(points, 10, max_distance=0.11, canonical=True)
+    assert not limited.valid.all()
+    config = GrowingConfig(**{**rules, "connectivity": 0.3}, min_size=1, max_angle_deg=15.0)
+    cloud = (points, normals, curvature, limited)
+    labels = grow_regions(*cloud, config, canonical=True)
+    assert labels.tolist() == expected_labels(*cloud, config)
+    assert labels.tolist() != grow_regions(points, normals, curvature, neighbors, config).tolist()
