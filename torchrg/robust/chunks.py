@@ -1,6 +1,6 @@
 """Work on many rows in chunks that fit the cache, on as many threads as torch may use."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
@@ -18,18 +18,26 @@ def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
     ]
 
 
-def run_chunks(work: Callable[[slice], None], chunks: Iterable[slice]) -> None:
-    """Call ``work`` on each chunk, on ``torch.get_num_threads()`` threads.
+def run_chunks(
+    work: Callable[[slice], None], chunks: Sequence[slice], device: torch.device
+) -> None:
+    """Call ``work`` on each chunk, on a CPU on ``torch.get_num_threads()`` threads.
 
-    Every chunk writes its own rows, so the result does not depend on the number of threads. What
-    ``work`` calls has to release the interpreter lock, as NumPy's loops, sorts and partitions do.
+    Threads that each take whole chunks need no synchronisation between operations, which costs
+    more than the operations themselves on tensors that fit the cache. Every chunk writes its own
+    rows, so the result does not depend on the number of threads.
     """
-    todo = list(chunks)
-    num_threads = min(torch.get_num_threads(), len(todo))
-    if num_threads < 2:
-        for chunk in todo:
+    num_threads = torch.get_num_threads()
+    if device.type != "cpu" or num_threads < 2 or len(chunks) < 2:
+        for chunk in chunks:
             work(chunk)
         return
-    with ThreadPoolExecutor(num_threads) as pool:
-        for _ in pool.map(work, todo):
-            pass
+    try:
+        with ThreadPoolExecutor(
+            min(num_threads, len(chunks)), initializer=torch.set_num_threads, initargs=(1,)
+        ) as pool:
+            for _ in pool.map(work, chunks):
+                pass
+    finally:
+        # The initializer changed the default that later threads start with.
+        torch.set_num_threads(num_threads)

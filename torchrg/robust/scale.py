@@ -106,8 +106,8 @@ def qn(
         the American Statistical Association 88, 1993.
 
     Example:
-        >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0], dtype=torch.float64)).item()
-        6.6657
+        >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0]))
+        tensor(6.6657)
     """
 
     def of_sorted(rows: Tensor) -> Tensor:
