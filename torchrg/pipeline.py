@@ -73,6 +73,7 @@ def segment_planes(
         neighbors,
         config.growing,
         valid=fit.valid,
+        canonical=True,
         chunk_size=config.chunk_size,
     )
 

@@ -140,6 +140,7 @@ class GrowRegions(SampleTransform):
             search_knn(cloud, min(self.k, len(cloud)), canonical=True),
             self.config,
             valid=(normals[rows] != 0).any(dim=-1),
+            canonical=True,
         )
         labels = restore_rows(grown, rows, len(points), fill=UNLABELED)
         return {**sample, self.keys["plane"]: labels}
