@@ -5,7 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from torchrg.scenes.frames import Array, Frame, cos_sin
+from torchrg.scenes.frames import Array, Frame, cos_sin, dot
+from torchrg.scenes.surfaces import Plane
 from torchrg.scenes.turns import (
     FULL_TURN,
     SLACK,
@@ -46,6 +47,15 @@ class Cone:
     def planar(self) -> bool:
         """Whether it lies in a plane, as a disc does."""
         return self.start[1] == self.end[1]
+
+    @property
+    def plane(self) -> Plane | None:
+        """Normal and offset of its plane; None if it is curved."""
+        if not self.planar:
+            return None
+        side = 1 if self.start[0] > self.end[0] else -1
+        normal = side * self.frame.axes[2]
+        return normal, float(dot(normal, self.frame.moved(0, 0, self.start[1]).origin))
 
     @cached_property
     def area(self) -> float:

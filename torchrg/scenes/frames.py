@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
 
 _QUARTER_TURN = np.pi / 2
 _SINE = tuple((-1) ** n / math.factorial(2 * n + 1) for n in range(9))
@@ -102,6 +103,11 @@ class Frame:
         axis0 = unit(first)
         axis1 = unit(second - dot(second, axis0) * axis0)
         return cls(origin, np.stack([axis0, axis1, _cross(axis0, axis1)]))
+
+    def placed(self, origin: Triple, first: Triple, second: Triple) -> "Frame":
+        """Return another frame, given in this one by its origin and two directions."""
+        local = Frame.spanned(*(np.array(v, dtype=np.float64) for v in (origin, first, second)))
+        return local.inside(self)
 
     def to_world(self, local: Array) -> Array:
         """Return points of shape ``(N, 3)``, given in this frame, in the world."""

@@ -1,24 +1,24 @@
-"""Objects made of flat faces: blocks, tables, boards, recesses for doors and windows."""
+"""Furniture: blocks, tables, boards, and round things."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from torchrg.scenes.frames import Frame
+from torchrg.scenes.cones import Cone
+from torchrg.scenes.frames import Frame, Triple
+from torchrg.scenes.rings import Ring
 from torchrg.scenes.scene import Part
-from torchrg.scenes.solids import Block
-from torchrg.scenes.surfaces import Flat, rectangle
+from torchrg.scenes.solids import Ball, Block, Drum
+from torchrg.scenes.surfaces import rectangle
 
 SIDES = ("left", "right", "front", "back")
 FACES = (*SIDES, "bottom", "top")
-
-Hole = tuple[float, float, float, float]
 
 
 def block(
     kind: str,
     frame: Frame,
-    size: tuple[float, float, float],
+    size: Triple,
     *,
     without: Collection[str] = (),
     kinds: Mapping[str, str] | None = None,
@@ -51,14 +51,14 @@ def block(
         "top": ((-x / 2, -y / 2, z), (1, 0, 0), (0, 1, 0), x, y),
     }
     surfaces = tuple(
-        rectangle((kinds or {}).get(name, kind), _turned(frame, corner, u, v), width, height)
+        rectangle((kinds or {}).get(name, kind), frame.placed(corner, u, v), width, height)
         for name, (corner, u, v, width, height) in corners.items()
         if name not in without
     )
     return Part(surfaces, (Block(frame, size),))
 
 
-def table(frame: Frame, size: tuple[float, float, float], *, thickness: float, post: float) -> Part:
+def table(frame: Frame, size: Triple, *, thickness: float, post: float) -> Part:
     """Return a table: a plate with all its faces on a square post.
 
     Args:
@@ -83,7 +83,7 @@ def table(frame: Frame, size: tuple[float, float, float], *, thickness: float, p
     return Part(plate.surfaces + stand.surfaces, plate.solids + stand.solids)
 
 
-def board(kind: str, frame: Frame, size: tuple[float, float, float]) -> Part:
+def board(kind: str, frame: Frame, size: Triple) -> Part:
     """Return a plate fixed to a wall by its back: a shelf, or a panel.
 
     Args:
@@ -106,107 +106,51 @@ def board(kind: str, frame: Frame, size: tuple[float, float, float]) -> Part:
     return block(kind, frame, size, without=["back"], kinds=names)
 
 
-def recess(wall: Frame, hole: Hole, depth: float, kind: str) -> Part:
-    """Return what is behind a hole in a wall: a leaf, or a pane, and the four sides to it.
+def round_table(frame: Frame, radius: float, height: float, *, thickness: float) -> Part:
+    """Return a round table: a disc with a curved edge on a round post.
 
     Args:
-        wall: First axis along the wall, second up, third into the room.
-        hole: Left, right, low and high end of the hole along the first two axes.
-        depth: How far behind the wall the leaf is.
-        kind: What the leaf is; the sides are called ``kind`` and "frame".
+        frame: The third axis is up, the origin is on the floor under its middle.
+        radius: Of the plate.
+        height: Of the upper side.
+        thickness: Of the plate.
 
     Returns:
-        Five faces.
+        The table: two discs, the edge and the post.
 
     Example:
-        >>> wall = Frame.spanned(np.zeros(3), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]))
-        >>> recess(wall, (1, 2, 0.02, 2), 0.1, "door").surfaces[0].frame.origin.tolist()
-        [1.0, 0.1, 0.02]
+        >>> desk = round_table(Frame.upright(np.zeros(3)), 0.5, 0.75, thickness=0.04)
+        >>> [surface.plane is None for surface in desk.surfaces]
+        [False, False, True, True]
     """
-    left, right, low, high = hole
-    width, height = right - left, high - low
-    sides = (
-        ((left, low, 0), (0, 0, -1), (0, 1, 0), depth, height),
-        ((right, low, -depth), (0, 0, 1), (0, 1, 0), depth, height),
-        ((left, low, -depth), (0, 0, 1), (1, 0, 0), depth, width),
-        ((left, high, 0), (0, 0, -1), (1, 0, 0), depth, width),
+    under, post = height - thickness, radius / 5
+    surfaces = (
+        Cone("table underside", frame, (0, under), (radius, under)),
+        Cone("table top", frame, (radius, height), (0, height)),
+        Cone("table edge", frame, (radius, under), (radius, height)),
+        Cone("table post", frame, (post, 0), (post, under)),
     )
-    leaf = rectangle(kind, wall.moved(left, low, -depth), width, height)
-    frames: list[Flat] = [
-        rectangle(f"{kind} frame", _turned(wall, corner, u, v), a, b)
-        for corner, u, v, a, b in sides
-    ]
-    return Part((leaf, *frames))
+    plate = Drum(frame.moved(0, 0, under), radius, thickness)
+    return Part(surfaces, (plate, Drum(frame, post, under)))
 
 
-def room_walls(room: Frame, size: tuple[float, float, float]) -> list[Frame]:
-    """Return the frames of the four walls: first axis along the wall, second up, third inwards.
-
-    Example:
-        >>> walls = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))
-        >>> [wall.axes[2].tolist()[:2] for wall in walls]
-        [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]]
-    """
-    length, width, _ = size
-    starts = ((length, 0), (length, width), (0, width), (0, 0))
-    along = ((-1, 0), (0, -1), (1, 0), (0, 1))
-    return [
-        _turned(room, (*start, 0), (*axis, 0), (0, 0, 1))
-        for start, axis in zip(starts, along, strict=True)
-    ]
+def column(frame: Frame, radius: float, height: float) -> Part:
+    """Return a round column from the floor to the ceiling."""
+    side = Cone("column", frame, (radius, 0), (radius, height))
+    return Part((side,), (Drum(frame, radius, height),))
 
 
-def shell(room: Frame, size: tuple[float, float, float], holes: Sequence[Sequence[Hole]]) -> Part:
-    """Return floor, ceiling and four walls with holes in them.
+def ball(frame: Frame, radius: float) -> Part:
+    """Return a ball on the floor."""
+    middle = frame.moved(0, 0, radius)
+    return Part((Ring("ball", middle, 0, radius),), (Ball(middle.origin, radius),))
 
-    Example:
-        >>> walls = shell(Frame.upright(np.zeros(3)), (4, 3, 2.5), [[]] * 4).surfaces
-        >>> [wall.area for wall in walls]
-        [12.0, 12.0, 10.0, 7.5, 10.0, 7.5]
-    """
-    length, width, height = size
-    floor = rectangle("floor", room, length, width)
-    above = _turned(room, (0, width, height), (1, 0, 0), (0, -1, 0))
-    ceiling = rectangle("ceiling", above, length, width)
-    lengths = (length, width, length, width)
-    walls = (
-        rectangle("wall", frame, along, height, openings)
-        for frame, along, openings in zip(room_walls(room, size), lengths, holes, strict=True)
+
+def lamp(frame: Frame, radius: float, height: float) -> Part:
+    """Return a lamp: a ball on a round post of the given height."""
+    post, middle = radius / 5, frame.moved(0, 0, height + 0.9 * radius)
+    surfaces = (
+        Cone("lamp post", frame, (post, 0), (post, height)),
+        Ring("lamp", middle, 0, radius),
     )
-    return Part((floor, ceiling, *walls))
-
-
-def against(wall: Frame, along: float, height: float, depth: float) -> Frame:
-    """Return the frame of an object with its back against a wall.
-
-    Args:
-        wall: See :func:`room_walls`.
-        along: Distance of the object's middle from the start of the wall.
-        height: Of the object's base.
-        depth: Of the object.
-
-    Returns:
-        First axis along the wall, second into it, third up; the origin is the middle of the base.
-
-    Example:
-        >>> wall = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))[0]
-        >>> against(wall, 1, 0.5, 0.4).origin.tolist()
-        [3.0, 0.2, 0.5]
-    """
-    along_axis, up, inwards = wall.axes
-    return Frame(wall.moved(along, height, depth / 2).origin, np.stack([along_axis, -inwards, up]))
-
-
-def _turned(
-    outer: Frame,
-    origin: tuple[float, float, float],
-    first: tuple[float, float, float],
-    second: tuple[float, float, float],
-) -> Frame:
-    """Return the frame of a face, given by its origin and first two axes in another frame."""
-    local = Frame.spanned(
-        np.array(origin, dtype=np.float64),
-        np.array(first, dtype=np.float64),
-        np.array(second, dtype=np.float64),
-    )
-    return local.inside(outer)
+    return Part(surfaces, (Drum(frame, post, height), Ball(middle.origin, radius)))

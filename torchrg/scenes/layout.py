@@ -1,26 +1,23 @@
-"""What stands where in a room: settings, free places, and the rule that planes are distinct."""
+"""What a room contains, and where in it things fit."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
-import numpy as np
-
-from torchrg.scenes.frames import Array, dot
-from torchrg.scenes.scene import Part, plane_table
+from torchrg.errors import ConfigError
+from torchrg.scenes.frames import Triple
 
 _FLOOR_CELL = (1.85, 1.35)  # a table with room to turn, metres
 _WALL_CELL = 1.9  # a window or a cabinet with wall on both sides
 _AISLE = 0.75  # along the walls, for doors and cabinets
-_PARALLEL = 1 - 0.02**2 / 2  # cosine of about one degree
 
 Place = tuple[float, float]
+WallPlace = tuple[int, float]
 
 
 @dataclass(frozen=True)
 class RoomLayout:
     """What is in a room; lengths in metres. The defaults make 153 faces, 35 of them 4 cm wide."""
 
-    size: tuple[float, float, float] = (9.0, 7.0, 2.8)
+    size: Triple = (9.0, 7.0, 2.8)
     """Length, width, height."""
     num_doors: int = 2
     num_windows: int = 3
@@ -35,6 +32,15 @@ class RoomLayout:
     num_small_boxes: int = 2
     """On tables, at most one on each."""
     num_pillars: int = 1
+    num_columns: int = 0
+    """Round pillars."""
+    num_round_tables: int = 0
+    num_balls: int = 0
+    num_lamps: int = 0
+    num_bent_walls: int = 0
+    """Walls that are arcs of large cylinders, without anything on them; up to 4."""
+    wall_bend: float = 0.04
+    """How far the middle of a bent wall bulges into the room."""
     plate_thickness: float = 0.04
     """Of tables and shelves."""
     panel_thickness: float = 0.02
@@ -44,9 +50,31 @@ class RoomLayout:
     """Whether all table tops lie in one plane."""
     min_plane_gap: float = 0.005
     """Least distance of any face to the plane of another face that is parallel to it."""
+    num_viewpoints: int = 1
+    """Places where a scanner may stand, spread along the room."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name.startswith("num_") and value < 0:
+                raise ConfigError(f"RoomLayout: expected {field.name} >= 0, got {value}.")
+        for name, (value, limit) in {
+            "num_small_boxes": (self.num_small_boxes, self.num_tables),
+            "num_bent_walls": (self.num_bent_walls, 4),
+            "wall_bend": (self.wall_bend, min(self.size[:2]) / 8),
+        }.items():
+            if value > limit:
+                raise ConfigError(f"RoomLayout: expected {name} <= {limit}, got {value}.")
+        for name in ("wall_bend", "plate_thickness", "panel_thickness", "num_viewpoints"):
+            if getattr(self, name) <= 0:
+                raise ConfigError(f"RoomLayout: expected {name} > 0, got {getattr(self, name)}.")
+        if min(self.size[:2]) < 1 or self.size[2] < 2.3:
+            raise ConfigError(
+                f"RoomLayout: expected size of at least 1 x 1 x 2.3 metres, got {self.size}."
+            )
 
 
-def wall_places(size: tuple[float, float, float]) -> list[tuple[int, float]]:
+def wall_places(size: Triple) -> list[WallPlace]:
     """Return where things fit on the four walls: wall, and distance from its start.
 
     Example:
@@ -61,7 +89,7 @@ def wall_places(size: tuple[float, float, float]) -> list[tuple[int, float]]:
     ]
 
 
-def floor_places(size: tuple[float, float, float]) -> list[Place]:
+def floor_places(size: Triple) -> list[Place]:
     """Return where things fit on the floor, away from the walls.
 
     Example:
@@ -79,28 +107,3 @@ def _middles(length: float, cell: float) -> list[float]:
     """Return the middles of as many equal cells of at least ``cell`` as fit into a length."""
     count = max(int(length / cell), 0)
     return [length * (number + 0.5) / count for number in range(count)]
-
-
-def shares_plane(part: Part, others: Sequence[Part], min_gap: float) -> bool:
-    """Return whether a face of a part is closer than ``min_gap`` to the plane of a parallel one.
-
-    Args:
-        part: The new object.
-        others: The objects that are there.
-        min_gap: In metres; zero allows everything.
-    """
-    mine = [surface for surface in part.surfaces if surface.planar]
-    theirs = [surface for other in others for surface in other.surfaces if surface.planar]
-    if not mine or not theirs:
-        return False
-    middles = np.stack([surface.bounds.mean(axis=0) for surface in mine])
-    normals, _ = plane_table(mine)
-    planes, offsets = plane_table(theirs)
-    parallel = np.abs(_products(normals, planes)) > _PARALLEL
-    near = np.abs(_products(middles, planes) - offsets) < min_gap
-    return bool((parallel & near).any())
-
-
-def _products(left: Array, right: Array) -> Array:
-    """Return the scalar products of all pairs of rows, shape ``(M, N)``."""
-    return dot(left[:, None], right[None])

@@ -1,4 +1,4 @@
-"""Extruded parts: flat outlines with sharp and rounded corners, and their sides."""
+"""Flat outlines with sharp and rounded corners and round holes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,9 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.scenes.cones import Cone
-from torchrg.scenes.frames import Array, Frame
-from torchrg.scenes.surfaces import Surface, rectangle
+from torchrg.scenes.frames import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +34,8 @@ class Outline:
         """Unit vectors along the edge into and out of each corner, shape ``(M, 2)`` each."""
         edges = np.roll(self.corners, -1, axis=0) - self.corners
         out = edges / np.sqrt((edges * edges).sum(axis=1))[:, None]
-        return np.roll(out, 1, axis=0), out
+        into: Array = np.roll(out, 1, axis=0)
+        return into, out
 
     @cached_property
     def turns(self) -> Array:
@@ -50,7 +49,8 @@ class Outline:
         """Distance from each corner to where its rounding starts, shape ``(M,)``."""
         into, out = self.ways
         # tan(turn / 2) = sin / (1 + cos)
-        return self.radii * np.abs(self.turns) / (1 + (into * out).sum(axis=1))
+        reach: Array = self.radii * np.abs(self.turns) / (1 + (into * out).sum(axis=1))
+        return reach
 
     @cached_property
     def centers(self) -> Array:
@@ -65,7 +65,8 @@ class Outline:
     def angles(self) -> Array:
         """Unsigned turn at each corner in radians, shape ``(M,)``."""
         into, out = self.ways
-        return np.arctan2(np.abs(self.turns), (into * out).sum(axis=1))
+        angles: Array = np.arctan2(np.abs(self.turns), (into * out).sum(axis=1))
+        return angles
 
     @cached_property
     def area(self) -> float:
@@ -94,118 +95,6 @@ class Outline:
             dx, dy = x - middle_x, y - middle_y
             inside &= dx * dx + dy * dy >= radius * radius
         return inside
-
-
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """The flat inside of an outline.
-
-    Args:
-        kind: What it is part of.
-        frame: The outline is in the plane of the first two axes; the third is the normal.
-        outline: Its edge.
-    """
-
-    kind: str
-    frame: Frame
-    outline: Outline
-
-    planar = True
-
-    @property
-    def area(self) -> float:
-        """Its area."""
-        return self.outline.area
-
-    @cached_property
-    def bounds(self) -> Array:
-        """Lowest and highest coordinates of a box around it, shape ``(2, 3)``."""
-        (left, low), (right, high) = (
-            self.outline.corners.min(axis=0),
-            self.outline.corners.max(axis=0),
-        )
-        box = np.array([(x, y, 0) for x in (left, right) for y in (low, high)])
-        world = self.frame.to_world(box)
-        return np.stack([world.min(axis=0), world.max(axis=0)])
-
-    def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return points spread evenly over it, shape ``(count, 3)``."""
-        low, high = self.outline.corners.min(axis=0), self.outline.corners.max(axis=0)
-        drawn, missing = [np.zeros((0, 2))], count
-        while missing > 0:
-            tried = low + (high - low) * rng.random((2 * missing + 16, 2))
-            drawn.append(tried[self.outline.contains(*tried.T)][:missing])
-            missing -= len(drawn[-1])
-        return self.frame.to_world(np.column_stack([np.concatenate(drawn), np.zeros(count)]))
-
-    def normals_at(self, points: Array) -> Array:
-        """Return the outward unit normal at each point, shape ``(N, 3)``."""
-        return np.broadcast_to(self.frame.axes[2], points.shape)
-
-    def intersect(self, origins: Array, directions: Array) -> Array:
-        """Return how far along each ray it is first met, shape ``(N,)``; infinite where never."""
-        start, step = self.frame.to_local(origins), self.frame.turned_back(directions)
-        distance = -start[:, 2] / np.where(step[:, 2] == 0, np.nan, step[:, 2])
-        x, y = start[:, 0] + distance * step[:, 0], start[:, 1] + distance * step[:, 1]
-        return np.where(self.outline.contains(x, y) & (distance > 0), distance, np.inf)
-
-
-def extrude(kind: str, frame: Frame, outline: Outline, height: float) -> tuple[Surface, ...]:
-    """Return the faces of a body with the same outline at every height.
-
-    Args:
-        kind: What it is.
-        frame: The outline is in the plane of the first two axes.
-        outline: Its edge and holes.
-        height: Along the third axis.
-
-    Returns:
-        Bottom, top, the straight sides, the roundings, the holes.
-
-    Example:
-        >>> square = Outline(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), np.array([0.2, 0, 0, 0]))
-        >>> len(extrude("part", Frame.upright(np.zeros(3)), square, 1.0))
-        7
-    """
-    top = Sheet(kind, frame.moved(0, 0, height), outline)
-    mirrored = Outline(
-        (outline.corners * [1, -1])[::-1],
-        outline.radii[::-1],
-        [(x, -y, radius) for x, y, radius in outline.holes],
-    )
-    upside_down = Frame(frame.origin, frame.axes * np.array([[1], [-1], [-1]]))
-    sides: list[Surface] = [Sheet(kind, upside_down, mirrored), top]
-    into, out = outline.ways
-    for corner, following in enumerate(np.roll(np.arange(len(into)), -1)):
-        start = outline.corners[corner] + outline.tangents[corner] * out[corner]
-        end = outline.corners[following] - outline.tangents[following] * into[following]
-        edge = end - start
-        span = Frame.spanned(np.array([*start, 0]), np.array([*edge, 0]), np.array([0, 0, 1.0]))
-        width = float(np.sqrt((edge * edge).sum()))
-        sides.append(rectangle(kind, span.inside(frame), width, height))
-    rounded = (int(corner) for corner in np.flatnonzero(outline.radii))
-    roundings = (_rounding(kind, frame, outline, corner, height) for corner in rounded)
-    holes = (
-        Cone(kind, frame.moved(x, y, 0), (radius, height), (radius, 0))
-        for x, y, radius in outline.holes
-    )
-    return (*sides, *roundings, *holes)
-
-
-def _rounding(kind: str, frame: Frame, outline: Outline, corner: int, height: float) -> Cone:
-    """Return the side along a rounded corner: part of a cylinder, inside out for a fillet."""
-    convex = outline.turns[corner] > 0
-    tangent = outline.corners[corner] - outline.tangents[corner] * outline.ways[0][corner]
-    first = np.array([*(tangent - outline.centers[corner]), 0])
-    # From the first point of the arc the turn is to the left, or for a fillet to the right.
-    second = np.array([-first[1], first[0], 0]) * (1 if convex else -1)
-    middle = np.array([*outline.centers[corner], 0])
-    radius, turn = float(outline.radii[corner]), (0.0, float(outline.angles[corner]))
-    span = Frame.spanned(middle, first, second).inside(frame)
-    if convex:
-        return Cone(kind, span, (radius, 0), (radius, height), turn)
-    # The third axis points down here, so up is towards negative heights.
-    return Cone(kind, span, (radius, 0), (radius, -height), turn)
 
 
 def _in_polygon(x: Array, y: Array, corners: Array) -> NDArray[np.bool_]:

@@ -44,7 +44,7 @@ class Ring:
     arc: Turn = (-np.pi / 2, np.pi / 2)
     turn: Turn = (0.0, FULL_TURN)
 
-    planar = False
+    plane = None
 
     @cached_property
     def area(self) -> float:

@@ -124,7 +124,7 @@ def label_points(
         points=torch.from_numpy(points),
         labels=torch.from_numpy(labels),
         normals=torch.from_numpy(normals),
-        planar=torch.tensor([surface.planar for surface in model.surfaces]),
+        planar=torch.tensor([surface.plane is not None for surface in model.surfaces]),
         face_normals=torch.from_numpy(face_normals),
         face_offsets=torch.from_numpy(face_offsets),
         face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),

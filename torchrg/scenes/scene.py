@@ -91,8 +91,7 @@ class SceneModel:
     @cached_property
     def planes(self) -> tuple[Array, Array]:
         """Normals ``(M, 3)`` and offsets ``(M,)`` of the faces; zero for curved ones."""
-        normals, offsets = plane_table(self.surfaces)
-        return normals, offsets
+        return plane_table(self.surfaces)
 
     @cached_property
     def bounds(self) -> Array:
@@ -137,15 +136,7 @@ class SceneModel:
 
 def plane_table(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
     """Return normals ``(M, 3)`` and offsets ``(M,)`` of surfaces; zero for curved ones."""
-    normals, offsets = [], []
-    for surface in surfaces:
-        corner = surface.bounds[:1]
-        if surface.planar:
-            point = surface.sample(np.random.default_rng(0), 1)
-            normal = surface.normals_at(point)[0]
-            offset = float((normal * point[0]).sum())
-        else:
-            normal, offset = np.zeros_like(corner[0]), 0.0
-        normals.append(normal)
-        offsets.append(offset)
-    return np.array(normals), np.array(offsets)
+    curved = (np.zeros(3), 0.0)
+    planes = [curved if surface.plane is None else surface.plane for surface in surfaces]
+    normals = np.array([normal for normal, _ in planes]).reshape(-1, 3)
+    return normals, np.array([offset for _, offset in planes])

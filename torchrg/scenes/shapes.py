@@ -7,9 +7,10 @@ import numpy as np
 
 from torchrg.errors import ConfigError
 from torchrg.scenes.cones import Cone
+from torchrg.scenes.extrusions import extrude
 from torchrg.scenes.frames import Array, Frame, cos_sin, unit
 from torchrg.scenes.furniture import block
-from torchrg.scenes.outlines import Outline, extrude
+from torchrg.scenes.outlines import Outline
 from torchrg.scenes.rings import Ring
 from torchrg.scenes.sampling import NoiseDirection, Order, sample_scene
 from torchrg.scenes.scene import Part, Scene, SceneModel

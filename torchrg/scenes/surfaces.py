@@ -9,9 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.scenes.frames import Array, Frame
+from torchrg.scenes.frames import Array, Frame, dot
 
 _SLACK = 1e-9  # rays through the seam of two pieces must not slip between them; metres
+
+
+Plane = tuple[Array, float]
 
 
 class Surface(Protocol):
@@ -22,8 +25,8 @@ class Surface(Protocol):
         """What it is part of, as in ``"table edge"``."""
 
     @property
-    def planar(self) -> bool:
-        """Whether it lies in a plane."""
+    def plane(self) -> Plane | None:
+        """Normal and offset of its plane, ``normal . x = offset``; None if it is curved."""
 
     @property
     def area(self) -> float:
@@ -68,7 +71,10 @@ class Flat:
     pieces: Array
     triangular: bool = False
 
-    planar = True
+    @property
+    def plane(self) -> Plane:
+        """Normal and offset of its plane."""
+        return plane_of(self.frame)
 
     @cached_property
     def _piece_areas(self) -> Array:
@@ -130,6 +136,17 @@ class Flat:
         beyond = a + b if self.triangular else np.maximum(a, b)
         inside: NDArray[np.bool_] = (np.minimum(a, b) >= -slack) & (beyond <= 1 + slack)
         return inside
+
+
+def plane_of(frame: Frame) -> Plane:
+    """Return normal and offset of the plane of a frame's first two axes.
+
+    Example:
+        >>> plane_of(Frame.upright(np.array([1.0, 2, 3])))[1]
+        3.0
+    """
+    normal = frame.axes[2]
+    return normal, float(dot(normal, frame.origin))
 
 
 def rectangle(

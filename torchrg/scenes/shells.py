@@ -1,0 +1,149 @@
+"""Rooms without furniture: walls, straight or bent, and holes in them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrg.scenes.cones import Cone
+from torchrg.scenes.frames import Frame, Triple
+from torchrg.scenes.scene import Part
+from torchrg.scenes.solids import Drum
+from torchrg.scenes.surfaces import Surface, rectangle
+
+Hole = tuple[float, float, float, float]
+
+
+def room_walls(room: Frame, size: Triple) -> list[Frame]:
+    """Return the frames of the four walls: first axis along the wall, second up, third inwards.
+
+    Example:
+        >>> walls = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))
+        >>> [wall.axes[2].tolist()[:2] for wall in walls]
+        [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]]
+    """
+    length, width, _ = size
+    starts = ((length, 0), (length, width), (0, width), (0, 0))
+    along = ((-1, 0), (0, -1), (1, 0), (0, 1))
+    return [
+        room.placed((*start, 0), (*axis, 0), (0, 0, 1))
+        for start, axis in zip(starts, along, strict=True)
+    ]
+
+
+def shell(
+    room: Frame,
+    size: Triple,
+    holes: Sequence[Sequence[Hole]],
+    *,
+    bends: Sequence[float] = (0, 0, 0, 0),
+    with_floor: bool = True,
+) -> Part:
+    """Return floor, ceiling and four walls with holes in them.
+
+    Args:
+        room: Its origin is a corner of the floor.
+        size: Length, width and height.
+        holes: For each wall its holes; see :func:`room_walls`.
+        bends: How far the middle of each wall bulges into the room; 0 for a flat wall. Bent walls
+            have no holes.
+        with_floor: Whether there is a floor.
+
+    Returns:
+        The faces, the floor first.
+
+    Example:
+        >>> walls = shell(Frame.upright(np.zeros(3)), (4, 3, 2.5), [[]] * 4).surfaces
+        >>> [wall.area for wall in walls]
+        [12.0, 12.0, 10.0, 7.5, 10.0, 7.5]
+    """
+    length, width, height = size
+    above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
+    surfaces: list[Surface] = [rectangle("floor", room, length, width)] if with_floor else []
+    surfaces.append(rectangle("ceiling", above, length, width))
+    solids: list[Drum] = []
+    walls = zip(room_walls(room, size), (length, width) * 2, holes, bends, strict=True)
+    for frame, along, openings, bend in walls:
+        if bend > 0:
+            surface, body = _bent_wall(frame, along, height, bend)
+            surfaces.append(surface)
+            solids.append(body)
+        else:
+            surfaces.append(rectangle("wall", frame, along, height, openings))
+    return Part(tuple(surfaces), tuple(solids))
+
+
+def _bent_wall(wall: Frame, length: float, height: float, bend: float) -> tuple[Cone, Drum]:
+    """Return an arc of a large cylinder through both ends of a wall, and what is behind it."""
+    radius = length * length / (8 * bend) + bend / 2
+    axis = wall.placed((length / 2, 0, bend - radius), (0, 0, 1), (1, 0, 0))
+    half_turn = float(np.arcsin(length / 2 / radius))
+    surface = Cone("wall", axis, (radius, 0), (radius, height), (-half_turn, half_turn))
+    return surface, Drum(axis, radius, height)
+
+
+def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
+    """Return what is behind a hole in a wall: a leaf, or a pane, and the four sides to it.
+
+    Args:
+        kind: What the leaf is; the sides are called ``kind`` and "frame".
+        wall: First axis along the wall, second up, third into the room.
+        hole: Left, right, low and high end of the hole along the first two axes.
+        depth: How far behind the wall the leaf is.
+
+    Returns:
+        Five faces.
+
+    Example:
+        >>> wall = Frame.spanned(np.zeros(3), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]))
+        >>> recess("door", wall, (1, 2, 0.02, 2), 0.1).surfaces[0].frame.origin.tolist()
+        [1.0, 0.1, 0.02]
+    """
+    left, right, low, high = hole
+    leaf = rectangle(kind, wall.moved(left, low, -depth), right - left, high - low)
+    sill = wall.placed((left, low, -depth), (0, 0, 1), (1, 0, 0))
+    under = rectangle(f"{kind} frame", sill, depth, right - left)
+    return Part((leaf, under, *passage(f"{kind} frame", wall, hole, depth).surfaces))
+
+
+def passage(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
+    """Return the left, right and upper side of a hole through a wall.
+
+    Args:
+        kind: What they are.
+        wall: First axis along the wall, second up, third into the room.
+        hole: Left, right, low and high end of the hole along the first two axes.
+        depth: Thickness of the wall.
+
+    Returns:
+        Three faces.
+    """
+    left, right, low, high = hole
+    sides = (
+        ((left, low, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), high - low),
+        ((right, low, -depth), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), high - low),
+        ((left, high, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), right - left),
+    )
+    return Part(
+        tuple(rectangle(kind, wall.placed(*axes), depth, length) for *axes, length in sides)
+    )
+
+
+def against(wall: Frame, along: float, height: float, depth: float) -> Frame:
+    """Return the frame of an object with its back against a wall.
+
+    Args:
+        wall: See :func:`room_walls`.
+        along: Distance of the object's middle from the start of the wall.
+        height: Of the object's base.
+        depth: Of the object.
+
+    Returns:
+        First axis along the wall, second into it, third up; the origin is the middle of the base.
+
+    Example:
+        >>> wall = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))[0]
+        >>> against(wall, 1, 0.5, 0.4).origin.tolist()
+        [3.0, 0.2, 0.5]
+    """
+    along_axis, up, inwards = wall.axes
+    return Frame(wall.moved(along, height, depth / 2).origin, np.stack([along_axis, -inwards, up]))
