@@ -1,0 +1,177 @@
+"""Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchrg.errors import FormatError
+from torchrg.io.atomic import atomic_path, check_place
+from torchrg.io.e57 import read_e57, write_e57
+from torchrg.io.fields import FileCloud, checked_coordinates
+from torchrg.io.files import check_file
+from torchrg.io.las import read_las, write_las
+from torchrg.io.npy import (
+    cloud_arrays,
+    read_npy,
+    read_npz,
+    write_arrays,
+    write_npy,
+    write_npz,
+)
+from torchrg.io.pcd import read_pcd, write_pcd
+from torchrg.io.ply import read_ply, write_ply
+from torchrg.io.result import check_segmentation, result_arrays, with_segmentation
+from torchrg.io.text import read_text, write_text
+from torchrg.structures import Cloud, Segmentation
+
+__all__ = ["FORMATS", "FileCloud", "atomic_path", "check_output", "read_cloud", "write_cloud"]
+
+
+class Format(NamedTuple):
+    """How a kind of file is read and written."""
+
+    read: Callable[[Path], Cloud]
+    write: Callable[[Path, Cloud], None]
+
+
+FORMATS: dict[str, Format] = {
+    ".npz": Format(read_npz, write_npz),
+    ".npy": Format(read_npy, write_npy),
+    ".ply": Format(read_ply, write_ply),
+    ".pcd": Format(read_pcd, write_pcd),
+    ".las": Format(read_las, write_las),
+    ".laz": Format(read_las, write_las),
+    ".e57": Format(read_e57, write_e57),
+    ".xyz": Format(read_text, write_text),
+    ".txt": Format(read_text, write_text),
+}
+"""Reader and writer by suffix."""
+
+
+def read_cloud(path: str | os.PathLike[str]) -> Cloud:
+    r"""Read a point cloud; the suffix says how.
+
+    Convention:
+        Coordinates and fields stay as they are in the file, points that are not finite included.
+        Fields have one name whatever the format calls them, see :mod:`torchrg.io.fields`:
+        ``labels`` int64, ``normals``, ``curvature``, ``intensity``, ``color`` uint8.
+
+    Args:
+        path: A file with a suffix of :data:`FORMATS`, in any case.
+
+    Returns:
+        The cloud, with at least one point.
+
+    Raises:
+        FormatError: If the file is missing, damaged, or not of a known format. The message begins
+            with the path and names the place and the repair.
+        MissingDependencyError: If the format needs an optional package.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "corner.xyz"
+        >>> _ = path.write_text("0 0 0 255 0 0\n0.5 0 0 0 255 0\n")
+        >>> cloud = read_cloud(path)
+        >>> cloud.coordinates.shape, cloud.fields["color"].tolist()
+        ((2, 3), [[255, 0, 0], [0, 255, 0]])
+    """
+    source = Path(path)
+    try:
+        check_file(source)
+        found = _format_of(source)
+        return found.read(source)
+    except OSError as error:
+        raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
+
+
+def write_cloud(
+    path: str | os.PathLike[str],
+    cloud: Cloud,
+    segmentation: Segmentation | None = None,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a point cloud, or the result of segmenting it; the suffix says how.
+
+    The file appears whole or not at all. What is written reads back with :func:`read_cloud`, in the
+    same order and, but for the grid of ``.las``, to the last bit of the coordinates.
+
+    Convention:
+        A segmentation is written as ``label``, normals and ``curvature`` of each point, beside the
+        cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. ``.npz``
+        holds exactly: ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the
+        plane table as ``plane_normal``, ``plane_offset``, ``plane_centroid``, ``plane_area``,
+        ``plane_count`` and ``plane_rms`` in the input's own coordinates, and ``provenance``. Equal
+        input gives equal bytes (``.e57`` excepted: its files carry random identifiers).
+
+    Args:
+        path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
+        cloud: The cloud.
+        segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
+        provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
+
+    Raises:
+        FormatError: If the format cannot hold the values, or the file cannot be written.
+        MissingDependencyError: If the format needs an optional package.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "corner.ply"
+        >>> write_cloud(path, Cloud(np.eye(3), {"labels": np.array([0, 0, -1])}))
+        >>> read_cloud(path).fields["labels"].tolist()
+        [0, 0, -1]
+    """
+    target = Path(path)
+    found = _format_of(target)
+    check_place(target)
+    cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
+    if segmentation is not None:
+        check_segmentation(target, cloud, segmentation)
+    if found.write is write_npz:
+        arrays = (
+            cloud_arrays(target, cloud)
+            if segmentation is None
+            else result_arrays(cloud, segmentation)
+        )
+        if provenance is not None:
+            arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
+        write_arrays(target, arrays)
+    else:
+        written = cloud if segmentation is None else with_segmentation(cloud, segmentation)
+        found.write(target, written)
+
+
+def check_output(path: str | os.PathLike[str]) -> None:
+    """Check before long work that its result has a place: known suffix, folder there.
+
+    Args:
+        path: Where a file shall be written.
+
+    Raises:
+        FormatError: If :func:`write_cloud` would refuse the path.
+
+    Example:
+        >>> check_output("planes.stl")
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.FormatError: planes.stl: expected a file that ends in one of .npz .npy \
+.ply .pcd .las .laz .e57 .xyz .txt, got '.stl'.
+    """
+    _format_of(Path(path))
+    check_place(path)
+
+
+def _format_of(path: Path) -> Format:
+    """Return the format of a path."""
+    found = FORMATS.get(path.suffix.lower())
+    if found is None:
+        known = " ".join(FORMATS)
+        raise FormatError(
+            f"{path}: expected a file that ends in one of {known}, got {path.suffix!r}."
+        )
+    return found

@@ -1,0 +1,66 @@
+"""Files that appear whole or not at all."""
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from torchrg.errors import FormatError
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a path to write to that takes the place of ``path`` once the block has ended well.
+
+    The file is written beside its final place, flushed to the disk, and moved there in one step. If
+    the block raises, nothing is left behind and an older file stays as it was. The suffix is kept.
+
+    Args:
+        path: Where the file shall be. A symbolic link is followed.
+
+    Yields:
+        The path to write to, in the same folder.
+
+    Raises:
+        FormatError: If the folder does not exist, or the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with atomic_path(folder / "a.txt") as beside:
+        ...     _ = beside.write_text("whole")
+        ...     (folder / "a.txt").exists()
+        False
+        >>> (folder / "a.txt").read_text()
+        'whole'
+    """
+    target = Path(os.path.realpath(path))
+    beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    check_place(path)
+    try:
+        yield beside
+        with beside.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        beside.replace(target)
+    except OSError as error:
+        reason = error.strerror or error
+        raise FormatError(f"{path}: cannot be written: {reason}.") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Check that a file can be put at a path: its folder exists, and it is no directory itself.
+
+    Args:
+        path: Where a file shall be.
+
+    Raises:
+        FormatError: If it cannot.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
+    if not target.parent.is_dir():
+        raise FormatError(f"{path}: there is no folder {target.parent}; make it first.")

@@ -1,0 +1,225 @@
+"""LAS and LAZ through laspy (extra ``las``): scale, offset, reference system and dimensions kept.
+
+Normals, curvature and labels are extra dimensions named ``NormalX``, ``NormalY``, ``NormalZ``,
+``Curvature`` and ``label``, the names PDAL knows where it has one.
+"""
+
+import copy
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrg._optional import require
+from torchrg.errors import FormatError
+from torchrg.io.atomic import atomic_path
+from torchrg.io.columns import Spelling, flatten_cloud
+from torchrg.io.fields import FileCloud, assemble_cloud
+from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
+from torchrg.structures import Cloud
+
+POINTS_AT_ONCE = 1 << 20
+SPELLING = Spelling(normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16)
+COLOR = ("red", "green", "blue")
+WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
+"""By point format without colour, the one that adds it."""
+UNFIT = "_value"
+"""Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
+LARGEST_INTEGER = 2**31 - 1
+DATE_BYTES = (90, 4)
+
+
+def read_las(path: Path) -> Cloud:
+    """Read a LAS or LAZ file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The cloud in float64, with every extra dimension and every standard one that is not zero
+        everywhere; colours as uint8 where eight bits hold them, else uint16. The header is kept for
+        writing.
+
+    Raises:
+        FormatError: If the file is damaged.
+        MissingDependencyError: If laspy is not installed.
+    """
+    laspy = require("laspy", extra="las", purpose="read LAS and LAZ files")
+    size = check_file(path)
+    _check_counts(path, size)
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+            start = header.offset_to_point_data
+            least = 0 if header.are_points_compressed else header.point_format.size
+            check_promise(
+                path,
+                byte=start,
+                promised=header.point_count * least,
+                available=size - start,
+                content=f"{header.point_count:,} points",
+            )
+            # By blocks, so that memory grows with the points that are really there.
+            blocks = [_columns(block) for block in reader.chunk_iterator(POINTS_AT_ONCE)]
+    except FormatError:
+        raise
+    except (laspy.errors.LaspyException, *DAMAGES) as error:
+        raise FormatError(
+            f"{path}: expected a LAS or LAZ file, got: {first_line(error)}; fetch it again."
+        ) from error
+    columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    standard = set(header.point_format.standard_dimension_names)
+    used = {name: c for name, c in columns.items() if name not in standard or c.any()}
+    named = {
+        name.removesuffix(UNFIT) if name.removesuffix(UNFIT) not in used else name: column
+        for name, column in used.items()
+    }
+    return assemble_cloud(path, named, header={"las": header})
+
+
+def write_las(path: Path, cloud: Cloud) -> None:
+    """Write a cloud as a LAS file, or a LAZ file if its suffix says so.
+
+    Args:
+        path: The file.
+        cloud: The cloud. If it came from a LAS file, scale, offset, reference system and point
+            format are kept; otherwise the scale is the smallest power of ten that the grid of 32
+            bits allows.
+
+    Raises:
+        FormatError: If a point is not finite or off the grid, a field has no place in a LAS file,
+            or the file cannot be written.
+        MissingDependencyError: If laspy is not installed.
+    """
+    laspy = require("laspy", extra="las", purpose="write LAS and LAZ files")
+    if not cloud.finite.all():
+        first = int(np.argmin(cloud.finite))
+        raise FormatError(
+            f"{path}: expected finite coordinates, as LAS has no others, got "
+            f"{int((~cloud.finite).sum())} points that are not (first: {first}); "
+            "write .npz, .ply or .pcd."
+        )
+    columns = flatten_cloud(path, cloud, SPELLING)
+    header, has_date = _header(laspy, cloud, colored=all(name in columns for name in COLOR))
+    named = _fitted(path, header.point_format, columns)
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name, column.dtype.str[1:])
+            for name, column in named.items()
+            if name not in header.point_format.dimension_names
+        ]
+    )
+    try:
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = cloud.coordinates.T.astype(np.float64)
+        for name, column in named.items():
+            data[name] = column
+        with atomic_path(path) as beside:
+            data.write(beside)
+            if not has_date:
+                _erase_date(beside)
+    except (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"{path}: cannot be written: {first_line(error)}.") from error
+
+
+def _check_counts(path: Path, size: int) -> None:
+    """Check the numbers of records that laspy would otherwise loop over."""
+    with path.open("rb") as stream:
+        head = stream.read(255)
+        if head[:4] != b"LASF" or len(head) < 227:
+            raise FormatError(f"{path}: byte 0: expected the header of a LAS file; fetch it again.")
+        (num_records,) = struct.unpack_from("<I", head, 100)
+        check_promise(
+            path, byte=100, promised=54 * num_records, available=size, content="header records"
+        )
+        if head[25] < 4 or len(head) < 247:
+            return
+        start, num_extended = struct.unpack_from("<QI", head, 235)
+        for _ in range(num_extended):
+            content = f"{num_extended:,} extended header records"
+            check_promise(path, byte=start, promised=60, available=size - start, content=content)
+            stream.seek(start)
+            (length,) = struct.unpack_from("<Q", stream.read(60), 20)
+            start += 60
+            check_promise(
+                path, byte=start, promised=length, available=size - start, content=content
+            )
+            start += length
+
+
+def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
+    """Return the dimensions of a block of points."""
+    columns: dict[str, NDArray[Any]] = {axis: np.asarray(block[axis]) for axis in "xyz"}
+    for dimension in block.point_format.dimensions:
+        values = np.asarray(block[dimension.name])
+        if dimension.name in ("X", "Y", "Z"):
+            continue
+        if values.ndim == 1:
+            columns[dimension.name] = values
+        else:
+            columns |= {f"{dimension.name}_{i}": part for i, part in enumerate(values.T)}
+    return columns
+
+
+def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
+    """Return the header the cloud came with, or a new one, and whether it has a date."""
+    stored = cloud.header.get("las") if isinstance(cloud, FileCloud) else None
+    if stored is None:
+        header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
+        low, high = cloud.coordinates.min(axis=0), cloud.coordinates.max(axis=0)
+        middle = np.rint((low.astype(np.float64) + high) / 2)
+        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
+        header.offsets = middle
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
+        return header, False
+    number = stored.point_format.id
+    number = WITH_COLOR.get(number, number) if colored else number
+    least = laspy.LasHeader(point_format=number).version
+    header = copy.deepcopy(stored)
+    header.set_version_and_point_format(max(stored.version, least), laspy.PointFormat(number))
+    return header, stored.creation_date is not None
+
+
+def _fitted(
+    path: Path,
+    point_format: Any,  # noqa: ANN401
+    columns: dict[str, NDArray[Any]],
+) -> dict[str, NDArray[Any]]:
+    """Return all columns but x, y, z; those that a standard dimension cannot hold renamed."""
+    fitted = {}
+    for name, column in columns.items():
+        if name in ("x", "y", "z"):
+            continue
+        if name in COLOR and column.dtype == np.uint8:
+            column = column.astype(np.uint16) * 257
+        known = name in point_format.dimension_names
+        if known and not _holds(point_format.dimension_by_name(name), column):
+            name = f"{name}{UNFIT}"
+        if name in ("X", "Y", "Z") or len(name.encode()) > 32:
+            raise FormatError(
+                f"{path}: expected names of at most 32 bytes other than X, Y, Z, got {name!r}; "
+                "rename the field."
+            )
+        fitted[name] = column
+    return fitted
+
+
+def _holds(dimension: Any, column: NDArray[Any]) -> bool:  # noqa: ANN401
+    """Whether a standard dimension holds all values of a column exactly."""
+    if dimension.dtype is not None and dimension.dtype.kind == "f":
+        return bool((column.astype(dimension.dtype) == column).all())
+    whole = np.isfinite(column).all() and (column == np.floor(column)).all()
+    return bool(whole and column.min() >= dimension.min and column.max() <= dimension.max)
+
+
+def _erase_date(path: Path) -> None:
+    """Set the date of creation to none; laspy writes the day, so that equal runs would differ."""
+    start, length = DATE_BYTES
+    with path.open("rb+") as stream:
+        stream.seek(start)
+        stream.write(bytes(length))
