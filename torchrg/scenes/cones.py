@@ -113,7 +113,7 @@ class Cone:
     def _nearest(self, start: Array, step: Array, distances: list[Array]) -> Array:
         """Return the least of the distances that lies on the piece."""
         (r0, z0), (r1, z1) = self.start, self.end
-        nearest = np.full(len(start), np.inf)
+        nearest = np.full(len(step), np.inf)
         for distance in distances:
             x, y, z = (start + distance[:, None] * step).T
             rise = np.sqrt(x * x + y * y) - r0 if self.planar else z - z0

@@ -74,6 +74,18 @@ def unit(vectors: Array) -> Array:
     return result
 
 
+def cross(left: Array, right: Array) -> Array:
+    """Return the vector product of two vectors of shape ``(3,)``.
+
+    Example:
+        >>> cross(np.array([1.0, 0, 0]), np.array([0, 1.0, 0])).tolist()
+        [0.0, 0.0, 1.0]
+    """
+    a, b, c = left
+    d, e, f = right
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """An origin and three orthonormal axes.
@@ -102,7 +114,7 @@ class Frame:
         """Return a frame with its first axis along ``first``, whose first plane has ``second``."""
         axis0 = unit(first)
         axis1 = unit(second - dot(second, axis0) * axis0)
-        return cls(origin, np.stack([axis0, axis1, _cross(axis0, axis1)]))
+        return cls(origin, np.stack([axis0, axis1, cross(axis0, axis1)]))
 
     def placed(self, origin: Triple, first: Triple, second: Triple) -> "Frame":
         """Return another frame, given in this one by its origin and two directions."""
@@ -142,10 +154,3 @@ class Frame:
     def inside(self, outer: "Frame") -> "Frame":
         """Return this frame, given in ``outer``, in the world of ``outer``."""
         return Frame(outer.to_world(self.origin[None])[0], outer.turned(self.axes))
-
-
-def _cross(left: Array, right: Array) -> Array:
-    """Return the vector product of two vectors of shape ``(3,)``."""
-    a, b, c = left
-    d, e, f = right
-    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])

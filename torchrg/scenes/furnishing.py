@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from torchrg.scenes.shells import Hole, recess, room_walls, shell
 T = TypeVar("T")
 _TRIES = 1000
 _PARALLEL = 1 - 0.02**2 / 2  # cosine of about one degree
-_CLEARANCE = 0.3  # around a scanner, metres
+_CLEARANCES = (1.0, 0.6, 0.4, 0.2)  # around a scanner, as much as there is, metres
 _DOORWAY_AISLE = 1.45  # kept free on both sides of the middle of a doorway, metres
 
 
@@ -55,21 +56,21 @@ def free_places(
     Raises:
         ConfigError: If there is no free space.
     """
-    length, width, _ = layout.size
     solids = [solid for part in parts for solid in part.solids]
+    length, width, _ = layout.size
     found: list[Array] = []
-    for number in range(layout.num_viewpoints):
-        for _ in range(_TRIES):
-            x = (number + between(rng, 0.3, 0.7)) / layout.num_viewpoints * length
-            place = room.moved(x, between(rng, 0.3, 0.7) * width, between(rng, 1.4, 1.7)).origin
-            around = place + _CLEARANCE * (2 * rng.random((64, 3)) - 1)
-            if not any(solid.contains(around).any() for solid in solids):
+    for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
+        for _ in range(_TRIES // 20 if len(found) == number else 0):
+            x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
+            place = room.moved(x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)).origin
+            near = place + clearance * (2 * rng.random((64, 3)) - 1)
+            if not any(solid.contains(near).any() for solid in solids):
                 found.append(place)
                 break
-        else:
-            raise ConfigError(
-                "build_room: expected free space for a scanner in the room, got none; enlarge it."
-            )
+    if len(found) < layout.num_viewpoints:
+        raise ConfigError(
+            "build_room: expected free space for a scanner in the room, got none; enlarge it."
+        )
     return np.stack(found)
 
 

@@ -90,7 +90,7 @@ class Ring:
         start = self.frame.to_local(origins)
         step = self.frame.turned_back(directions)
         distances = self._crossings(start, step)
-        nearest = np.full(len(start), np.inf)
+        nearest = np.full(len(step), np.inf)
         for distance in distances:
             x, y, z = (start + distance[:, None] * step).T
             outwards = np.sqrt(x * x + y * y) - self.center
@@ -108,7 +108,7 @@ class Ring:
         unit_step = step / length[:, None]
         shift = -dot(start, unit_step)
         near = (start + shift[:, None] * unit_step) / size
-        roots = np.full((len(start), 4), np.nan)
+        roots = np.full((len(step), 4), np.nan)
         meets = dot(near, near) <= 1
         ring, tube = self.center / size, self.radius / size
         roots[meets] = _torus_crossings(near[meets], unit_step[meets], ring, tube)

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from torchrg.errors import ConfigError
 from torchrg.scenes.frames import Array, dot
+from torchrg.scenes.scans import scan_places
 from torchrg.scenes.scene import Scene, SceneModel
 from torchrg.structures import UNLABELED
 
 NoiseDirection = Literal["normal", "isotropic", "ray"]
-Density = Literal["uniform", "falloff"]
-Order = Literal["random", "face"]
+Density = Literal["uniform", "falloff", "scan"]
+Order = Literal["random", "face", "scan"]
 
 Floats = NDArray[np.float32]
 
@@ -35,8 +36,8 @@ def sample_scene(
     """Sample the visible surface of a scene.
 
     Each point is drawn independently and evenly from all of the surface that has free space in
-    front of it, so the number of points of a face is proportional to its visible area. What is
-    hidden from the scanner by other objects is sampled as well.
+    front of it, so the number of points of a face is proportional to its visible area. What other
+    objects hide from the scanner is sampled as well, but for ``density="scan"``.
 
     Convention:
         The same seed gives the same places on the surface whatever the noise, so the noise of a
@@ -49,11 +50,13 @@ def sample_scene(
         seed: Two calls with equal arguments give equal clouds, on every platform.
         noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
             every direction. ``"ray"``: along the line to the nearest viewpoint of the scene.
-        density: ``"uniform"``, or ``"falloff"``: proportional to 1/r^2 with r the distance to the
-            nearest viewpoint of the scene, and even within a metre of it.
+        density: ``"uniform"``; ``"falloff"``: proportional to 1/r^2 with r the distance to the
+            nearest viewpoint of the scene, and even within a metre of it; ``"scan"``: what a laser
+            scanner at each viewpoint sees, in equal steps of azimuth and elevation.
         outlier_fraction: Share of points spread over the box around the scene instead, which
             belong to no face.
-        order: ``"random"``, or ``"face"``: one face after the other, outliers last.
+        order: ``"random"``; ``"face"``: one face after the other, outliers last; ``"scan"``: as
+            the scanner turns, outliers last, for ``density="scan"`` only.
         colors: Whether to colour the points by object.
 
     Returns:
@@ -75,9 +78,18 @@ def sample_scene(
         density=(density, Density),
         order=(order, Order),
     )
+    if order == "scan" and density != "scan":
+        raise ConfigError(
+            f"sample_scene: expected density='scan' for order='scan', got {density!r}."
+        )
     places, shake, paint = (random_stream(seed, number) for number in range(3))
     num_outliers = round(num_points * outlier_fraction)
-    points, normals, labels = _draw_places(model, num_points - num_outliers, density, places)
+    num_on_faces = num_points - num_outliers
+    if density == "scan":
+        seen, outwards, labels = scan_places(model, num_on_faces, places)
+        points, normals = _float32(seen), _float32(outwards)
+    else:
+        points, normals, labels = _draw_places(model, num_on_faces, density, places)
     if noise > 0:
         points += np.float32(noise) * _displacements(model, points, normals, noise_direction, shake)
     if num_outliers:
@@ -86,9 +98,9 @@ def sample_scene(
         points = np.concatenate([points, stray.astype(np.float32)])
         normals = np.concatenate([normals, np.zeros((num_outliers, 3), dtype=np.float32)])
         labels = np.concatenate([labels, np.full(num_outliers, UNLABELED)])
-    if order == "random":
-        shuffled = places.permutation(num_points)
-        points, normals, labels = points[shuffled], normals[shuffled], labels[shuffled]
+    if order != "scan":
+        rows = places.permutation(num_points) if order == "random" else _by_face(labels)
+        points, normals, labels = points[rows], normals[rows], labels[rows]
     return label_points(model, points, labels, normals, paint if colors else None)
 
 
@@ -159,11 +171,15 @@ def _draw_places(
         share_kept = max(num_kept, 1) / num_tried
     labels = np.concatenate(faces)
     # A random subset: to keep the first would leave the last faces short of points.
-    chosen = rng.permutation(len(labels))[:num_points]
-    chosen = chosen[np.argsort(labels[chosen], kind="stable")]
+    chosen = np.sort(rng.permutation(len(labels))[:num_points])
     points = np.concatenate([rows for rows, _ in drawn])[chosen]
     normals = np.concatenate([rows for _, rows in drawn])[chosen]
     return points, normals, labels[chosen]
+
+
+def _by_face(labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the order of points by face, outliers last."""
+    return np.argsort(np.where(labels == UNLABELED, labels.max() + 1, labels), kind="stable")
 
 
 def _displacements(

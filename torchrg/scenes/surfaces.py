@@ -45,8 +45,8 @@ class Surface(Protocol):
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Return how far along each ray it is first met, shape ``(N,)``; infinite where never.
 
-        ``origins`` and ``directions`` have shape ``(N, 3)``; distances are in lengths of the
-        directions, and only positive ones count.
+        ``origins`` have shape ``(N, 3)`` or ``(1, 3)``, ``directions`` ``(N, 3)``; distances are
+        in lengths of the directions, and only positive ones count.
         """
 
 
