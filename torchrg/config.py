@@ -79,6 +79,12 @@ class GrowingConfig:
         _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
 
+    @property
+    def is_order_free(self) -> bool:
+        """Whether a claimed point spreads by what it is, not by which edge claimed it."""
+        by_edge = self.connectivity is not None and self.connectivity_scope == "seed"
+        return self.seed_rule == "curvature" and not by_edge
+
 
 @dataclass(frozen=True)
 class PipelineConfig:

@@ -29,7 +29,7 @@ def segment(
 
     ``k`` is the number of neighbours asked for where some lists are shorter.
     """
-    num_points = len(points)
+    num_points, k = len(points), k or len(knn[0])
     valid = [True] * num_points if valid is None else valid
     ascending = sorted(c for c, v in zip(curvature, valid, strict=True) if v)
     sigma_th = ascending[int(curvature_quantile * (len(ascending) - 1))] if ascending else 0.0
@@ -42,8 +42,7 @@ def segment(
         for seed in seeds:
             neighbors = list(knn[seed])
             connected = [
-                connectivity is None
-                or num_shared(knn, seed, j) >= connectivity * (k or len(knn[seed]))
+                connectivity is None or num_shared(knn, seed, j) >= connectivity * k
                 for j in neighbors
             ]
             gamma = [residual(points, normals, seed, j) for j in neighbors]

@@ -3,7 +3,9 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.config import GrowingConfig
@@ -15,7 +17,8 @@ from torchrg.regions.criteria import (
     sq_chord_limit,
     sq_chords,
 )
-from torchrg.regions.sharing import shares_at_least
+from torchrg.regions.graph import EdgeBlock
+from torchrg.regions.sharing import SharedNeighbors
 from torchrg.structures import Neighbors
 
 
@@ -37,8 +40,8 @@ class GrowingCloud(NamedTuple):
     valid: Tensor
 
 
-class EdgeBlock(NamedTuple):
-    """Edges from a block of points to their neighbours.
+class AcceptedEdges(NamedTuple):
+    """Which neighbours of a block of points the criteria accept.
 
     Attributes:
         joins: Whether the neighbour joins the region of the point, shape ``(n, K)``, bool.
@@ -50,13 +53,16 @@ class EdgeBlock(NamedTuple):
     connected: Tensor | None
 
 
-def accept_edges(cloud: GrowingCloud, config: GrowingConfig, rows: slice) -> EdgeBlock:
+def accept_edges(
+    cloud: GrowingCloud, config: GrowingConfig, rows: slice, shared: SharedNeighbors
+) -> AcceptedEdges:
     """Tell which neighbours of a block of points may join the points' regions.
 
     Args:
         cloud: The cloud, in canonical order.
         config: Settings; each criterion that is on has to hold.
         rows: The block.
+        shared: Counts of common neighbours of the cloud.
 
     Returns:
         The edges of the block. Those of or to points that are not valid, and those of points to
@@ -72,17 +78,17 @@ def accept_edges(cloud: GrowingCloud, config: GrowingConfig, rows: slice) -> Edg
     min_shared = min_shared_neighbors(config.connectivity, indices.shape[1])
     if config.coplanarity and config.coplanarity_scope == "connected":
         everyone = torch.ones_like(joins) if counted is None else counted
-        connected = _connected(cloud.neighbors, rows, everyone, min_shared)
+        connected = shared.at_least(min_shared, rows, everyone)
         joins &= _coplanar(cloud, rows, indices, joins, config.coplanarity_floor, connected)
     elif config.coplanarity:
         joins &= _coplanar(cloud, rows, indices, joins, config.coplanarity_floor, None)
     if config.connectivity is None:
-        return EdgeBlock(joins, None)
+        return AcceptedEdges(joins, None)
     if connected is None:
-        connected = _connected(cloud.neighbors, rows, joins, min_shared)
+        connected = shared.at_least(min_shared, rows, joins)
     if config.connectivity_scope == "region":
         joins &= connected
-    return EdgeBlock(joins, connected)
+    return AcceptedEdges(joins, connected)
 
 
 def min_shared_neighbors(connectivity: float | None, k: int) -> int:
@@ -101,6 +107,62 @@ def min_shared_neighbors(connectivity: float | None, k: int) -> int:
         (38, 7)
     """
     return 0 if connectivity is None else math.ceil(round(connectivity * k, 9))
+
+
+class EdgeFinder:
+    """Finds the edges of blocks of points, in the form that each way of growing reads.
+
+    Args:
+        cloud: The cloud, in canonical order.
+        config: Settings.
+        limit: Curvature limit, a scalar.
+    """
+
+    def __init__(self, cloud: GrowingCloud, config: GrowingConfig, limit: Tensor) -> None:
+        self._cloud = cloud
+        self._config = config
+        self._limit = limit
+        self._spreads = cloud.curvature <= limit
+        self._shared = SharedNeighbors(cloud.neighbors)
+        self._others: dict[int, tuple[NDArray[np.int32], NDArray[np.int32]]] = {}
+
+    def spreading(self, rows: slice) -> EdgeBlock:
+        """Return the edges of the block's points that spread, and remember those of the others."""
+        joins = accept_edges(self._cloud, self._config, rows, self._shared).joins
+        spreads = self._spreads[rows, None]
+        targets = self._cloud.neighbors.indices[rows].cpu().numpy()
+        sources, columns = (joins & ~spreads).cpu().numpy().nonzero()
+        self._others[rows.start] = (
+            (sources + rows.start).astype(np.int32),
+            targets[sources, columns],
+        )
+        return _pick(targets, joins & spreads)
+
+    def others(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return sources and targets of the edges of points that do not spread, in order."""
+        parts = [self._others[start] for start in sorted(self._others)]
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+    def coded(self, rows: slice) -> EdgeBlock:
+        """Return the block's edges with targets as ``2 * row + (whether it becomes a seed)``."""
+        config, curvature = self._config, self._cloud.curvature
+        edges = accept_edges(self._cloud, config, rows, self._shared)
+        indices = self._cloud.neighbors.indices[rows]
+        target = curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
+        if config.seed_rule == "increment":
+            becomes_seed = (target - curvature[rows, None]).abs() <= self._limit
+        else:
+            becomes_seed = target <= self._limit
+        if edges.connected is not None and config.connectivity_scope == "seed":
+            becomes_seed &= edges.connected
+        codes = indices.to(torch.int32) * 2 + becomes_seed
+        return _pick(codes.cpu().numpy(), edges.joins)
+
+
+def _pick(targets: NDArray[np.int32], accepted: Tensor) -> EdgeBlock:
+    """Return the accepted ones of targets ``(n, K)``."""
+    mask = accepted.cpu().numpy()
+    return EdgeBlock(targets[mask].astype(np.int32, copy=False), np.count_nonzero(mask, axis=1))
 
 
 def _is_candidate(cloud: GrowingCloud, rows: slice, indices: Tensor) -> Tensor:
@@ -139,16 +201,3 @@ def _coplanar(
     result = torch.zeros_like(asked)
     result[needed] = residuals <= limits[:, None]
     return result
-
-
-def _connected(neighbors: Neighbors, rows: slice, asked: Tensor, min_shared: int) -> Tensor:
-    """Return which of the asked edges join points with enough common neighbours, ``(n, K)``."""
-    start, stop, _ = rows.indices(len(neighbors.indices))
-    found = shares_at_least(
-        neighbors.indices.cpu().numpy(),
-        slice(start, stop),
-        asked.cpu().numpy(),
-        min_shared,
-        counted=None if neighbors.valid is None else neighbors.valid.cpu().numpy(),
-    )
-    return torch.from_numpy(found).to(asked.device)

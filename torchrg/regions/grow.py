@@ -1,7 +1,5 @@
 """Region growing: from points, normals and neighbours to labels."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,12 +10,10 @@ from torchrg.config import GrowingConfig
 from torchrg.errors import ShapeError
 from torchrg.neighbors import canonical_order
 from torchrg.regions.components import claim_leftovers, first_to_reach
-from torchrg.regions.edges import GrowingCloud, accept_edges
+from torchrg.regions.edges import EdgeFinder, GrowingCloud
 from torchrg.regions.frontier import grow_in_turn
 from torchrg.regions.graph import pack_edges
 from torchrg.structures import UNLABELED, Neighbors
-
-_Blocks = Iterator[tuple[NDArray[np.int32], NDArray[np.bool_]]]
 
 
 def grow_regions(
@@ -186,65 +182,31 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
     """Return the head of each point's region, by whichever way the settings allow."""
-    num_points, k = cloud.neighbors.indices.shape
     curvature, valid = cloud.curvature.cpu().numpy(), cloud.valid.cpu().numpy()
     order = np.argsort(curvature, kind="stable").astype(np.int32)
     order = order[valid[order]]
     limit = curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
-    if config.seed_rule == "increment" or (
-        config.connectivity is not None and config.connectivity_scope == "seed"
-    ):
-        blocks = _coded_blocks(cloud, config, limit, chunk_size)
-        return grow_in_turn(pack_edges(blocks, num_points, num_points * k), order, valid)
-    spreads = cloud.curvature <= limit
-    seeds = order[spreads.cpu().numpy()[order]]
-    others: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
-    blocks = _joining_blocks(cloud, config, spreads, chunk_size, others)
-    capacity = num_points * k + 2 * len(seeds)
-    heads = first_to_reach(pack_edges(blocks, num_points, capacity), seeds, num_points)
+    finder = EdgeFinder(cloud, config, limit)
+    num_points, k = cloud.neighbors.indices.shape
+    if not config.is_order_free:
+        edges = pack_edges(
+            finder.coded,
+            num_points,
+            capacity=num_points * k,
+            chunk_size=chunk_size,
+            device=cloud.points.device,
+        )
+        return grow_in_turn(edges, order, valid)
+    seeds = order[curvature[order] <= limit.cpu().numpy()]
+    edges = pack_edges(
+        finder.spreading,
+        num_points,
+        capacity=num_points * k + 2 * len(seeds),
+        chunk_size=chunk_size,
+        device=cloud.points.device,
+    )
+    heads = first_to_reach(edges, seeds, num_points)
     # A point that does not spread claims at most its k - 1 neighbours.
     if config.min_size <= k:
-        sources, targets = (np.concatenate(parts) for parts in zip(*others, strict=True))
-        claim_leftovers(sources, targets, heads, order)
+        claim_leftovers(*finder.others(), heads, order)
     return heads
-
-
-def _joining_blocks(
-    cloud: GrowingCloud,
-    config: GrowingConfig,
-    spreads: Tensor,
-    chunk_size: int,
-    others: list[tuple[NDArray[np.int32], NDArray[np.int32]]],
-) -> _Blocks:
-    """Yield neighbours and which of them join, for points that spread; put by the other edges."""
-    for rows in _chunks(len(cloud.points), chunk_size):
-        joins = accept_edges(cloud, config, rows).joins
-        targets = cloud.neighbors.indices[rows].cpu().numpy()
-        spreading = spreads[rows, None]
-        sources, columns = (joins & ~spreading).cpu().numpy().nonzero()
-        others.append(((sources + rows.start).astype(np.int32), targets[sources, columns]))
-        yield targets, (joins & spreading).cpu().numpy()
-
-
-def _coded_blocks(
-    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, chunk_size: int
-) -> _Blocks:
-    """Yield neighbours with the mark of those that become seeds, and which of them join."""
-    for rows in _chunks(len(cloud.points), chunk_size):
-        block = accept_edges(cloud, config, rows)
-        indices = cloud.neighbors.indices[rows]
-        target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
-        if config.seed_rule == "increment":
-            spreads = (target - cloud.curvature[rows, None]).abs() <= limit
-        else:
-            spreads = target <= limit
-        if block.connected is not None and config.connectivity_scope == "seed":
-            spreads &= block.connected
-        codes = indices.to(torch.int32) * 2 + spreads
-        yield codes.cpu().numpy(), block.joins.cpu().numpy()
-
-
-def _chunks(num_points: int, chunk_size: int) -> Iterator[slice]:
-    """Yield the rows of successive blocks."""
-    for start in range(0, num_points, chunk_size):
-        yield slice(start, min(start + chunk_size, num_points))
