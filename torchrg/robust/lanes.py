@@ -1,0 +1,91 @@
+"""Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches (lanes).
+
+Every lane is computed by the same operations in the same order wherever it stands, so a result
+does not depend, to the last bit, on the chunk it was computed in. ``torch.sum`` does not promise
+that: it adds the last lanes of a tensor in another order than the first.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg.robust.scale import sort_rows
+
+
+def split_columns(patches: Tensor) -> list[Tensor]:
+    """Lay patches ``(B, K, P)`` out as P contiguous columns of shape ``(K, B)``."""
+    return list(patches.permute(2, 1, 0).contiguous().unbind(0))
+
+
+def join_columns(columns: list[Tensor]) -> Tensor:
+    """Stack values ``(*)`` of P columns into ``(*, P)``."""
+    return torch.stack(columns, dim=-1)
+
+
+def sum_points(values: Tensor) -> Tensor:
+    """Sum each lane of ``(K, *)`` over its points, in the same order for every lane."""
+    if values.device.type == "cpu":
+        flat = values.reshape(len(values), -1)
+        if flat.shape[1] == 1:
+            # NumPy adds a single column pairwise, two columns row by row.
+            flat = flat.expand(-1, 2).contiguous()
+            return torch.from_numpy(np.add.reduce(flat.numpy(), axis=0))[:1].reshape(
+                values.shape[1:]
+            )
+        return torch.from_numpy(np.add.reduce(flat.numpy(), axis=0)).reshape(values.shape[1:])
+    while len(values) > 1:
+        half = len(values) // 2
+        folded = values[:half] + values[half : 2 * half]
+        values = torch.cat([folded, values[2 * half :]]) if len(values) % 2 else folded
+    return values[0]
+
+
+def sorted_points(values: Tensor) -> Tensor:
+    """Sort each lane of ``(K, M)`` and return the lanes as rows ``(M, K)``."""
+    return sort_rows(values.t().contiguous())
+
+
+def median_points(values: Tensor) -> Tensor:
+    """Median of each lane of ``(K, M)``, shape ``(M,)``."""
+    return median_of_sorted(sorted_points(values))
+
+
+def median_of_sorted(rows: Tensor) -> Tensor:
+    """Median of each sorted row of ``(M, K)``: the mean of the middle two for an even K."""
+    count = rows.shape[1]
+    low, high = rows[:, (count - 1) // 2], rows[:, count // 2]
+    return low if count % 2 else low + (high - low) / 2
+
+
+def smallest_points(distances: Tensor, size: int) -> Tensor:
+    """Mark exactly ``size`` smallest values of each lane; of equal ones the first points win.
+
+    Args:
+        distances: Values, shape ``(K, M)``, without NaN.
+        size: How many to mark, from 1 to K.
+
+    Returns:
+        1 for a marked point, 0 for another, shape ``(K, M)`` and dtype of ``distances``.
+    """
+    num_points = len(distances)
+    if size == num_points:
+        return torch.ones_like(distances)
+    rows = sorted_points(distances)
+    bound = rows[:, size - 1].contiguous()
+    marked = indicator(distances, bound)
+    tied = torch.nonzero(rows[:, size] == bound).squeeze(1)
+    if len(tied):
+        # A threshold alone would mark too many, and C-steps on such subsets can cycle.
+        lanes, limit = distances[:, tied], bound[tied]
+        below, level = (lanes < limit).to(lanes.dtype), (lanes == limit).to(lanes.dtype)
+        room = size - sum_points(below)
+        marked[:, tied] = below + level * (level.cumsum(dim=0) <= room)
+    return marked
+
+
+def indicator(values: Tensor, bound: Tensor) -> Tensor:
+    """1 where ``values <= bound`` and 0 elsewhere, in the dtype of ``values``."""
+    if values.device.type == "cpu":
+        below = np.less_equal(values.numpy(), bound.numpy())
+        return torch.from_numpy(below.astype(values.numpy().dtype))
+    return (values <= bound).to(values.dtype)
