@@ -2,23 +2,34 @@
 
 from torchrg.scenes.cameras import Camera, cameras_around
 from torchrg.scenes.depth import DepthFrame, render_depth
+from torchrg.scenes.halls import HALL_LAYOUT, make_hall
+from torchrg.scenes.kinect import KINECT_LAYOUT, fuse_frames, make_kinect_room
 from torchrg.scenes.layout import RoomLayout
 from torchrg.scenes.rooms import build_room, make_room
 from torchrg.scenes.sampling import sample_scene
 from torchrg.scenes.scene import Scene, SceneModel
 from torchrg.scenes.shapes import SHAPES, make_shape
+from torchrg.scenes.storeys import StoreyLayout, build_storey, make_storey
 
 __all__ = [
+    "HALL_LAYOUT",
+    "KINECT_LAYOUT",
     "SHAPES",
     "Camera",
     "DepthFrame",
     "RoomLayout",
     "Scene",
     "SceneModel",
+    "StoreyLayout",
     "build_room",
+    "build_storey",
     "cameras_around",
+    "fuse_frames",
+    "make_hall",
+    "make_kinect_room",
     "make_room",
     "make_shape",
+    "make_storey",
     "render_depth",
     "sample_scene",
 ]

@@ -19,7 +19,8 @@ T = TypeVar("T")
 _TRIES = 1000
 _PARALLEL = 1 - 0.02**2 / 2  # cosine of about one degree
 _CLEARANCES = (1.0, 0.6, 0.4, 0.2)  # around a scanner, as much as there is, metres
-_DOORWAY_AISLE = 1.45  # kept free on both sides of the middle of a doorway, metres
+_DOORWAY_AISLE = 1.6  # from the middle of a doorway to what is on walls, metres
+_DOORWAY_SPACE = 1.9  # from there to what stands on the floor, for an open door
 
 
 def furnish(
@@ -96,7 +97,11 @@ class _Furnisher:
             [place for place in wall_places(layout.size) if self._is_free(*place)]
         )
         self.floor_places = self._shuffled(
-            [place for place in floor_places(layout.size) if self._is_away(*place)]
+            [
+                (x, y)
+                for x, y in floor_places(layout.size)
+                if self._is_away(room.moved(x, y, 0).origin, _DOORWAY_SPACE)
+            ]
         )
         self.parts = [self._shell()]
 
@@ -138,17 +143,16 @@ class _Furnisher:
         )
 
     def _is_free(self, wall: int, middle: float) -> bool:
-        """Return whether a place on a wall is neither bent nor beside a doorway."""
-        doorways = ((left + right) / 2 for left, right, _, _ in self.holes[wall])
-        near = any(abs(middle - doorway) < _DOORWAY_AISLE for doorway in doorways)
-        return self.bends[wall] == 0 and not near
+        """Return whether a place on a wall is neither bent nor near a doorway."""
+        place = self.walls[wall].moved(middle, 0, 0).origin
+        return self.bends[wall] == 0 and self._is_away(place, _DOORWAY_AISLE)
 
-    def _is_away(self, x: float, y: float) -> bool:
-        """Return whether a place on the floor leaves the way through all doorways free."""
+    def _is_away(self, place: Array, distance: float) -> bool:
+        """Return whether a place on the floor is away from all doorways."""
         for wall, holes in zip(self.walls, self.holes, strict=True):
             for left, right, _, _ in holes:
-                gap = wall.moved((left + right) / 2, 0, 0).origin - self.room.moved(x, y, 0).origin
-                if dot(gap, gap) < _DOORWAY_AISLE**2:
+                gap = wall.moved((left + right) / 2, 0, 0).origin - place
+                if dot(gap, gap) < distance * distance:
                     return False
         return True
 

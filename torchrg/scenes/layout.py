@@ -43,7 +43,8 @@ class RoomLayout:
     """How far the middle of a bent wall bulges into the room."""
     plate_thickness: float = 0.04
     """Of tables and shelves."""
-    panel_thickness: float = 0.02
+    panel_thickness: float = 0.015
+    """Least thickness of panels; each is up to twice as thick, so that no two are in one plane."""
     heading_deg: float = 0.0
     """How far the room is turned about the upward axis."""
     equal_tables: bool = False

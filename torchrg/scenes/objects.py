@@ -40,8 +40,8 @@ def draw_shelf(rng: np.random.Generator, wall: Frame, along: float, thickness: f
 
 
 def draw_panel(rng: np.random.Generator, wall: Frame, along: float, thickness: float) -> Part:
-    """Return an upright board on a wall."""
-    size = (between(rng, 1, 1.5), thickness, between(rng, 0.8, 1.1))
+    """Return an upright board on a wall, up to twice as thick as asked for."""
+    size = (between(rng, 1, 1.5), thickness * between(rng, 1, 2), between(rng, 0.8, 1.1))
     return board("panel", against(wall, along, between(rng, 0.8, 1.1), size[1]), size)
 
 
