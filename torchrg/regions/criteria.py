@@ -1,6 +1,7 @@
 """Which neighbours may join a region: tests of single edges, each a function of tensors."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -24,34 +25,35 @@ def sq_chord_limit(max_angle_deg: float) -> float:
     return (2 * math.sin(math.radians(max_angle_deg) / 2)) ** 2
 
 
-def sq_chords(normals: Tensor, neighbor_normals: Tensor, *, signed: bool = False) -> Tensor:
+def sq_chords(
+    normals: Sequence[Tensor], neighbor_normals: Sequence[Tensor], *, signed: bool = False
+) -> Tensor:
     """Return the squared distance on the unit sphere between normals and those of the neighbours.
 
     Built from ``+ - *`` alone, hence the same to the last bit in every chunk; and exact where the
     normals are equal, so that an angle limit of 0 accepts them.
 
     Args:
-        normals: Unit normals of the points, as three columns, shape ``(3, n)``.
-        neighbor_normals: Unit normals of their neighbours, shape ``(3, n, K)``.
+        normals: Unit normals of the points, three components of shape ``(n, 1)``.
+        neighbor_normals: Unit normals of their neighbours, three components of shape ``(n, K)``.
         signed: Whether opposite normals are far apart (in [0, 4]) or equal (in [0, 2]).
 
     Returns:
         Shape ``(n, K)``.
 
     Example:
-        >>> a = torch.tensor([[0.0], [0.0], [1.0]])
-        >>> sq_chords(a, -a[:, :, None]), sq_chords(a, -a[:, :, None], signed=True)
+        >>> a = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
+        >>> sq_chords(a, -a), sq_chords(a, -a, signed=True)
         (tensor([[0.]]), tensor([[4.]]))
     """
-    own = normals[:, :, None]
+    pairs = list(zip(normals, neighbor_normals, strict=True))
     if signed:
-        first, second, third = (neighbor_normals[axis] - own[axis] for axis in range(3))
+        first, second, third = (b - a for a, b in pairs)
     else:
-        dot = neighbor_normals[0] * own[0]
-        dot += neighbor_normals[1] * own[1]
-        dot += neighbor_normals[2] * own[2]
-        sign = torch.where(dot < 0, -1.0, 1.0).to(own.dtype)
-        first, second, third = (neighbor_normals[axis] - own[axis] * sign for axis in range(3))
+        (a0, b0), (a1, b1), (a2, b2) = pairs
+        dot = a0 * b0 + a1 * b1 + a2 * b2
+        sign = torch.where(dot < 0, -1.0, 1.0).to(dot.dtype)
+        first, second, third = (b - a * sign for a, b in pairs)
     result = first.mul_(first)
     result += second.mul_(second)
     result += third.mul_(third)

@@ -25,6 +25,8 @@ from torchrg.structures import Neighbors
 class GrowingCloud(NamedTuple):
     """What growth reads: a cloud in canonical order with everything known about its points.
 
+    Coordinates and normals are fast to gather when each column is contiguous.
+
     Attributes:
         points: Shape ``(N, 3)``.
         normals: Unit normals, shape ``(N, 3)``.
@@ -177,10 +179,10 @@ def _within_angle(normals: Tensor, rows: slice, indices: Tensor, config: Growing
     if config.max_angle_deg >= 90:
         return torch.ones_like(indices, dtype=torch.bool)
     flat = indices.reshape(-1)
-    gathered = torch.stack(
-        [normals[:, axis].index_select(0, flat).view(indices.shape) for axis in range(3)]
-    )
-    return sq_chords(normals[rows].T, gathered) <= sq_chord_limit(config.max_angle_deg)
+    columns = normals.unbind(dim=1)
+    own = [column[rows, None] for column in columns]
+    theirs = [column.index_select(0, flat).view(indices.shape) for column in columns]
+    return sq_chords(own, theirs) <= sq_chord_limit(config.max_angle_deg)
 
 
 def _coplanar(

@@ -159,9 +159,8 @@ def _checked_cloud(
             f"{neighbors.indices.device}."
         )
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
-    return GrowingCloud(
-        points, normals, curvature, neighbors, finite if valid is None else finite & valid
-    )
+    valid = finite if valid is None else finite & valid
+    return GrowingCloud(_by_column(points), _by_column(normals), curvature, neighbors, valid)
 
 
 def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
@@ -172,12 +171,17 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
     indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
     mask = cloud.neighbors.valid
     return GrowingCloud(
-        cloud.points[order],
-        cloud.normals[order],
+        _by_column(cloud.points[order]),
+        _by_column(cloud.normals[order]),
         cloud.curvature[order],
         Neighbors(indices, None if mask is None else mask[order]),
         cloud.valid[order],
     )
+
+
+def _by_column(vectors: Tensor) -> Tensor:
+    """Return vectors ``(N, 3)`` laid out column by column."""
+    return vectors.T.contiguous().T
 
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
