@@ -1,0 +1,186 @@
+"""Growth: what it refuses, degenerate clouds, and what each setting does."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.regions import growing_clouds
+from torchrg.config import GrowingConfig
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.neighbors import search_knn
+from torchrg.regions import grow_regions
+from torchrg.regions.components import first_to_reach
+from torchrg.regions.graph import EdgeLists
+from torchrg.regions.grow import curvature_limit, number_by_size
+from torchrg.structures import Neighbors
+
+CLASSIC = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
+
+
+def strip(num_points, angle_step_deg):
+    """Points on a line whose normals turn by a step from one to the next."""
+    angle = torch.deg2rad(torch.arange(num_points, dtype=torch.float64) * angle_step_deg)
+    points = torch.zeros(num_points, 3, dtype=torch.float64)
+    points[:, 0] = torch.arange(num_points)
+    normals = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()], dim=1)
+    return points, normals, torch.zeros(num_points, dtype=torch.float64), search_knn(points, 3)
+
+
+def test_angle_limit_is_between_neighbours_and_inclusive():
+    at_limit = strip(10, 4.999999)
+    assert grow_regions(*at_limit, CLASSIC).tolist() == [0] * 10
+    assert grow_regions(*strip(10, 5.000001), CLASSIC).tolist() == list(range(10))
+    same = GrowingConfig(**{**vars(CLASSIC), "max_angle_deg": 0.0})
+    assert grow_regions(*strip(10, 0.0), same).tolist() == [0] * 10
+
+
+def test_right_angles_join_at_a_limit_of_ninety_degrees():
+    points, _, curvature, neighbors = strip(4, 0.0)
+    normals = torch.eye(3, dtype=torch.float64)[[0, 1, 2, 0]]
+    config = GrowingConfig(**{**vars(CLASSIC), "max_angle_deg": 90.0})
+    assert grow_regions(points, normals, curvature, neighbors, config).tolist() == [0] * 4
+
+
+def test_points_above_the_curvature_limit_join_but_do_not_spread():
+    points, normals, curvature, neighbors = strip(9, 0.0)
+    curvature[4] = 0.2
+    config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.5})
+    labels = grow_regions(points, normals, curvature, neighbors, config)
+    assert labels.tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1]
+
+
+def test_the_increment_rule_compares_with_the_point_that_was_joined():
+    points, normals, curvature, neighbors = strip(9, 0.0)
+    curvature = torch.arange(9, dtype=torch.float64) * 0.03125
+    # The limit is 0.03125: each step of curvature is within it, each value but two above.
+    config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.125})
+    by_value = grow_regions(points, normals, curvature, neighbors, config)
+    assert by_value.max() > 1
+    config = GrowingConfig(**{**vars(config), "seed_rule": "increment"})
+    assert grow_regions(points, normals, curvature, neighbors, config).max() == 0
+
+
+def test_curvature_limit_is_the_lower_quantile():
+    values = torch.rand(237, generator=torch.Generator().manual_seed(0))
+    for share in (0.0, 0.5, 0.95, 0.98, 1.0):
+        expected = np.quantile(values.numpy(), share, method="lower")
+        assert curvature_limit(values, share).item() == expected
+
+
+def test_regions_smaller_than_min_size_are_not_labelled():
+    points, normals, curvature, neighbors = strip(10, 0.0)
+    normals[:3] = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    config = GrowingConfig(**{**vars(CLASSIC), "min_size": 4})
+    labels = grow_regions(points, normals, curvature, neighbors, config)
+    assert labels.tolist() == [-1] * 3 + [0] * 7
+
+
+def test_labels_descend_by_size_then_by_first_point():
+    assert number_by_size(np.array([7, 7, 2, 2, 5, 5, 5, -1]), 2).tolist() == [
+        1,
+        1,
+        2,
+        2,
+        0,
+        0,
+        0,
+        -1,
+    ]
+
+
+def test_points_without_finite_normal_or_curvature_do_not_join():
+    points, normals, curvature, neighbors = strip(12, 0.0)
+    normals[3] = torch.nan
+    curvature[7] = torch.nan
+    labels = grow_regions(points, normals, curvature, neighbors, CLASSIC)
+    assert labels[3] == labels[7] == -1
+    # With two neighbours on a line nobody reaches across.
+    assert len(labels.unique()) == 4
+
+
+@pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
+@pytest.mark.parametrize("num_points", [0, 1, 2, 3])
+def test_tiny_clouds_work(config, num_points):
+    points = torch.rand(num_points, 3)
+    k = min(num_points, 3)
+    neighbors = Neighbors(torch.zeros(0, 0, dtype=torch.int32))
+    if num_points:
+        neighbors = search_knn(points, k)
+    normals = torch.eye(3)[torch.full((num_points,), 2)]
+    labels = grow_regions(points, normals, torch.zeros(num_points), neighbors, config)
+    assert labels.tolist() == [0] * num_points
+
+
+@pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
+def test_a_cloud_without_a_valid_point_has_no_region(config):
+    cloud = strip(6, 0.0)
+    nobody = torch.zeros(6, dtype=torch.bool)
+    assert grow_regions(*cloud, config, valid=nobody).tolist() == [-1] * 6
+
+
+@pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
+def test_equal_points_are_one_region(config):
+    points = torch.full((20, 3), 0.3)
+    neighbors = search_knn(points, 5)
+    normals = torch.eye(3)[[2] * 20]
+    labels = grow_regions(points, normals, torch.zeros(20), neighbors, config)
+    assert (labels >= 0).all()
+
+
+def test_exact_and_quantized_walls_do_not_shatter():
+    grid = torch.cartesian_prod(torch.arange(30.0), torch.arange(30.0), torch.zeros(1))
+    step = 1e-3
+    rough = grid + (torch.rand(grid.shape, generator=torch.Generator().manual_seed(1)) * 20 * step)
+    rough[:, 2] = (rough[:, 2] / (20 * step) > 0.9) * step
+    for points in (grid, rough):
+        cloud = growing_clouds.prepare(points.numpy(), 50, dtype=torch.float32)
+        config = GrowingConfig(connectivity=0.5, min_size=1)
+        labels = grow_regions(*cloud, config)
+        assert (labels == 0).float().mean() > 0.97
+
+
+def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
+    num_points = 200_000
+    edges = EdgeLists(
+        np.arange(num_points + 1, dtype=np.int32).clip(max=num_points - 1),
+        np.concatenate([np.arange(1, num_points), np.zeros(2 * num_points + 1)]).astype(np.int32),
+    )
+    seeds = np.arange(num_points, dtype=np.int32)
+    assert not first_to_reach(edges, seeds, num_points).any()
+
+
+def test_numpy_arrays_are_accepted():
+    points, normals, curvature, neighbors = strip(10, 0.0)
+    labels = grow_regions(points.numpy(), normals.numpy(), curvature.numpy(), neighbors, CLASSIC)
+    assert labels.tolist() == [0] * 10
+
+
+def test_wrong_shapes_are_refused():
+    points, normals, curvature, neighbors = strip(10, 0.0)
+    with pytest.raises(
+        ShapeError, match=r"grow_regions: expected normals of shape \(N, 3\) with N=10"
+    ):
+        grow_regions(points, normals[:9], curvature, neighbors)
+    with pytest.raises(ShapeError, match=r"expected curvature of shape \(N\)"):
+        grow_regions(points, normals, normals, neighbors)
+    with pytest.raises(ShapeError, match=r"expected neighbors of shape \(N, K\)"):
+        grow_regions(points, normals, curvature, Neighbors(neighbors.indices[:5]))
+    with pytest.raises(ShapeError, match="of one dtype"):
+        grow_regions(points.float(), normals, curvature, neighbors)
+    with pytest.raises(ShapeError, match="expected valid of bool"):
+        grow_regions(points, normals, curvature, neighbors, valid=curvature)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_angle_deg", 91.0),
+        ("curvature_quantile", 1.1),
+        ("connectivity", -0.1),
+        ("coplanarity_floor", -1.0),
+        ("min_size", 0),
+    ],
+)
+def test_values_out_of_range_are_refused(name, value):
+    with pytest.raises(ConfigError, match=f"GrowingConfig: expected {name} "):
+        GrowingConfig(**{name: value})

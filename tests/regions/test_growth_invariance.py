@@ -1,0 +1,100 @@
+"""Labels do not depend on order, chunks, threads, unit or origin."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.regions import growing_clouds
+from torchrg.config import GrowingConfig, load_config
+from torchrg.neighbors import search_knn
+from torchrg.regions import grow_regions
+from torchrg.structures import Neighbors
+
+PRESETS = {name: load_config(name).growing for name in ("classic", "paper", "consensus")}
+SMALL = {"min_size": 3, "max_angle_deg": 12.0}
+CONFIGS = {name: GrowingConfig(**{**vars(config), **SMALL}) for name, config in PRESETS.items()} | {
+    "seed scope": GrowingConfig(seed_rule="curvature", connectivity_scope="seed", **SMALL)
+}
+
+
+def clouds(kind, seed=0, k=10, **options):
+    return growing_clouds.prepare(
+        growing_clouds.KINDS[kind](np.random.default_rng(seed)), k, **options
+    )
+
+
+def permuted(points, normals, curvature, neighbors, order):
+    """The same cloud with its rows, and the rows its neighbours name, in another order."""
+    row_of = torch.empty_like(order)
+    row_of[order] = torch.arange(len(order))
+    indices = row_of[neighbors.indices[order].long()].to(torch.int32)
+    return points[order], normals[order], curvature[order], Neighbors(indices)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+@pytest.mark.parametrize("kind", ["room", "lattice", "exact room", "blob"])
+def test_labels_follow_the_points_into_any_order(kind, config, rng):
+    cloud = clouds(kind, ties=5)
+    labels = grow_regions(*cloud, config)
+    assert labels.max() > 0
+    order = torch.randperm(len(labels), generator=rng)
+    assert torch.equal(grow_regions(*permuted(*cloud, order), config), labels[order])
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_swapped_duplicates_are_all_that_another_order_changes(config, rng):
+    points, normals, curvature, _ = clouds("doubled", ties=5)
+
+    def labelled_places(order):
+        neighbors = search_knn(points[order], 10)
+        labels = grow_regions(points[order], normals[order], curvature[order], neighbors, config)
+        rows = torch.cat([points[order], labels[:, None].double()], dim=1)
+        return sorted(rows.tolist())
+
+    first = labelled_places(torch.arange(len(points)))
+    assert labelled_places(torch.randperm(len(points), generator=rng)) == first
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_labels_do_not_depend_on_chunk_size_or_threads(config, monkeypatch):
+    cloud = clouds("quantized", dtype=torch.float32)
+    labels = grow_regions(*cloud, config)
+    for chunk_size in (1, 7, 64, 1000):
+        assert torch.equal(grow_regions(*cloud, config, chunk_size=chunk_size), labels)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        assert torch.equal(grow_regions(*cloud, config, chunk_size=50), labels)
+        torch.set_num_threads(1)
+        assert torch.equal(grow_regions(*cloud, config, chunk_size=50), labels)
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+@pytest.mark.parametrize("kind", ["noisy room", "exact room", "lattice"])
+def test_labels_do_not_depend_on_unit_or_origin(kind, config):
+    points, normals, curvature, neighbors = clouds(kind)
+    labels = grow_regions(points, normals, curvature, neighbors, config)
+    for moved in (points * 1e-4, points * 1e3, points + torch.tensor([5e6, -5e6, 100.0])):
+        again = grow_regions(moved, normals, curvature, neighbors, config, canonical=True)
+        assert torch.equal(again, labels)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_the_sign_of_normals_does_not_matter(config, rng):
+    points, normals, curvature, neighbors = clouds("room")
+    sign = torch.randint(0, 2, (len(points), 1), generator=rng) * 2.0 - 1
+    first = grow_regions(points, normals, curvature, neighbors, config)
+    again = grow_regions(points, normals * sign, curvature, neighbors, config)
+    assert torch.equal(again, first)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_float32_and_float64_agree(config):
+    points, normals, curvature, neighbors = clouds("room")
+    double = grow_regions(points, normals, curvature, neighbors, config)
+    single = grow_regions(
+        points.float(), normals.float(), curvature.float(), neighbors, config, canonical=True
+    )
+    assert torch.equal(single, double)
