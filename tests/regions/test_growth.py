@@ -51,9 +51,9 @@ def test_points_above_the_curvature_limit_join_but_do_not_spread():
 
 def test_the_increment_rule_compares_with_the_point_that_was_joined():
     points, normals, curvature, neighbors = strip(9, 0.0)
-    curvature = torch.arange(9, dtype=torch.float64) * 0.03125
-    # The limit is 0.03125: each step of curvature is within it, each value but two above.
-    config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.125})
+    curvature = (torch.arange(9, dtype=torch.float64) - 1).clamp(min=0) / 32
+    # The limit is 1/32: each step of curvature is within it, most values are above.
+    config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.25})
     by_value = grow_regions(points, normals, curvature, neighbors, config)
     assert by_value.max() > 1
     config = GrowingConfig(**{**vars(config), "seed_rule": "increment"})
