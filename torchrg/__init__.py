@@ -1,3 +1,32 @@
 """Robust normals, curvature and plane labels for indoor point clouds."""
 
+from torchrg import metrics, nn, normals, robust, scenes, transforms
+from torchrg.config import load_config
+from torchrg.errors import TorchrgError
+from torchrg.io import read_cloud, write_cloud
+from torchrg.neighbors import search_knn
+from torchrg.normals import estimate_normals
+from torchrg.pipeline import segment_planes
+from torchrg.regions import grow_regions
+from torchrg.structures import UNLABELED, Cloud
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "UNLABELED",
+    "Cloud",
+    "TorchrgError",
+    "estimate_normals",
+    "grow_regions",
+    "load_config",
+    "metrics",
+    "nn",
+    "normals",
+    "read_cloud",
+    "robust",
+    "scenes",
+    "search_knn",
+    "segment_planes",
+    "transforms",
+    "write_cloud",
+]

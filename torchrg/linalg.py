@@ -192,8 +192,8 @@ def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
         Angles in [0, 90], same shape, right to 1e-7 (float32) or 1e-8 degrees (float64).
 
     Example:
-        >>> sq_chord_to_deg(torch.tensor([0.0, 1.0, 2.0])).tolist()
-        [0.0, 60.0, 90.0]
+        >>> sq_chord_to_deg(torch.tensor([0.0, 1.0, 2.0]))
+        tensor([ 0.0000, 60.0000, 90.0000])
     """
     # asin(x) / x as a polynomial of x^2 on [0, 1/2], where x is half the chord.
     sq_half = (sq_chord / 4).clamp(max=0.5)

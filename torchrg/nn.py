@@ -62,7 +62,7 @@ class Qn(nn.Module):
 
     Example:
         >>> Qn()(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0]))
-        tensor(4.4438)
+        tensor(2.2219)
     """
 
     def __init__(self, dim: int = -1, *, finite_sample: bool = False) -> None:

@@ -44,8 +44,8 @@ def find_sharp_points(
         ConfigError: If ``rule`` is unknown.
 
     Example:
-        >>> normals = torch.tensor([[0.0, 0, 1]] * 3 + [[1.0, 0, 0]] * 3)
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2, 3], [2, 3, 4, 5]]))
+        >>> normals = torch.tensor([[0.0, 0, 1]] * 3 + [[0.6, 0, 0.8], [1.0, 0, 0]])
+        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [2, 3, 4]]))
         >>> find_sharp_points(normals, neighbors)
         tensor([False,  True])
     """
