@@ -1,10 +1,14 @@
 """Least-squares planes: the classic estimator, and the last step of every robust one."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg import covariance, eigh3, rank_tolerance
+from torchrg.normals.chunks import coordinate_resolution
+from torchrg.normals.frame import PrincipalFrame, principal_frame, root
 from torchrg.structures import NormalFit
 
 
@@ -19,6 +23,7 @@ def fit_normals_pca(
     Convention:
         The sign of a normal is arbitrary. Gradients flow through normals, curvature and residual,
         and are finite where two eigenvalues are equal: the turn between the two is left out.
+        ``torch.vmap`` and ``torch.compile(fullgraph=True)`` work.
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, 3)``.
@@ -44,66 +49,136 @@ def fit_normals_pca(
         >>> fit_normals_pca(patches).normals.abs()
         tensor([0., 0., 1.])
     """
-    check_shapes("fit_normals_pca", patches=(patches, "* K 3"), mask=(mask, "* K"))
-    check_shapes("fit_normals_pca", patches=(patches[..., 0, 0], "*"), resolution=(resolution, "*"))
-    check_floating("fit_normals_pca", patches=patches, resolution=resolution)
+    check_patches("fit_normals_pca", patches, mask, resolution)
+    fit, _ = fit_plane(patches, mask, resolution=resolution)
+    return fit
+
+
+def fit_plane(
+    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
+) -> tuple[NormalFit, PrincipalFrame]:
+    """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from.
+
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
+        mask: Which points count, shape ``(*, K)``, bool.
+        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
+
+    Returns:
+        Fit and frame.
+
+    Example:
+        >>> _, frame = fit_plane(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [2, 1, 0]]))
+        >>> frame.vectors[:, 2].abs()
+        tensor([1., 0., 0.])
+    """
     _, matrix = covariance(patches, mask)
+    frame = principal_frame(matrix)
     with torch.no_grad():
-        values, vectors = eigh3(matrix)
-        valid = _spans_a_plane(patches, mask, values, resolution)
-    normals, smallest = vectors[..., 0], values[..., 0].clamp(min=0)
-    if matrix.requires_grad:
-        normals, smallest = _differentiable(matrix, values, vectors)
+        valid = _spans_plane(patches, mask, frame.values, resolution)
+    normals, smallest = frame.normals, frame.smallest
     total = matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
     curvature = (smallest / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    rms = torch.where(smallest > 0, smallest, 1.0).sqrt() * (smallest > 0)
-    return NormalFit(
+    fit = NormalFit(
         torch.where(valid[..., None], normals, 0.0),
         torch.where(valid, curvature, 0.0),
         valid,
-        residual_rms=torch.where(valid, rms, 0.0),
+        residual_rms=torch.where(valid, root(smallest), 0.0),
     )
+    return fit, frame
 
 
-def _spans_a_plane(
+def check_patches(
+    caller: str, patches: Tensor, mask: Tensor | None, resolution: Tensor | None
+) -> None:
+    """Check the arguments of an estimator of patches.
+
+    Raises:
+        ShapeError: If a shape or dtype is wrong.
+
+    Example:
+        >>> check_patches("f", torch.zeros(8, 2), None, None)
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected patches of shape (*, K, 3), got (8, 2).
+    """
+    check_shapes(caller, patches=(patches, "* K 3"), mask=(mask, "* K"))
+    check_shapes(caller, patches=(patches[..., 0, 0], "*"), resolution=(resolution, "*"))
+    check_floating(caller, patches=patches, resolution=resolution)
+
+
+@torch.library.custom_op("torchrg::spans_plane", mutates_args=())
+def _spans_plane(
     patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None
 ) -> Tensor:
     """Return whether the second direction of each patch is more than rounding.
 
-    A covariance holds squares, so its own rounding hides widths below 1e-3 of the length in
-    float32; the few patches as narrow as that are decided in double precision.
+    A covariance holds squares, so its own rounding hides widths below the root of its precision;
+    the few patches that narrow are looked at again. Which these are depends on the data: as an
+    operator of its own, neither compilers nor vmap see that.
     """
-    num_points = patches.shape[-2]
-    longest, second = values[..., 2], values[..., 1]
-    valid = longest > 0
-    narrow = valid & (second < 1e-3 * longest)
-    if patches.dtype == torch.float32 and bool(narrow.any()):
-        inside = None if mask is None else mask[narrow]
-        exact, _ = eigh3(covariance(patches[narrow].double(), inside)[1])
-        longest, second = longest.double(), second.double()
-        longest[narrow], second[narrow] = exact[:, 2], exact[:, 1]
-    flat = rank_tolerance(num_points, patches.dtype) * longest.clamp(min=0).sqrt()
-    if resolution is not None:
-        flat = torch.maximum(flat, resolution.to(flat.dtype))
-    valid = valid & (second.clamp(min=0).sqrt() > flat)
+    if resolution is None:
+        resolution = patch_resolution(patches, mask)
+    lengths, widths = (values[..., axis].clamp(min=0).sqrt() for axis in (2, 1))
+    narrow = widths < 0.03 * lengths
+    if bool(narrow.any()):
+        widths = widths.double()
+        widths[narrow] = _width(patches[narrow], None if mask is None else mask[narrow])
+    flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
+    valid = widths > flat
+    return valid if mask is None else valid & (mask.sum(dim=-1) >= 3)
+
+
+@_spans_plane.register_fake
+def _(patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None) -> Tensor:
+    return patches.new_empty(patches.shape[:-2], dtype=torch.bool)
+
+
+@_spans_plane.register_vmap
+def _(
+    info: Any,  # noqa: ANN401
+    in_dims: tuple[int | None, ...],
+    *arguments: Tensor | None,
+) -> tuple[Tensor, int]:
+    batched = [
+        argument
+        if argument is None
+        else argument.expand(info.batch_size, *argument.shape)
+        if dim is None
+        else argument.movedim(dim, 0)
+        for argument, dim in zip(arguments, in_dims, strict=True)
+    ]
+    return _spans_plane(*batched), 0
+
+
+def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the root mean square extent of long patches across their length, shape ``(n,)``."""
+    mean, matrix = covariance(patches.double(), mask)
+    direction = eigh3(matrix)[1][..., 2]
+    offsets = patches - mean[..., None, :]
     if mask is not None:
-        valid = valid & (mask.sum(dim=-1) >= 3)
-    return valid
+        offsets = torch.where(mask[..., None], offsets, 0.0)
+    along = (offsets * direction[..., None, :]).sum(dim=-1, keepdim=True)
+    across = offsets - along * direction[..., None, :]
+    # The direction is right to rounding only; what is left of the length would look like width.
+    slope = (along * across).sum(dim=-2, keepdim=True) / (along * along).sum(dim=-2, keepdim=True)
+    _, matrix = covariance(across - along * slope, mask)
+    return eigh3(matrix)[0][..., 2].clamp(min=0).sqrt()
 
 
-def _differentiable(matrix: Tensor, values: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first eigenvector and eigenvalue with their first-order gradients.
+def patch_resolution(patches: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the rounding of coordinate differences in each patch.
 
-    With the decomposition held constant, one step of perturbation theory changes nothing in value
-    and everything in gradient: ``dn = sum_j v_j (v_j . dA n) / (l0 - l_j)``.
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
+        mask: Which points count, shape ``(*, K)``, bool; the others may hold NaN.
+
+    Returns:
+        Shape ``(*)``, in the unit of the cloud.
+
+    Example:
+        >>> patch_resolution(torch.full((8, 3), 1000.0)) > 1e-4
+        tensor(True)
     """
-    smallest, normal = values[..., :1], vectors[..., :1]
-    gap = smallest - values[..., 1:]
-    distinct = gap.abs() > rank_tolerance(3, values.dtype) * values[..., 2:]
-    turn = (vectors[..., 1:].mT @ (matrix @ normal)).squeeze(-1)
-    turn = turn - turn.detach()
-    step = torch.where(distinct, turn / torch.where(distinct, gap, 1.0), 0.0)
-    moved = normal.squeeze(-1) + (vectors[..., 1:] @ step[..., None]).squeeze(-1)
-    value = (normal.mT @ matrix @ normal).squeeze(-1)
-    value = smallest + value - value.detach()
-    return moved, value.squeeze(-1).clamp(min=0)
+    counted = patches if mask is None else torch.where(mask[..., None], patches, 0.0)
+    return coordinate_resolution(counted.detach().flatten(-2))
