@@ -12,6 +12,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.detmcd import fit_normals_detmcd
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.normals.sharp import find_sharp_points
@@ -28,7 +29,7 @@ __all__ = [
 
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 
-ESTIMATORS: dict[str, Estimator] = {"paper": estimate_paper}
+ESTIMATORS: dict[str, Estimator] = {"paper": estimate_paper, "consensus": estimate_consensus}
 """Estimators by name: points, their neighbours, settings, chunk size -> fit."""
 
 

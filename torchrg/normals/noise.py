@@ -1,0 +1,152 @@
+"""How noisy the points are, from neighbourhoods of several sizes."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg.linalg import covariance
+from torchrg.neighbors import gather_patches
+from torchrg.normals.chunks import coordinate_resolution
+from torchrg.normals.columns import fit_planes, residuals, split_columns, sq_lengths
+from torchrg.robust.chunks import chunks_of, run_chunks
+from torchrg.structures import Neighbors, NormalFit
+
+_QUANTILE = 0.35
+_NARROW = 0.03
+
+
+class _Size(NamedTuple):
+    """A number of neighbours, and what planes of that many points say of the noise.
+
+    Attributes:
+        num_points: Number of neighbours.
+        factor: Noise by the 35th percentile of the deviations, on a plane with little noise.
+        limit: What that tends to, by the radius of the whole neighbourhood, as noise grows.
+    """
+
+    num_points: int
+    factor: float
+    limit: float
+
+
+_SMALL_SIZES = (_Size(8, 1.22, 0.137), _Size(16, 1.1, 0.225))
+_WHOLE_FACTOR = 1.04
+
+
+class Survey(NamedTuple):
+    """What the plane of each neighbourhood leaves unexplained.
+
+    Attributes:
+        offsets: Distance of the fitted plane from the point along the normal, shape ``(N,)``.
+        deviations: Standard deviation of the residuals (3 degrees of freedom less), ``(N,)``.
+        noise: Standard deviation of the noise, positive, shape ``(N,)``; infinite where too few
+            neighbours have a plane.
+        radius: Distance of the farthest neighbour, shape ``(N,)``.
+    """
+
+    offsets: Tensor
+    deviations: Tensor
+    noise: Tensor
+    radius: Tensor
+
+
+def survey_noise(
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = 16384
+) -> Survey:
+    r"""Estimate the noise about each point, at edges and on curved surfaces too.
+
+    The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
+    points lie on one smooth face, and more elsewhere. Small neighbourhoods do so more often, so the
+    estimate is the least of three, for m = 8, 16 and all neighbours, of
+    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R))^2)``, where ``q`` is the 35th percentile
+    over the neighbours, ``c_m`` the factor that makes it unbiased for a plane, and the root undoes
+    that a plane of few points turns with their noise (``R``: radius of the neighbourhood, ``a_m``:
+    measured on noisy planes). Neighbourhoods almost on one line, as on scan lines, do not count.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        neighbors: Neighbours of all points.
+        fit: Planes of all neighbours.
+        chunk_size: Points handled at a time.
+
+    Returns:
+        Offsets, deviations, noise and radius. Noise is at least the rounding of the coordinates.
+
+    Example:
+        >>> from torchrg.neighbors import search_knn
+        >>> from torchrg.normals import estimate_normals
+        >>> floor = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
+        >>> floor[:, 2] = 0.01 * torch.randn(500, generator=torch.Generator().manual_seed(1))
+        >>> neighbors = search_knn(floor, 50)
+        >>> fit = estimate_normals(floor, method="paper", neighbors=neighbors)
+        >>> survey = survey_noise(floor, neighbors, fit)
+        >>> bool((survey.noise.median() - 0.01).abs() < 0.001)
+        True
+    """
+    parts = [
+        _deviations(points, neighbors, fit, block) for block in chunks_of(len(points), chunk_size)
+    ]
+    offsets, radius, whole, *small = (torch.cat(rows) for rows in zip(*parts, strict=True))
+    floor = torch.maximum(
+        coordinate_resolution(points), radius * (4 * torch.finfo(points.dtype).eps)
+    )
+    noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors)
+    for size, values in zip(_SMALL_SIZES, small, strict=True):
+        found = size.factor * _neighbor_quantiles(values, neighbors)
+        share = found / torch.where(radius > 0, size.limit * radius, 1.0)
+        below = (1 - share * share).clamp_(min=0)
+        scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
+        noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
+    return Survey(offsets, whole, torch.maximum(noise, floor), radius)
+
+
+def _deviations(
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, block: slice
+) -> tuple[Tensor, ...]:
+    """Return offsets, radius and deviations from planes of all and of the nearest neighbours."""
+    patches = gather_patches(points, neighbors.indices[block])
+    mask = None if neighbors.valid is None else neighbors.valid[block]
+    columns = split_columns(patches)
+    counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
+    normals, valid = fit.normals[block], fit.valid[block]
+    count = counted.sum(dim=1)
+    center = covariance(patches, mask)[0]
+    offsets = (normals * center).sum(dim=1)
+    rests = residuals(columns, normals, offsets)
+    spread = (rests * rests * counted).sum(dim=1) / (count - 3).clamp_(min=1)
+    whole = torch.where(valid & (count > 3), spread.sqrt_(), torch.inf)
+    radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
+    small = [_small_deviations(patches, counted, size.num_points) for size in _SMALL_SIZES]
+    return offsets, radius, whole, *small
+
+
+def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
+    """Return deviations of the nearest points from their plane; inf where they span none."""
+    if patches.shape[1] < count:
+        return patches.new_full(patches.shape[:1], torch.inf)
+    columns = split_columns(patches[:, :count])
+    normals, offsets, values = fit_planes(columns, counted[:, :count])
+    rests = residuals(columns, normals, offsets)
+    spread = (rests * rests).sum(dim=1) / (count - 3)
+    broad = (values[:, 1] > _NARROW * values[:, 2]) & (counted[:, count - 1] > 0)
+    return torch.where(broad, spread.sqrt_(), torch.inf)
+
+
+def _neighbor_quantiles(values: Tensor, neighbors: Neighbors) -> Tensor:
+    """Return the 35th percentile of values over the neighbours of each point."""
+    indices = neighbors.indices
+    rank = max(math.ceil(_QUANTILE * indices.shape[1]), 1)
+    if values.device.type != "cpu":
+        return values[indices.long()].kthvalue(rank, dim=1).values
+    found, columns, rows = torch.empty_like(values), values.numpy(), indices.numpy()
+
+    def work(block: slice) -> None:
+        near = np.take(columns, rows[block])
+        near.partition(rank - 1, axis=1)
+        found.numpy()[block] = near[:, rank - 1]
+
+    run_chunks(work, chunks_of(len(values), 8192), values.device)
+    return found
