@@ -80,7 +80,7 @@ def assemble_cloud(
     exact = all(axis in rest for axis in "xyz")
     names = [axis if exact else axis.upper() for axis in "xyz"]
     if not all(name in rest for name in names):
-        found = ", ".join(rest) or "none"
+        found = ", ".join(map(ascii, rest)) or "none"
         raise FormatError(f"{path}: expected fields x, y, z, got {found}; rename or add them.")
     axes = [rest.pop(name) for name in names]
     if any(axis.ndim != 1 for axis in axes):

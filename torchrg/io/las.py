@@ -29,6 +29,7 @@ WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 UNFIT = "_value"
 """Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
 LARGEST_INTEGER = 2**31 - 1
+VARIABLE_CHUNKS = 2**32 - 1
 DATE_BYTES = (90, 4)
 
 
@@ -51,7 +52,11 @@ def read_las(path: Path) -> Cloud:
     size = check_file(path)
     _check_counts(path, size)
     try:
-        with laspy.open(path) as reader:
+        with (
+            np.errstate(over="ignore", invalid="ignore"),
+            # The parallel backend takes what memory a damaged table of chunks asks for.
+            laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
+        ):
             header = reader.header
             start = header.offset_to_point_data
             least = 0 if header.are_points_compressed else header.point_format.size
@@ -62,6 +67,8 @@ def read_las(path: Path) -> Cloud:
                 available=size - start,
                 content=f"{header.point_count:,} points",
             )
+            if header.are_points_compressed:
+                _check_chunks(path, header, size)
             # By blocks, so that memory grows with the points that are really there.
             blocks = [_columns(block) for block in reader.chunk_iterator(POINTS_AT_ONCE)]
     except FormatError:
@@ -70,6 +77,15 @@ def read_las(path: Path) -> Cloud:
         raise FormatError(
             f"{path}: expected a LAS or LAZ file, got: {first_line(error)}; fetch it again."
         ) from error
+    except BaseException as error:
+        # A panic of lazrs, which is written in Rust, is no Exception and has no importable name.
+        if type(error).__name__ != "PanicException":
+            raise
+        raise FormatError(
+            f"{path}: expected whole compressed points, got: {first_line(error)}; fetch it again."
+        ) from error
+    if not blocks:
+        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
     columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     standard = set(header.point_format.standard_dimension_names)
     used = {name: c for name, c in columns.items() if name not in standard or c.any()}
@@ -150,6 +166,42 @@ def _check_counts(path: Path, size: int) -> None:
                 path, byte=start, promised=length, available=size - start, content=content
             )
             start += length
+
+
+def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
+    """Check the number of compressed chunks; lazrs ends the process if memory for it fails."""
+    start = header.offset_to_point_data
+    with path.open("rb") as stream:
+        stream.seek(start)
+        offset = int.from_bytes(stream.read(8), "little", signed=True)
+        if offset == -1:
+            # The writer could not go back to the beginning, so the offset is at the end.
+            stream.seek(size - 8)
+            offset = int.from_bytes(stream.read(8), "little", signed=True)
+        content = "the table of chunks"
+        if offset < 0:
+            raise FormatError(
+                f"{path}: byte {start}: expected the place of {content}; fetch it again."
+            )
+        check_promise(path, byte=offset, promised=8, available=size - offset, content=content)
+        stream.seek(offset)
+        _, num_chunks = struct.unpack("<II", stream.read(8))
+        # The first point of a chunk is stored as it is.
+        check_promise(
+            path,
+            byte=offset + 4,
+            promised=num_chunks * header.point_format.size,
+            available=size,
+            content=f"{num_chunks:,} chunks",
+            at_least=True,
+        )
+    (record,) = header.vlrs.get("LasZipVlr")
+    (chunk_size,) = struct.unpack_from("<I", record.record_data, 12)
+    if chunk_size != VARIABLE_CHUNKS and header.point_count > num_chunks * chunk_size:
+        raise FormatError(
+            f"{path}: byte {offset}: expected chunks for {header.point_count:,} points, got "
+            f"{num_chunks:,} of {chunk_size:,}; the file is damaged, fetch it again."
+        )
 
 
 def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401

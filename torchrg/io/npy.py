@@ -7,6 +7,7 @@ a structured array with named fields ``x``, ``y``, ``z``.
 """
 
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, check_length, flatten_cloud
 from torchrg.io.fields import assemble_cloud, cloud_of, name_columns
-from torchrg.io.files import check_file, check_promise
+from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
 from torchrg.structures import Cloud
 
 COORDINATES = ("points", "coord")
@@ -99,11 +100,12 @@ def read_npz(path: Path) -> Cloud:
             }
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, struct.error) as error:
         raise FormatError(
-            f"{path}: expected an archive of NumPy arrays, got {error}; fetch or write it again."
+            f"{path}: expected an archive of NumPy arrays, got: {first_line(error)}; "
+            "fetch or write it again."
         ) from error
     name = next((name for name in COORDINATES if name in arrays), None)
     if name is None:
-        found = ", ".join(arrays) or "none"
+        found = ", ".join(map(repr, arrays)) or "none"
         raise FormatError(
             f"{path}: expected an array points (or coord), got {found}; rename the coordinates."
         )
@@ -179,7 +181,7 @@ def _read_member(
     ratio = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: LARGEST_DEFLATE_RATIO}
     if member.compress_type not in ratio:
         raise FormatError(
-            f"{path}: expected {member.filename} stored or deflated, got compression "
+            f"{path}: expected {member.filename!r} stored or deflated, got compression "
             f"{member.compress_type}; write it with numpy.savez."
         )
     check_promise(
@@ -187,14 +189,14 @@ def _read_member(
         byte=member.header_offset,
         promised=member.file_size,
         available=min(member.compress_size, size) * ratio[member.compress_type],
-        content=f"the array {member.filename}",
+        content=repr(member.filename),
     )
     try:
         with archive.open(member) as stream:
-            return _read_array(path, stream, member.file_size, content=member.filename)
+            return _read_array(path, stream, member.file_size, content=repr(member.filename))
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise FormatError(
-            f"{path}: {member.filename}: {error or 'the array is cut off'}; fetch the file again."
+            f"{path}: {member.filename!r}: {first_line(error)}; fetch the file again."
         ) from error
 
 
@@ -207,10 +209,9 @@ def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> ND
         if version != (1, 0):
             read = npy_format.read_array_header_2_0
         shape, _, dtype = read(stream)
-    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (*DAMAGES, SyntaxError, tokenize.TokenError) as error:
         raise FormatError(
-            f"{path}: byte 0: expected the header of a NumPy array in {content}, got: {reason}; "
+            f"{path}: byte 0: expected the header of a NumPy array in {content}, got: {first_line(error)}; "
             "write it again with numpy.save or numpy.savez."
         ) from error
     if dtype.hasobject:

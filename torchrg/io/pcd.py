@@ -5,7 +5,6 @@ measured) takes the memory a header promises, misreads fields of COUNT > 1 in co
 needs every header line in place, and writes ASCII with ten decimals.
 """
 
-import io
 import struct
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -63,7 +62,8 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
     Args:
         path: The file.
         cloud: The cloud; coordinates keep their precision, colours are packed as PCL does, an
-            organised cloud keeps its width and height.
+            organised cloud keeps its width and height. (Open3D's older reader, and PCL's own point
+            types, take float32 coordinates only; ``open3d.t.io`` takes both.)
 
     Raises:
         FormatError: If a field has no place in a PCD file, or the file cannot be written.
@@ -78,6 +78,9 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
         axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")
     }
     for name, values in check_fields(path, cloud).items():
+        if name == "normals":
+            # Open3D reads normals as if they had the type of the coordinates.
+            values = values.astype(np.result_type(values, cloud.coordinates))
         packed = _packed(name, values)
         if not columns.keys().isdisjoint(packed):
             twice = ", ".join(columns.keys() & packed.keys())
@@ -125,7 +128,7 @@ def _read_text(path: Path, stream: BinaryIO, header: Header, size: int) -> dict[
         content=f"{header.num_points:,} points",
         at_least=True,
     )
-    lines = iter(io.TextIOWrapper(stream, encoding="latin-1"))
+    lines = (raw.decode("latin-1") for raw in stream)
     first = header.num_lines + 1
     return _fields(read_table(path, lines, dtype, first_line=first, num_rows=header.num_points))
 

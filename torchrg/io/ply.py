@@ -262,7 +262,7 @@ def _check_lists(path: Path, element: Element, records: NDArray[np.void]) -> Non
 
 def _read_text(path: Path, stream: BinaryIO, header: Header, size: int) -> NDArray[np.void]:
     """Read the vertices of an ASCII file."""
-    lines = iter(io.TextIOWrapper(stream, encoding="latin-1"))
+    lines = (raw.decode("latin-1") for raw in stream)
     line_number = header.num_lines + 1
     for element in header.elements:
         if element.name != "vertex":
