@@ -1,0 +1,178 @@
+"""Angle errors of normals against true ones."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.errors import ShapeError
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.metrics.contingency import check_one_device
+from torchrg.metrics.sphere import unit_vectors
+
+_CHUNK = 2**20
+_LIMITS_DEG = (5, 10, 20)
+
+
+class NormalScore(NamedTuple):
+    """Errors of normals; see :func:`score_normals`. ``METRICS["normals"]`` holds the units.
+
+    Attributes:
+        msae: Mean squared angle error, degrees^2.
+        rms: Root mean square angle error, degrees.
+        mean: Mean angle error, degrees.
+        median: Median angle error, degrees.
+        under_5_deg: Share of points with an error below 5 degrees, in [0, 1].
+        under_10_deg: The same below 10 degrees.
+        under_20_deg: The same below 20 degrees.
+        points: Points that were scored.
+        invalid: Points with a true normal and no estimated one; in none of the indices.
+        sharp_msae: As ``msae``, over sharp points; None if no split was asked for.
+        sharp_rms: As ``rms``, over sharp points.
+        sharp_mean: As ``mean``, over sharp points.
+        sharp_median: As ``median``, over sharp points.
+        sharp_under_5_deg: As ``under_5_deg``, over sharp points.
+        sharp_under_10_deg: As ``under_10_deg``, over sharp points.
+        sharp_under_20_deg: As ``under_20_deg``, over sharp points.
+        sharp_points: Sharp points that were scored.
+        regular_msae: As ``msae``, over the other points.
+        regular_rms: As ``rms``, over the other points.
+        regular_mean: As ``mean``, over the other points.
+        regular_median: As ``median``, over the other points.
+        regular_under_5_deg: As ``under_5_deg``, over the other points.
+        regular_under_10_deg: As ``under_10_deg``, over the other points.
+        regular_under_20_deg: As ``under_20_deg``, over the other points.
+        regular_points: Other points that were scored.
+    """
+
+    msae: float
+    rms: float
+    mean: float
+    median: float
+    under_5_deg: float
+    under_10_deg: float
+    under_20_deg: float
+    points: int
+    invalid: int
+    sharp_msae: float | None = None
+    sharp_rms: float | None = None
+    sharp_mean: float | None = None
+    sharp_median: float | None = None
+    sharp_under_5_deg: float | None = None
+    sharp_under_10_deg: float | None = None
+    sharp_under_20_deg: float | None = None
+    sharp_points: int | None = None
+    regular_msae: float | None = None
+    regular_rms: float | None = None
+    regular_mean: float | None = None
+    regular_median: float | None = None
+    regular_under_5_deg: float | None = None
+    regular_under_10_deg: float | None = None
+    regular_under_20_deg: float | None = None
+    regular_points: int | None = None
+
+
+def score_normals(
+    normals: Tensor | NDArray[Any],
+    truth: Tensor | NDArray[Any],
+    sharp: Tensor | NDArray[Any] | None = None,
+    *,
+    valid: Tensor | NDArray[Any] | None = None,
+) -> NormalScore:
+    r"""Score normals by their angle to the true ones, signs ignored.
+
+    The error of a point is ``arccos |n . t|`` in [0, 90] degrees; MSAE is the mean of its square
+    (the measure of the paper's Figure 4), RMS the root of that.
+
+    Convention:
+        Normals need no unit length. A point without an estimated normal (zero, not finite, or
+        ``valid`` False) is in no index and counted in ``invalid``: look at that count before
+        comparing estimators that may abstain. A point without a true normal (zero or not finite)
+        counts nowhere. Angles are computed in float64 from chords, so that small ones are right.
+
+    Args:
+        normals: Estimated normals, shape ``(*, 3)``, floating point.
+        truth: True normals, shape ``(*, 3)``, floating point.
+        sharp: Points to report apart, shape ``(*)``, bool. Default: no split.
+        valid: Points whose normal counts as estimated, shape ``(*)``, bool. Default: all.
+
+    Returns:
+        The errors. Over no point at all the errors and shares are nan.
+
+    Raises:
+        ShapeError: If a shape, dtype or device does not fit.
+
+    Example:
+        >>> truth = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])
+        >>> score = score_normals(torch.tensor([[0.0, 0, -2], [0, 1, 1], [0, 0, 0]]), truth)
+        >>> round(score.msae, 6), round(score.mean, 6), score.under_5_deg, score.invalid
+        (1012.5, 22.5, 0.5, 1)
+    """
+    normals = as_tensor("score_normals", "normals", normals)
+    truth = as_tensor("score_normals", "truth", truth)
+    masks = {
+        name: None if mask is None else as_tensor("score_normals", name, mask)
+        for name, mask in (("sharp", sharp), ("valid", valid))
+    }
+    check_floating("score_normals", normals=normals)
+    check_floating("score_normals", truth=truth)
+    vectors = {"normals": (normals, "* 3"), "truth": (truth, "* 3")}
+    check_shapes("score_normals", **vectors, **{name: (m, "*") for name, m in masks.items()})
+    _check_masks(normals, truth, masks)
+
+    flat = {name: None if mask is None else mask.reshape(-1) for name, mask in masks.items()}
+    errors, scored, has_truth = _angle_errors(normals.reshape(-1, 3), truth.reshape(-1, 3))
+    if flat["valid"] is not None:
+        scored = scored & flat["valid"]
+    invalid = int((has_truth & ~scored).sum())
+    split: dict[str, Any] = {}
+    if flat["sharp"] is not None:
+        for name, part in (("sharp", flat["sharp"]), ("regular", ~flat["sharp"])):
+            values = _summarize(errors[scored & part])
+            split |= {f"{name}_{index}": value for index, value in values.items()}
+    return NormalScore(invalid=invalid, **_summarize(errors[scored]), **split)
+
+
+def _check_masks(normals: Tensor, truth: Tensor, masks: dict[str, Tensor | None]) -> None:
+    """Raise a ShapeError for a mask that is not bool, or tensors on several devices."""
+    given = {name: mask for name, mask in masks.items() if mask is not None}
+    for name, mask in given.items():
+        if mask.dtype != torch.bool:
+            dtype = str(mask.dtype).removeprefix("torch.")
+            raise ShapeError(f"score_normals: expected {name} of bool, got {dtype}.")
+    check_one_device("score_normals", normals=normals, truth=truth, **given)
+
+
+def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return errors in degrees, which points have both normals, and which a true one, ``(N,)``."""
+    blocks = []
+    for start in range(0, max(len(normals), 1), _CHUNK):
+        block = slice(start, start + _CHUNK)
+        estimated, has_estimate = unit_vectors(normals[block])
+        true, has_truth = unit_vectors(truth[block])
+        angles = unsigned_angle_deg(estimated, true)
+        blocks.append((angles, has_estimate & has_truth, has_truth))
+    errors, scored, has_truth = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    return errors, scored, has_truth
+
+
+def _summarize(errors: Tensor) -> dict[str, Any]:
+    """Return the indices of angle errors in degrees, by field of :class:`NormalScore`."""
+    count = len(errors)
+    msae = float(errors.square().mean())
+    ordered = errors.sort().values
+    middle = ordered[(count - 1) // 2 : count // 2 + 1] if count else ordered
+    shares = {
+        f"under_{limit}_deg": float((errors < limit).double().mean()) for limit in _LIMITS_DEG
+    }
+    return {
+        "msae": msae,
+        "rms": math.sqrt(msae),
+        "mean": float(errors.mean()),
+        "median": float(middle.mean()),
+        **shares,
+        "points": count,
+    }
