@@ -101,7 +101,7 @@ def extrude(kind: str, frame: Frame, outline: Outline, height: float) -> tuple[S
         span = Frame.spanned(np.array([*start, 0]), np.array([*edge, 0]), np.array([0, 0, 1.0]))
         width = float(np.sqrt((edge * edge).sum()))
         sides.append(rectangle(kind, span.inside(frame), width, height))
-    rounded = (int(corner) for corner in np.flatnonzero(outline.radii))
+    rounded = (int(corner) for corner in np.flatnonzero(outline.radii * outline.turns))
     roundings = (_rounding(kind, frame, outline, corner, height) for corner in rounded)
     holes = (
         Cone(kind, frame.moved(x, y, 0), (radius, height), (radius, 0))

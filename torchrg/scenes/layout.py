@@ -6,7 +6,8 @@ from torchrg.errors import ConfigError
 from torchrg.scenes.frames import Triple
 
 _FLOOR_CELL = (1.85, 1.35)  # a table with room to turn, metres
-_WALL_CELL = 1.9  # a window or a cabinet with wall on both sides
+_WALL_CELL = 1.75  # a window or a cabinet with wall on both sides
+_CORNER = 0.6  # free at both ends of a wall, for a cabinet on the next one
 _AISLE = 0.75  # along the walls, for doors and cabinets
 
 Place = tuple[float, float]
@@ -79,14 +80,14 @@ def wall_places(size: Triple) -> list[WallPlace]:
     """Return where things fit on the four walls: wall, and distance from its start.
 
     Example:
-        >>> wall_places((4.0, 2.0, 3.0))
-        [(0, 1.0), (0, 3.0), (1, 1.0), (2, 1.0), (2, 3.0), (3, 1.0)]
+        >>> wall_places((5.2, 3.2, 3.0))
+        [(0, 1.6), (0, 3.6), (1, 1.6), (2, 1.6), (2, 3.6), (3, 1.6)]
     """
     lengths = (size[0], size[1], size[0], size[1])
     return [
-        (wall, middle)
+        (wall, _CORNER + middle)
         for wall, length in enumerate(lengths)
-        for middle in _middles(length, _WALL_CELL)
+        for middle in _middles(length - 2 * _CORNER, _WALL_CELL)
     ]
 
 

@@ -7,7 +7,7 @@ from torchrg.scenes.furniture import ball, block, board, column, lamp, round_tab
 from torchrg.scenes.scene import Part
 from torchrg.scenes.shells import Hole, against
 
-_TABLE_HEIGHT = (0.66, 0.84)
+_TABLE_HEIGHT = (0.62, 0.92)
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -35,7 +35,7 @@ def draw_cabinet(rng: np.random.Generator, wall: Frame, along: float) -> Part:
 
 def draw_shelf(rng: np.random.Generator, wall: Frame, along: float, thickness: float) -> Part:
     """Return a horizontal board on a wall."""
-    size = (between(rng, 1, 1.5), between(rng, 0.25, 0.4), thickness)
+    size = (between(rng, 1, 1.5), between(rng, 0.38, 0.5), thickness)
     return board("shelf", against(wall, along, between(rng, 1.1, 1.9), size[1]), size)
 
 

@@ -71,7 +71,9 @@ def _cones(tiles: NDArray[np.int64], steps: Array) -> tuple[Array, Array]:
     """Return axis ``(T, 3)`` and half angle ``(T,)`` of a cone around each block of rays."""
     starts = np.flatnonzero(np.diff(tiles, prepend=-1))
     towards = unit(steps)
-    axes = unit(np.add.reduceat(towards, starts))
+    sums = np.add.reduceat(towards, starts)
+    # Opposite rays add up to nothing: then any axis will do, with a half angle as wide as it takes.
+    axes = unit(np.where(dot(sums, sums)[:, None] > 0, sums, towards[starts]))
     cosines = np.minimum.reduceat(dot(towards, axes[tiles]), starts)
     return axes, np.arccos(np.clip(cosines, -1, 1)) + _MARGIN
 

@@ -21,7 +21,7 @@ _DOOR_LEAF = 0.04  # thickness, metres
 _DOOR_HEIGHT = (1.98, 2.15)
 _HALL_WALLS = (0, 2)  # the long walls of the hallway
 _FIRST_WALL = 0  # of a room: the one along the hallway
-_HALL = replace(HALL_LAYOUT, num_doors=2, num_cabinets=1, num_panels=2)
+_HALL = replace(HALL_LAYOUT, size=(24.0, 2.4, 2.5), num_doors=2, num_cabinets=1, num_panels=2)
 _ROOM = RoomLayout(
     num_doors=0,
     num_windows=1,
@@ -45,7 +45,7 @@ class StoreyLayout:
     room_height: tuple[float, float] = (2.6, 2.9)
     wall_thickness: tuple[float, float] = (0.33, 0.42)
     hall: RoomLayout = _HALL
-    """The hallway; its length is that of the rooms."""
+    """The hallway; its length is that of the rooms. A short one has place for less."""
     room: RoomLayout = _ROOM
     """What is in each room; its size is drawn."""
 

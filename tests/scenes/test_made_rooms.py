@@ -1,0 +1,328 @@
+"""Rooms against their own geometry: planes, areas, bodies, noise."""
+
+import hashlib
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare, kstest
+
+from torchrg.errors import ConfigError
+from torchrg.scenes import RoomLayout, build_room, make_room, sample_scene
+from torchrg.structures import UNLABELED
+
+CURVED = RoomLayout(
+    num_tables=3,
+    num_columns=1,
+    num_round_tables=2,
+    num_balls=1,
+    num_lamps=1,
+    num_windows=1,
+    num_panels=2,
+    num_bent_walls=1,
+    heading_deg=20,
+)
+
+
+BARE_WALLS = RoomLayout(num_cabinets=0, num_shelves=0, num_boxes=7)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return make_room(200_000, noise=0, seed=0)
+
+
+@pytest.fixture(scope="module")
+def bare():
+    return make_room(200_000, noise=0, seed=2, layout=BARE_WALLS)
+
+
+def test_default_room_has_about_150_faces_and_more_than_30_of_4_cm(exact):
+    assert 140 <= len(exact.kinds) <= 160
+    thin = [kind in ("table edge", "shelf edge") for kind in exact.kinds]
+    assert 30 <= sum(thin) <= 40
+    heights = [
+        surface.pieces[0][:, 1].sum()
+        for surface, edge in zip(build_room().surfaces, thin, strict=True)
+        if edge
+    ]
+    assert np.allclose(heights, 0.04)
+    assert exact.planar.all()
+
+
+def test_points_without_noise_lie_on_their_planes(exact):
+    points, labels = exact.points.double(), exact.labels
+    residuals = (points * exact.face_normals[labels]).sum(dim=1) - exact.face_offsets[labels]
+    assert residuals.abs().max() < 1e-6  # rounding of coordinates up to 9 m to float32
+
+
+def test_normals_are_those_of_the_faces(exact):
+    expected = exact.face_normals[exact.labels].float()
+    torch.testing.assert_close(exact.normals, expected, atol=0, rtol=0)
+    assert torch.allclose(exact.face_normals.norm(dim=1), torch.ones(len(exact.kinds)).double())
+
+
+def test_normals_of_the_shell_point_into_the_room(exact):
+    middle = torch.tensor([4.5, 3.5, 1.4], dtype=torch.float64)
+    inwards = exact.face_normals[:6] @ middle - exact.face_offsets[:6]
+    assert (inwards > 1).all()
+
+
+def _inside(block, points, margin):
+    """Which points are inside a block shrunk by a margin, by a matrix inverse."""
+    local = np.linalg.solve(block.frame.axes.T, (points - block.frame.origin).T).T
+    low = np.array([-block.size[0] / 2, -block.size[1] / 2, 0]) + margin
+    high = np.array([block.size[0] / 2, block.size[1] / 2, block.size[2]]) - margin
+    return ((local > low) & (local < high)).all(axis=1)
+
+
+def test_no_point_is_inside_a_body(exact):
+    points = exact.points.double().numpy()
+    in_front = points + 1e-4 * exact.normals.double().numpy()
+    for block in build_room().solids:
+        assert not _inside(block, points, 1e-5).any()
+        # Nor is a covered place sampled: the underside of a table above its post, for example.
+        assert not _inside(block, in_front, 2e-4).any()
+
+
+def test_what_is_covered_is_left_out_and_only_that(bare):
+    covered = sum(
+        solid.size[0] * solid.size[1]
+        for solid in build_room(2, layout=BARE_WALLS).solids
+        if solid.frame.origin[2] == 0
+    )
+    counts = bare.labels.bincount(minlength=len(bare.kinds)).double()
+    expected = (bare.face_areas[0] - covered) * counts[2:6].sum() / bare.face_areas[2:6].sum()
+    assert abs(counts[0] - expected) < 4 * (2 * expected).sqrt()
+    # The test would see it if they were sampled too.
+    assert covered * counts[0] / bare.face_areas[0] > 5 * (2 * expected).sqrt()
+
+
+def test_numbers_of_points_are_proportional_to_areas(bare):
+    free = ["wall", "door", "window", "door frame", "window frame", "table edge", "pillar"]
+    rows = [row for row, kind in enumerate(bare.kinds) if kind in free]
+    counts = bare.labels.bincount(minlength=len(bare.kinds))[rows].numpy()
+    areas = bare.face_areas[rows].numpy()
+    assert chisquare(counts, areas / areas.sum() * counts.sum()).pvalue > 1e-4
+
+
+def test_points_are_spread_evenly_over_walls_with_holes(bare):
+    for face, surface in enumerate(build_room(2, layout=BARE_WALLS).surfaces[2:6], start=2):
+        local = surface.frame.to_local(bare.points[bare.labels == face].double().numpy())
+        counts = [
+            ((local[:, :2] >= corner) & (local[:, :2] < corner + edge + other)).all(axis=1).sum()
+            for corner, edge, other in surface.pieces
+        ]
+        areas = np.array([edge[0] * other[1] for _, edge, other in surface.pieces])
+        assert abs(sum(counts) - len(local)) < 5  # rounding at the edges
+        assert chisquare(counts, areas / areas.sum() * sum(counts)).pvalue > 1e-4
+
+
+def test_points_are_spread_evenly_over_the_ceiling(exact):
+    ceiling = exact.points[exact.labels == 1]
+    grid = np.histogram2d(ceiling[:, 0], ceiling[:, 1], bins=8, range=[(0, 9), (0, 7)])[0]
+    pillars = [solid for solid in build_room().solids if solid.bounds[1, 2] > 2.79]
+    assert len(pillars) == 1  # covers part of one cell or a few
+    touched = grid < grid.mean() - 6 * np.sqrt(grid.mean())
+    assert touched.sum() <= 4
+    assert chisquare(grid[~touched]).pvalue > 1e-4
+
+
+def test_no_face_lies_in_the_plane_of_another(exact):
+    planes = torch.cat([exact.face_normals, exact.face_offsets[:, None]], dim=1).numpy()
+    for first, second in combinations(planes, 2):
+        sign = np.sign(first[:3] @ second[:3])
+        if abs(first[:3] @ second[:3]) > 1 - 1e-12:
+            assert abs(first[3] - sign * second[3]) > 0.005 - 1e-9
+
+
+def test_equal_tables_share_one_plane():
+    scene = make_room(1000, seed=4, layout=RoomLayout(equal_tables=True))
+    tops = [row for row, kind in enumerate(scene.kinds) if kind == "table top"]
+    assert len(set(scene.face_offsets[tops].tolist())) == 1
+
+
+def test_same_seed_gives_the_same_room_on_every_machine():
+    scene = make_room(2000, noise=0.003, seed=7, outlier_fraction=0.01)
+    again = make_room(2000, noise=0.003, seed=7, outlier_fraction=0.01)
+    assert scene.points.equal(again.points)
+    assert scene.labels.equal(again.labels)
+    assert not scene.points.equal(make_room(2000, noise=0.003, seed=8).points)
+    digest = hashlib.sha256(scene.points.numpy().tobytes() + scene.labels.numpy().tobytes())
+    assert digest.hexdigest()[:16] == "a48001649f0ec643"
+
+
+def test_every_size_is_a_sample_of_the_same_room():
+    small, large = make_room(1000, seed=3), make_room(3000, seed=3)
+    assert len(small.points) == 1000
+    assert small.face_offsets.equal(large.face_offsets)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("layout", [RoomLayout(), CURVED], ids=["flat", "curved"])
+def test_rooms_of_any_seed_have_free_viewpoints(seed, layout):
+    model = build_room(seed, layout=layout)
+    assert not model.occupied(model.viewpoints).any()
+    assert len(model.surfaces) == len(model.objects)
+
+
+# Noise.
+
+
+def test_noise_is_along_the_normal_with_the_deviation_asked_for(exact):
+    noisy = make_room(200_000, noise=0.004, seed=0)
+    assert noisy.labels.equal(exact.labels)
+    shifts = (noisy.points - exact.points).double()
+    along = (shifts * exact.normals.double()).sum(dim=1)
+    across = shifts - along[:, None] * exact.normals.double()
+    assert across.abs().max() < 2e-6
+    assert kstest(along.numpy() / 0.004, "norm").pvalue > 1e-3
+
+
+def test_isotropic_noise_has_the_deviation_along_each_axis(exact):
+    noisy = make_room(200_000, noise=0.004, seed=0, noise_direction="isotropic")
+    shifts = (noisy.points - exact.points).double().numpy() / 0.004
+    for axis in range(3):
+        assert kstest(shifts[:, axis], "norm").pvalue > 1e-3
+
+
+def test_noise_along_rays_points_to_the_viewpoint(exact):
+    noisy = make_room(200_000, noise=0.004, seed=0, noise_direction="ray")
+    lines = torch.from_numpy(build_room().viewpoints[0]) - exact.points.double()
+    lines = lines / lines.norm(dim=1, keepdim=True)
+    shifts = (noisy.points - exact.points).double()
+    along = (shifts * lines).sum(dim=1)
+    assert (shifts - along[:, None] * lines).abs().max() < 2e-6
+    assert abs(along.std() / 0.004 - 1) < 0.01
+
+
+def test_outliers_have_no_label_and_no_normal():
+    scene = make_room(10_000, seed=1, outlier_fraction=0.05)
+    stray = scene.labels == UNLABELED
+    assert stray.sum() == 500
+    assert (scene.normals[stray] == 0).all()
+    assert torch.allclose(scene.normals[~stray].norm(dim=1), torch.ones(9500))
+
+
+# Density and order.
+
+
+def test_falloff_is_with_the_square_of_the_distance():
+    model = build_room(0)
+    scene = sample_scene(model, 200_000, density="falloff")
+    floor, even = (
+        cloud.points[cloud.labels == 0].double() - torch.from_numpy(model.viewpoints[0])
+        for cloud in (scene, sample_scene(model, 200_000))
+    )
+    edges = torch.linspace(1.7, 4, 9)
+    near, expected = (
+        torch.histogram(places.norm(dim=1).float(), edges).hist for places in (floor, even)
+    )
+    middle = (edges[1:] + edges[:-1]) / 2
+    ratio = near / expected * middle**2
+    assert (ratio / ratio.mean() - 1).abs().max() < 0.1
+
+
+def test_orders():
+    by_face = make_room(5000, seed=1, order="face", outlier_fraction=0.01)
+    labels = by_face.labels[: -round(5000 * 0.01)]
+    assert (labels.diff() >= 0).all()
+    assert (by_face.labels[len(labels) :] == UNLABELED).all()
+    random = make_room(5000, seed=1).labels
+    same = (random[1:] == random[:-1]).double().mean()
+    shares = random.bincount().double() / 5000
+    assert abs(same - (shares**2).sum()) < 0.02
+
+
+def test_colors_are_those_of_objects():
+    scene = make_room(5000, seed=1, colors=True)
+    assert scene.colors.dtype == torch.uint8
+    objects = scene.objects[scene.labels]
+    for number in range(3):
+        spread = scene.colors[objects == number].int()
+        assert (spread.max(dim=0).values - spread.min(dim=0).values).max() <= 24
+
+
+# Curved parts.
+
+
+def test_curved_faces_are_marked_and_labelled():
+    scene = make_room(20_000, noise=0, seed=0, layout=CURVED)
+    curved = {kind for kind, flat in zip(scene.kinds, scene.planar, strict=True) if not flat}
+    assert curved == {"wall", "column", "table edge", "table post", "ball", "lamp", "lamp post"}
+    assert (scene.labels >= 0).all()
+    assert torch.allclose(scene.normals.norm(dim=1), torch.ones(20_000))
+    flat = scene.planar[scene.labels]
+    points, labels = scene.points[flat].double(), scene.labels[flat]
+    residuals = (points * scene.face_normals[labels]).sum(dim=1) - scene.face_offsets[labels]
+    assert residuals.abs().max() < 2e-6
+
+
+def test_bent_wall_passes_through_its_corners_and_bulges_by_the_bend():
+    layout = RoomLayout(num_bent_walls=1, wall_bend=0.05)
+    scene = make_room(300_000, noise=0, seed=0, layout=layout)
+    wall = scene.points[scene.labels == 2].double()
+    length = layout.size[0]
+    chord = wall[:, 0]
+    # The parabola of an arc, up to its fourth order.
+    expected = 0.05 * (1 - (2 * chord / length - 1) ** 2)
+    assert (wall[:, 1] - expected).abs().max() < 1e-5
+    assert scene.kinds[2] == "wall"
+    slopes = -scene.normals[scene.labels == 2, 0].double() / scene.normals[scene.labels == 2, 1]
+    expected_slopes = -0.2 / length * (2 * chord / length - 1)
+    assert (slopes - expected_slopes).abs().max() < 1e-4
+    floor = scene.points[scene.labels == 0].double()
+    behind = floor[:, 1] < 0.05 * (1 - (2 * floor[:, 0] / length - 1) ** 2) - 1e-5
+    assert not behind.any()
+
+
+# Refusals.
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_points": 0}, "sample_scene: expected num_points >= 1, got 0"),
+        ({"noise": -1}, "sample_scene: expected noise >= 0 metres, got -1"),
+        ({"noise": float("nan")}, "expected noise >= 0 metres, got nan"),
+        ({"seed": -1}, "expected seed >= 0, got -1"),
+        ({"outlier_fraction": 1.0}, r"expected outlier_fraction in \[0, 1\), got 1.0"),
+        ({"noise_direction": "up"}, "expected noise_direction to be one of normal, .*got 'up'"),
+        ({"density": "dense"}, "expected density to be one of uniform, falloff, scan, got"),
+        ({"order": "any"}, "expected order to be one of random, face, scan, got 'any'"),
+        ({"order": "scan"}, "expected density='scan' for order='scan', got 'uniform'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        make_room(**{"num_points": 100, **settings})
+
+
+@pytest.mark.parametrize(
+    ("layout", "message"),
+    [
+        ({"num_doors": -1}, "RoomLayout: expected num_doors >= 0, got -1"),
+        ({"num_small_boxes": 9}, "expected num_small_boxes <= 8, got 9"),
+        ({"num_bent_walls": 5}, "expected num_bent_walls <= 4, got 5"),
+        ({"plate_thickness": 0}, "expected plate_thickness > 0, got 0"),
+        ({"num_viewpoints": 0}, "expected num_viewpoints > 0, got 0"),
+        ({"size": (9, 7, 2)}, "expected size of at least 1 x 1 x 2.3 metres, got"),
+    ],
+)
+def test_impossible_layouts_are_refused(layout, message):
+    with pytest.raises(ConfigError, match=message):
+        RoomLayout(**layout)
+
+
+@pytest.mark.parametrize(
+    ("layout", "message"),
+    [
+        ({"num_tables": 40}, "expected a place on the floor for each object"),
+        ({"num_windows": 40}, "expected a place on the walls for each object"),
+        ({"min_plane_gap": 0.5}, "expected no face within min_plane_gap=0.5 of the plane"),
+    ],
+)
+def test_rooms_that_cannot_be_furnished_are_refused(layout, message):
+    with pytest.raises(ConfigError, match=message):
+        build_room(layout=RoomLayout(**layout))
