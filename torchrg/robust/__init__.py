@@ -1,7 +1,8 @@
 """Robust scale, location and scatter of many small point sets at once."""
 
+from torchrg.robust.fastmcd import fit_fastmcd
 from torchrg.robust.mcd import fit_detmcd
 from torchrg.robust.result import RobustFit
 from torchrg.robust.scale import mad, median, qn, qn_exceeds
 
-__all__ = ["RobustFit", "fit_detmcd", "mad", "median", "qn", "qn_exceeds"]
+__all__ = ["RobustFit", "fit_detmcd", "fit_fastmcd", "mad", "median", "qn", "qn_exceeds"]

@@ -9,6 +9,7 @@ from torchrg.robust.lanes import smallest_points, sum_points
 from torchrg.robust.scatter import determinant, fit_ellipsoid, sq_distances
 
 MAX_STEPS = 100
+_MAX_COMPARED = 16
 
 
 class Concentrated(NamedTuple):
@@ -18,10 +19,12 @@ class Concentrated(NamedTuple):
         members: 1 for a point in the set, 0 for another, shape ``(K, S, M)``.
         determinants: Of their scatter over h - 1, shape ``(S, M)``, float64; inf for a start that
             repeats an earlier one of its lane.
+        size: h, the number of points in each set.
     """
 
     members: Tensor
     determinants: Tensor
+    size: int
 
 
 def concentrate(
@@ -81,7 +84,7 @@ def concentrate(
         floors, places, previous = floors[chosen], places[chosen], value[chosen]
         members = candidate[:, chosen]
     shape = (num_starts, num_lanes)
-    return Concentrated(final.reshape(num_points, *shape), best.reshape(shape))
+    return Concentrated(final.reshape(num_points, *shape), best.reshape(shape), size)
 
 
 def _repeats(means: list[Tensor], value: Tensor, num_starts: int, num_lanes: int) -> Tensor:
@@ -90,6 +93,8 @@ def _repeats(means: list[Tensor], value: Tensor, num_starts: int, num_lanes: int
         -1, num_starts, num_lanes
     )
     repeats = torch.zeros(num_starts, num_lanes, dtype=torch.bool, device=value.device)
+    if num_starts > _MAX_COMPARED:
+        return repeats.reshape(-1)
     for start in range(1, num_starts):
         same = (keys[:, :start] == keys[:, start : start + 1]).all(dim=0)
         repeats[start] = same.any(dim=0)

@@ -66,7 +66,8 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
     num_coordinates, (num_points, num_lanes) = len(columns), columns[0].shape
     dimension = torch.full((num_lanes,), num_coordinates, device=tolerance.device)
     members = torch.zeros((num_points, num_lanes), dtype=torch.bool, device=tolerance.device)
-    vertices = _simplices(num_points, min(num_coordinates, num_points - 1))
+    simplices = _simplices(num_points, min(num_coordinates, num_points - 1))
+    vertices = [torch.tensor(vertex, device=tolerance.device) for vertex in simplices]
     origins = [column[vertices[0]] for column in columns]
     extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
     axes: list[list[Tensor]] = []
@@ -78,15 +79,12 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         height = _sum_squares(rest).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
         found = _majorities(columns, origins, axes, candidates, reach, size)
-        on_flat = refine_flat(
-            [column[:, found.lanes] for column in columns],
-            found.members,
-            tolerance[found.lanes],
-            len(axes),
-        )
-        kept = on_flat.sum(dim=0) >= size
-        dimension[found.lanes[kept]] = len(axes)
-        members[:, found.lanes[kept]] = on_flat[:, kept]
+        if len(found.lanes):
+            lanes = [column[:, found.lanes] for column in columns]
+            on_flat = refine_flat(lanes, found.members, tolerance[found.lanes], len(axes))
+            kept = on_flat.sum(dim=0) >= size
+            dimension[found.lanes[kept]] = len(axes)
+            members[:, found.lanes[kept]] = on_flat[:, kept]
         steep = steep & (height > _MIN_EDGE * extent)
         # A short edge is a poor ruler: what rounding moves at its ends grows with the distance.
         reach = torch.maximum(reach, 2 * tolerance * (1 + 2 * extent / height))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.robust.concentrate import concentrate
+from torchrg.robust.concentrate import Concentrated, concentrate
 from torchrg.robust.estimate import Estimate, reweight
 from torchrg.robust.lanes import join_columns
 from torchrg.robust.patchwise import CHUNK_SIZE, fit_patchwise
@@ -72,35 +72,28 @@ def fit_detmcd(
         initial_size = -(-num_points // 2) if starts == "paper" else size
         initial = deterministic_starts(columns, initial_size)
         sets = concentrate(columns, initial, initial_size, size, floor)
-        best = sets.determinants.argmin(dim=0)
-        lanes = torch.arange(len(best), device=best.device)
-        members = sets.members[:, best, lanes]
-        return _finish(
-            columns,
-            members,
-            sets.determinants[best, lanes],
-            floor,
-            quantile,
-            support_fraction,
-            small_sample=small_sample,
+        return finish_mcd(
+            columns, sets, floor, quantile, support_fraction, small_sample=small_sample
         )
 
     return fit_patchwise("fit_detmcd", patches, mask, support_fraction, chunk_size, estimator)
 
 
-def _finish(
+def finish_mcd(
     columns: list[Tensor],
-    members: Tensor,
-    objective: Tensor,
+    sets: Concentrated,
     floor: Tensor,
     quantile: float,
     support_fraction: float,
     *,
     small_sample: bool,
 ) -> Estimate:
-    """Raw fit, distances and reweighted fit of the best set of each lane."""
+    """Take the best set of each lane as raw fit, and reweight by the distances to it."""
+    best = sets.determinants.argmin(dim=0)
+    lanes = torch.arange(len(best), device=best.device)
+    members = sets.members[:, best, lanes]
     num_points, num_coordinates = len(members), len(columns)
-    size = int(members[:, 0].sum())
+    size = sets.size
     raw_factor = consistency_factor(size / num_points, num_coordinates)
     final_factor = 1.0
     if small_sample:
@@ -119,6 +112,6 @@ def _finish(
         raw_location=join_columns(ellipsoid.means),
         raw_covariance=covariance * raw_factor,
         raw_support=members > 0,
-        objective=objective,
+        objective=sets.determinants[best, lanes],
         singular=ellipsoid.singular,
     )

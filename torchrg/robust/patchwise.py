@@ -143,13 +143,12 @@ def _fit_chunk(patches: Tensor, support_fraction: float, estimator: Estimator) -
         _store(out, regular, _general_fit(estimate, frame.of(regular)))
         # A plane that no simplex lay on may have been found by concentration.
         thin = torch.nonzero(estimate.singular).squeeze(1)
-        rows = regular[thin]
-        members = refine_flat(
-            lanes_of(rows), estimate.raw_support[:, thin], tolerance[rows], size - 1
-        )
-        found = members.sum(dim=0) >= subset
-        rows, members = rows[found], members[:, found]
-        _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
+        if len(thin):
+            rows, chosen = regular[thin], estimate.raw_support[:, thin]
+            members = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
+            found = members.sum(dim=0) >= subset
+            rows, members = rows[found], members[:, found]
+            _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
     exact = torch.nonzero(flats.dimension == size - 1).squeeze(1)
     if len(exact):
         members = flats.members[:, exact]
