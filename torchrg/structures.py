@@ -115,6 +115,24 @@ class NormalFit(NamedTuple):
         return NormalFit(normals, curvature, valid, residual_rms, sharp)
 
 
+PLANE_KINDS = ("other", "floor", "ceiling", "wall")
+"""Names of the classes of planes."""
+
+
+class PlaneAdjacency(NamedTuple):
+    """Pairs of planes that meet.
+
+    Attributes:
+        pairs: Rows of the plane table, the smaller first, ascending, shape ``(E, 2)``, int64.
+        boundary_length: Length along which they meet, shape ``(E,)``, in the unit of the cloud.
+        dihedral_deg: Angle between the planes, in [0, 90], shape ``(E,)``.
+    """
+
+    pairs: Tensor
+    boundary_length: Tensor
+    dihedral_deg: Tensor
+
+
 class Planes(NamedTuple):
     """The plane table: one row for each region, in the order of the labels.
 
@@ -130,6 +148,16 @@ class Planes(NamedTuple):
         area: Area that the points cover on the plane, shape ``(M,)``.
         count: Number of points, shape ``(M,)``, int64.
         rms: Root mean square distance of the points to the plane, shape ``(M,)``.
+        extent: Long and short side of the smallest rectangle in the plane that holds the points'
+            projections, shape ``(M, 2)``.
+        axes: Unit directions of those sides, shape ``(M, 2, 3)``.
+        center: Center of that rectangle, shape ``(M, 3)``.
+        curved: Whether the region is one smooth surface but not a plane, shape ``(M,)``, bool: a
+            column, a bent wall. Its plane is the best there is, no more.
+        kind: Class of each plane as a place in :data:`PLANE_KINDS`, shape ``(M,)``, int64; None
+            where the up direction was not given.
+        outline: Polygons around each region; None where not asked for.
+        adjacency: Which planes meet; None where the neighbours were not given.
     """
 
     normal: Tensor
@@ -138,6 +166,13 @@ class Planes(NamedTuple):
     area: Tensor
     count: Tensor  # type: ignore[assignment]
     rms: Tensor
+    extent: Tensor
+    axes: Tensor
+    center: Tensor
+    curved: Tensor
+    kind: Tensor | None = None
+    outline: tuple[tuple[Tensor, ...], ...] | None = None
+    adjacency: PlaneAdjacency | None = None
 
 
 class Segmentation(NamedTuple):

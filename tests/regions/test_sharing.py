@@ -30,7 +30,7 @@ def expected(neighbors, min_shared):
 @pytest.mark.parametrize("kind", ["graded", "blob", "doubled", "lattice"])
 @pytest.mark.parametrize("max_distance", [None, 0.3])
 def test_counts_equal_those_of_sets(kind, max_distance, monkeypatch):
-    monkeypatch.setattr("torchrg.regions.sharing._BLOCK_SIZE", 16)
+    monkeypatch.setitem(SharedNeighbors.at_least.__globals__, "_BLOCK_SIZE", 16)
     points = growing_clouds.prepare(growing_clouds.KINDS[kind](np.random.default_rng(0)), 12)[0]
     neighbors = search_knn(points, 12, max_distance=max_distance, canonical=True)
     shared = SharedNeighbors(neighbors)

@@ -1,4 +1,4 @@
-"""Sums over the points of each region, the same for any number of threads."""
+"""Statistics over the points of each region, the same for any number of threads."""
 
 import torch
 from torch import Tensor
@@ -7,8 +7,11 @@ from torch import Tensor
 class Segments:
     """The points of each region side by side, in the order of their rows.
 
+    Sums run over one region after the other, never by atomic additions, so they do not depend on
+    threads or device scheduling.
+
     Args:
-        labels: Region of each point, shape ``(N,)``: 0 to M-1, or negative for none.
+        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
 
     Example:
         >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
@@ -19,14 +22,15 @@ class Segments:
     """
 
     def __init__(self, labels: Tensor) -> None:
-        self.rows = labels.argsort(stable=True)
-        self.rows = self.rows[int((labels < 0).sum()) :]
-        self.labels = labels[self.rows].long()
+        ascending, rows = labels.sort(stable=True)
+        num_unlabeled = int(torch.searchsorted(ascending, 0))
+        self.rows = rows[num_unlabeled:]
+        self.labels = ascending[num_unlabeled:].long()
         self.counts = torch.bincount(self.labels)
 
     def take(self, values: Tensor) -> Tensor:
         """Return the values of the points that have a region, region by region."""
-        return values[self.rows]
+        return values.index_select(0, self.rows)
 
     def first(self, values: Tensor) -> Tensor:
         """Return the value of the first point of each region."""
@@ -34,18 +38,42 @@ class Segments:
 
     def spread(self, values: Tensor) -> Tensor:
         """Return for each point, in the order of :meth:`take`, the value of its region."""
-        return values[self.labels]
+        return values.index_select(0, self.labels)
+
+    def take_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
+        return [self.take(column).double() for column in vectors.unbind(dim=1)]
+
+    def spread_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Return the three columns of :meth:`spread` of vectors ``(M, 3)``."""
+        return [self.spread(column) for column in vectors.unbind(dim=1)]
 
     def sum(self, values: Tensor) -> Tensor:
-        """Return the sum of each region's values, in the order of :meth:`take`."""
-        return torch.segment_reduce(values.contiguous(), "sum", lengths=self.counts)
+        """Return the sum of each region's values, given in the order of :meth:`take`."""
+        return self._reduce(values, "sum")
 
     def mean(self, values: Tensor) -> Tensor:
         """Return the mean of each region's values."""
-        counts = self.counts.view(-1, *[1] * (values.dim() - 1))
-        return self.sum(values) / counts
+        return self.sum(values) / self.counts
 
-    def extent(self, values: Tensor) -> Tensor:
-        """Return the difference of largest and smallest value of each region."""
-        high = torch.segment_reduce(values, "max", lengths=self.counts)
-        return high - torch.segment_reduce(values, "min", lengths=self.counts)
+    def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest value of each region."""
+        return self._reduce(values, "min"), self._reduce(values, "max")
+
+    def first_of_each(self, chosen: Tensor) -> Tensor:
+        """Return the place of the first chosen value of each region that has one."""
+        places = chosen.nonzero().squeeze(1)
+        owner = self.labels[places]
+        is_first = torch.ones_like(owner, dtype=torch.bool)
+        is_first[1:] = owner[1:] != owner[:-1]
+        return places[is_first]
+
+    def median(self, values: Tensor) -> Tensor:
+        """Return the median of each region's values, the lower one of an even number."""
+        parts = torch.split(values, self.counts.tolist())
+        return torch.stack([part.median() for part in parts]) if parts else values
+
+    def _reduce(self, values: Tensor, how: str) -> Tensor:
+        if len(self.counts) == 0:
+            return values[:0]
+        return torch.segment_reduce(values.contiguous(), how, lengths=self.counts)
