@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import FORMATS
+from torchrg.io import FORMATS, check_output
 
 USAGE_ERROR = 2
 SOME_FAILED = 3
@@ -65,21 +65,6 @@ def _one_line(boxed: str) -> str:
     text = " ".join(part for part in message if part)
     text = re.sub(r"^Error parsing [\w.-]+: (?=\w+Config: )", "", text)
     return text if text.endswith((".", "!", "?")) else f"{text}."
-
-
-def check_output(path: Path) -> None:
-    """Check before any work that a result can be written there.
-
-    Raises:
-        FormatError: If the suffix is unknown, or the folder does not exist.
-    """
-    if path.suffix.lower() not in FORMATS:
-        known = " ".join(sorted(FORMATS))
-        raise FormatError(f"{path}: unknown suffix {path.suffix!r}; torchrg writes {known}.")
-    if path.is_dir():
-        raise FormatError(f"{path}: expected a file to write, got a directory.")
-    if not path.parent.is_dir():
-        raise FormatError(f"{path}: the directory {path.parent} does not exist; make it first.")
 
 
 def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -> list[Path]:

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from torchrg.cli.console import check_output, parse
-from torchrg.io import write_cloud
+from torchrg.cli.console import parse
+from torchrg.io import check_output, write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
