@@ -12,6 +12,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.normals.chunks import fit_points
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.detmcd import fit_normals_detmcd
 from torchrg.normals.pca import fit_normals_pca
@@ -29,7 +30,26 @@ __all__ = [
 
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 
-ESTIMATORS: dict[str, Estimator] = {"paper": estimate_paper, "consensus": estimate_consensus}
+
+def _at_all_points(fit: Callable[..., NormalFit]) -> Estimator:
+    """Return the estimator that fits every neighbourhood alike."""
+
+    def estimate(
+        points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
+    ) -> NormalFit:
+        def fit_block(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
+            return fit(patches, mask, resolution=resolution)
+
+        return fit_points(points, neighbors, fit_block, chunk_size=chunk_size)
+
+    return estimate
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "pca": _at_all_points(fit_normals_pca),
+    "paper": estimate_paper,
+    "consensus": estimate_consensus,
+}
 """Estimators by name: points, their neighbours, settings, chunk size -> fit."""
 
 
