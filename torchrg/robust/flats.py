@@ -9,8 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.linalg import eigh3
-from torchrg.robust.lanes import sum_points
+from torchrg.robust.lanes import eigenvectors, sum_points, sum_squares
 from torchrg.robust.scatter import covariance_entries
 
 NUM_SIMPLICES = 128
@@ -76,7 +75,7 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
     for vertex in vertices[1:]:
         edge = [column[vertex] - origin for column, origin in zip(columns, origins, strict=True)]
         rest = _reject(edge, axes)
-        height = _sum_squares(rest).sqrt()
+        height = sum_squares(rest).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
         found = _majorities(columns, origins, axes, candidates, reach, size)
         if len(found.lanes):
@@ -121,7 +120,7 @@ def _majorities(
         for column, origin in zip(columns, origins, strict=True)
     ]
     across = _reject(offsets, [[part[simplex, lane] for part in axis] for axis in axes])
-    near = _sum_squares(across) <= reach[simplex, lane] ** 2
+    near = sum_squares(across) <= reach[simplex, lane] ** 2
     count = near.sum(dim=0)
     fullest = torch.zeros_like(open_lanes).scatter_reduce_(0, place, count, "amax")
     order = torch.arange(len(place), device=place.device)
@@ -148,7 +147,7 @@ def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimens
     weights = chosen.double()
     count = sum_points(weights)
     means = [sum_points(weights * column) / count for column in columns]
-    vectors = _eigenvectors(covariance_entries(columns, means, weights, count))
+    vectors = eigenvectors(covariance_entries(columns, means, weights, count))
     centered = [column - mean for column, mean in zip(columns, means, strict=True)]
     across = torch.zeros_like(weights)
     for j in range(len(columns) - dimension):
@@ -159,14 +158,6 @@ def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimens
     return across <= tolerance.double() ** 2
 
 
-def _eigenvectors(matrices: Tensor) -> Tensor:
-    """Eigenvectors of symmetric ``(M, P, P)``, as columns by ascending eigenvalue."""
-    if matrices.shape[-1] == 3:
-        return eigh3(matrices)[1]
-    vectors: Tensor = torch.linalg.eigh(matrices)[1]
-    return vectors
-
-
 def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tensor]:
     """Part of vectors, given by their coordinates, across orthonormal directions."""
     for direction in directions:
@@ -175,13 +166,6 @@ def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tenso
             along = along + part * axis
         vectors = [part - along * axis for part, axis in zip(vectors, direction, strict=True)]
     return vectors
-
-
-def _sum_squares(parts: list[Tensor]) -> Tensor:
-    total = parts[0] * parts[0]
-    for part in parts[1:]:
-        total = total + part * part
-    return total
 
 
 @lru_cache(maxsize=256)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg.linalg import eigh3
 from torchrg.robust.scale import sort_rows
 
 
@@ -89,3 +90,19 @@ def indicator(values: Tensor, bound: Tensor) -> Tensor:
         below = np.less_equal(values.numpy(), bound.numpy())
         return torch.from_numpy(below.astype(values.numpy().dtype))
     return (values <= bound).to(values.dtype)
+
+
+def sum_squares(parts: list[Tensor]) -> Tensor:
+    """Sum of the squares of P tensors of one shape: squared lengths from coordinates."""
+    total = parts[0] * parts[0]
+    for part in parts[1:]:
+        total = total + part * part
+    return total
+
+
+def eigenvectors(matrices: Tensor) -> Tensor:
+    """Eigenvectors of symmetric ``(*, P, P)``, as columns by ascending eigenvalue."""
+    if matrices.shape[-1] == 3:
+        return eigh3(matrices)[1]
+    vectors: Tensor = torch.linalg.eigh(matrices)[1]
+    return vectors

@@ -1,6 +1,6 @@
 """Minimum covariance determinant: the deterministic algorithm."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -10,12 +10,13 @@ from torchrg.robust.concentrate import Concentrated, concentrate
 from torchrg.robust.estimate import Estimate, reweight
 from torchrg.robust.lanes import join_columns
 from torchrg.robust.patchwise import CHUNK_SIZE, fit_patchwise
+from torchrg.robust.planes import plane_starts, rotate_to_axes
 from torchrg.robust.result import RobustFit
 from torchrg.robust.scatter import covariance_entries, fit_ellipsoid, sq_distances
 from torchrg.robust.starts import deterministic_starts
 from torchrg.robust.weights import consistency_factor, small_sample_factor
 
-Starts = Literal["paper", "robustbase"]
+Starts = Literal["paper", "robustbase", "planes", "more"]
 
 
 def fit_detmcd(
@@ -42,7 +43,9 @@ def fit_detmcd(
         quantile: Points within this quantile of the chi-square distribution are inliers; 0.975
             means a squared distance of 9.3484 for P = 3.
         starts: ``"paper"``: initial sets of ceil(K / 2) points, as published. ``"robustbase"``:
-            of h points, as in R.
+            of h points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes
+            through P points; a third of the cost, no rotation changes it, and it withstands
+            clusters. ``"more"``: these, and the published six in the patch's own axes.
         small_sample: Apply the factors for small samples (P = 3 only). They widen the cut-off.
         chunk_size: Patches worked on together; bounds the memory, never changes the result.
 
@@ -64,19 +67,50 @@ def fit_detmcd(
         >>> fit.exact_fit.item(), fit.support.sum().item()
         (True, 25)
     """
-    if starts not in ("paper", "robustbase"):
-        raise ConfigError(f"fit_detmcd: expected starts to be paper or robustbase, got {starts!r}.")
+    check_starts("fit_detmcd", starts)
 
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
-        num_points = len(columns[0])
-        initial_size = -(-num_points // 2) if starts == "paper" else size
-        initial = deterministic_starts(columns, initial_size)
-        sets = concentrate(columns, initial, initial_size, size, floor)
+        sets = concentrated_starts(columns, floor, size, starts)
         return finish_mcd(
             columns, sets, floor, quantile, support_fraction, small_sample=small_sample
         )
 
     return fit_patchwise("fit_detmcd", patches, mask, support_fraction, chunk_size, estimator)
+
+
+def check_starts(caller: str, starts: str) -> None:
+    """Raise if there are no such starts."""
+    if starts not in get_args(Starts):
+        known = ", ".join(get_args(Starts))
+        raise ConfigError(f"{caller}: expected starts to be one of {known}, got {starts!r}.")
+
+
+def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:
+    """Initial sets ``(K, S, M)`` of the chosen starts, each with the size of its sets."""
+    half = -(-len(columns[0]) // 2)
+    if starts == "paper":
+        return [(deterministic_starts(columns, half), half)]
+    if starts == "robustbase":
+        return [(deterministic_starts(columns, size), size)]
+    planes = (plane_starts(columns, size), size)
+    if starts == "planes":
+        return [planes]
+    return [planes, (deterministic_starts(rotate_to_axes(columns), half), half)]
+
+
+def concentrated_starts(
+    columns: list[Tensor], floor: Tensor, size: int, starts: Starts
+) -> Concentrated:
+    """Concentrate the chosen starts."""
+    parts = [
+        concentrate(columns, initial, count, size, floor)
+        for initial, count in initial_sets(columns, size, starts)
+    ]
+    return Concentrated(
+        torch.cat([part.members for part in parts], dim=1),
+        torch.cat([part.determinants for part in parts]),
+        size,
+    )
 
 
 def finish_mcd(

@@ -7,14 +7,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.linalg import eigh3
 from torchrg.robust.differences import majority_difference
 from torchrg.robust.lanes import (
+    eigenvectors,
     median_of_sorted,
     median_points,
     smallest_points,
     sorted_points,
     sum_points,
+    sum_squares,
 )
 from torchrg.robust.scale import QN_REVISED_FACTOR, qn_sample_factor, sort_rows
 from torchrg.robust.scatter import covariance_entries
@@ -34,7 +35,7 @@ def deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
         1 for a point in the set, 0 for another, shape ``(K, 6, M)``.
     """
     standard = [_standardize(column) for column in columns]
-    vectors = _eigenvectors(_scatter_matrices(standard))
+    vectors = eigenvectors(_scatter_matrices(standard))
     num_points, num_lanes = columns[0].shape
     loadings = vectors.reshape(NUM_STARTS, num_lanes, len(columns), len(columns))
     distances = _sphered_distances(standard, loadings)
@@ -76,7 +77,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     """Stack the six scatter matrices of standardised columns into ``(6, M, P, P)``."""
     ranks = [_double_ranks(column) for column in columns]
     scores = _normal_scores(len(columns[0]), columns[0])
-    norms = _sum_squares(columns)
+    norms = sum_squares(columns)
     half = smallest_points(norms, -(-len(norms) // 2))
     lengths = norms.sqrt()
     lengths = torch.where(lengths > torch.finfo(norms.dtype).eps, lengths, 1.0)
@@ -112,7 +113,7 @@ def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
                 sphered.append(part)
             else:
                 sphered[i] += part
-    return _sum_squares([part - median_points(part) for part in sphered])
+    return sum_squares([part - median_points(part) for part in sphered])
 
 
 def _combine(columns: list[Tensor], factors: list[Tensor]) -> Tensor:
@@ -190,17 +191,3 @@ def _tanh(values: Tensor) -> Tensor:
     if values.device.type == "cpu":
         return torch.from_numpy(np.tanh(values.numpy()))
     return values.tanh()
-
-
-def _eigenvectors(matrices: Tensor) -> Tensor:
-    if matrices.shape[-1] == 3:
-        return eigh3(matrices)[1]
-    vectors: Tensor = torch.linalg.eigh(matrices)[1]
-    return vectors
-
-
-def _sum_squares(columns: list[Tensor]) -> Tensor:
-    total = columns[0] * columns[0]
-    for column in columns[1:]:
-        total += column * column
-    return total
