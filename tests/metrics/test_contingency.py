@@ -1,0 +1,145 @@
+"""The table of overlaps against counting by hand."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.metrics import contingency_table
+
+
+def random_labels(rng, count, num_labels):
+    return torch.randint(-1, num_labels, (count,), generator=rng)
+
+
+def counted(labels, truth):
+    """Overlaps, region sizes and face sizes, by loops over the points."""
+    overlaps, regions, faces = {}, {}, {}
+    for label, true in zip(labels, truth, strict=True):
+        if label != -1:
+            regions[label] = regions.get(label, 0) + 1
+        if true != -1:
+            faces[true] = faces.get(true, 0) + 1
+        if label != -1 and true != -1:
+            overlaps[label, true] = overlaps.get((label, true), 0) + 1
+    return overlaps, regions, faces
+
+
+def as_dicts(table):
+    regions = table.region_labels[table.regions].tolist()
+    faces = table.face_labels[table.faces].tolist()
+    return (
+        dict(zip(zip(regions, faces, strict=True), table.overlaps.tolist(), strict=True)),
+        dict(zip(table.region_labels.tolist(), table.region_sizes.tolist(), strict=True)),
+        dict(zip(table.face_labels.tolist(), table.face_sizes.tolist(), strict=True)),
+    )
+
+
+@pytest.mark.parametrize("num_labels", [1, 3, 40])
+def test_table_counts_what_loops_count(rng, num_labels):
+    labels, truth = random_labels(rng, 300, num_labels), random_labels(rng, 300, 5)
+    table = contingency_table(labels, truth)
+    assert as_dicts(table) == counted(labels.tolist(), truth.tolist())
+    assert table.num_points == 300
+
+
+def test_labels_may_be_any_integers(rng):
+    names = torch.tensor([-(2**40), -7, 0, 5, 2**40, -1])
+    labels, truth = names[torch.randint(6, (2, 200), generator=rng)]
+    assert as_dicts(contingency_table(labels, truth)) == counted(labels.tolist(), truth.tolist())
+
+
+@pytest.mark.parametrize(
+    "kind", [np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, ">i4"]
+)
+def test_numpy_integers_of_any_kind_are_accepted(kind):
+    labels, truth = np.array([0, 0, 1, 2]).astype(kind), np.array([3, 4, 4, 4]).astype(kind)
+    expected = counted(labels.tolist(), truth.tolist())
+    assert as_dicts(contingency_table(labels, truth)) == expected
+
+
+def test_unlabelled_points_make_their_partner_larger_and_nothing_else():
+    table = contingency_table(torch.tensor([0, 0, 0, -1]), torch.tensor([5, 5, -1, 5]))
+    assert as_dicts(table) == ({(0, 5): 2}, {0: 3}, {5: 3})
+    assert table.iou.tolist() == [0.5]
+
+
+def test_ignored_points_count_nowhere(rng):
+    labels, truth = random_labels(rng, 300, 6), random_labels(rng, 300, 6)
+    kept = truth != 2
+    table = contingency_table(labels, truth, ignore=2)
+    assert as_dicts(table) == counted(labels[kept].tolist(), truth[kept].tolist())
+    assert table.num_points == int(kept.sum())
+
+
+def test_points_of_no_face_can_be_ignored():
+    table = contingency_table(torch.tensor([0, 0, 1]), torch.tensor([5, -1, -1]), ignore=-1)
+    assert as_dicts(table) == ({(0, 5): 1}, {0: 1}, {5: 1})
+
+
+def test_small_regions_count_as_unlabelled():
+    labels = torch.tensor([4, 4, 4, 6, 6, 9])
+    truth = torch.tensor([0, 0, 1, 1, 1, 1])
+    table = contingency_table(labels, truth, min_size=3)
+    assert as_dicts(table) == ({(4, 0): 2, (4, 1): 1}, {4: 3}, {0: 2, 1: 4})
+
+
+def test_size_of_a_region_is_taken_before_points_are_ignored():
+    labels, truth = torch.tensor([4, 4, 4]), torch.tensor([0, 8, 8])
+    table = contingency_table(labels, truth, min_size=3, ignore=8)
+    assert as_dicts(table) == ({(4, 0): 1}, {4: 1}, {0: 1})
+
+
+@pytest.mark.parametrize(
+    ("labels", "truth", "expected"),
+    [
+        ([], [], ({}, {}, {})),
+        ([-1, -1], [-1, -1], ({}, {}, {})),
+        ([-1, -1], [0, 0], ({}, {}, {0: 2})),
+        ([0, 0], [-1, -1], ({}, {0: 2}, {})),
+        ([3], [8], ({(3, 8): 1}, {3: 1}, {8: 1})),
+    ],
+)
+def test_nothing_on_a_side_gives_an_empty_side(labels, truth, expected):
+    table = contingency_table(
+        torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
+    )
+    assert as_dicts(table) == expected
+
+
+def test_table_does_not_depend_on_the_order_of_the_points(rng):
+    labels, truth = random_labels(rng, 500, 9), random_labels(rng, 500, 9)
+    order = torch.randperm(500, generator=rng)
+    first, second = contingency_table(labels, truth), contingency_table(labels[order], truth[order])
+    for one, other in zip(first, second, strict=True):
+        assert torch.equal(torch.as_tensor(one), torch.as_tensor(other))
+
+
+def test_arguments_are_left_alone():
+    labels, truth = torch.tensor([0, 1, 1]), torch.tensor([2, 2, 3])
+    contingency_table(labels, truth, min_size=2, ignore=3)
+    assert labels.tolist() == [0, 1, 1]
+    assert truth.tolist() == [2, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (torch.zeros(4), "labels of integers, got float32; convert with .long"),
+        (torch.zeros(4, dtype=torch.bool), "labels of integers, got bool"),
+        (np.zeros(4), "labels of integers, got float64"),
+        (torch.zeros(3, dtype=torch.int64), r"truth of shape \(N\) with N=3, got \(4,\)"),
+        (torch.zeros(2, 2, dtype=torch.int64), r"labels of shape \(N\), got \(2, 2\)"),
+        ([0, 0, 0, 0], "labels to be a tensor or a NumPy array, got list"),
+        (torch.zeros(4, dtype=torch.int64, device="meta"), "one device, got meta and cpu"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused(labels, message):
+    with pytest.raises(ShapeError, match=f"contingency_table: expected .*{message}"):
+        contingency_table(labels, torch.zeros(4, dtype=torch.int64))
+
+
+def test_min_size_below_one_is_refused():
+    labels = torch.zeros(4, dtype=torch.int64)
+    with pytest.raises(ConfigError, match=r"contingency_table: expected min_size >= 1, got 0\."):
+        contingency_table(labels, labels, min_size=0)

@@ -1,0 +1,191 @@
+"""The external indices together: by hand, by loops over sets, and where there is nothing."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.metrics import (
+    METRICS,
+    LabelScore,
+    contingency_table,
+    count_segcomp,
+    score_evops,
+    score_labels,
+)
+
+SHARES = [name for name, index in METRICS["labels"].items() if index.unit != "count"]
+
+
+def scored_by_loops(labels, truth):
+    """Precision, recall, F1 and the IoU indices, from sets of points."""
+    regions = {a: {i for i, x in enumerate(labels) if x == a} for a in set(labels) - {-1}}
+    faces = {b: {i for i, x in enumerate(truth) if x == b} for b in set(truth) - {-1}}
+    iou = {
+        (a, b): len(region & face) / len(region | face)
+        for a, region in regions.items()
+        for b, face in faces.items()
+    }
+    shared = {(a, b): len(regions[a] & faces[b]) for a, b in iou}
+
+    def rank(pair):
+        return (-shared[pair], -iou[pair], pair)
+
+    pairs = [
+        (a, b)
+        for a, b in iou
+        if shared[a, b]
+        and min(rank((a, other)) for other in faces) == rank((a, b))
+        and min(rank((other, b)) for other in regions) == rank((a, b))
+    ]
+    precision = 100 * np.mean([shared[a, b] / len(regions[a]) for a, b in pairs])
+    recall = 100 * np.mean([shared[a, b] / len(faces[b]) for a, b in pairs])
+    expected = {
+        "precision": precision,
+        "recall": recall,
+        "f1": 2 * precision * recall / (precision + recall),
+        "pairs": len(pairs),
+        "regions": len(regions),
+        "faces": len(faces),
+        "points": len(labels),
+        "mean_best_iou": np.mean([max(iou[a, b] for a in regions) for b in faces]),
+        "share_labeled": np.mean([a != -1 for a in labels]),
+    }
+    for bound in (50, 80):
+        hits = [pair for pair, value in iou.items() if value > bound / 100]
+        expected[f"precision_iou{bound}"] = len({a for a, _ in hits}) / len(regions)
+        expected[f"recall_iou{bound}"] = len({b for _, b in hits}) / len(faces)
+    return expected
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_indices_are_those_of_loops_over_sets(seed):
+    rng = torch.Generator().manual_seed(seed)
+    truth = torch.randint(-1, 8, (200,), generator=rng)
+    noise = torch.rand(200, generator=rng) < 0.02 * seed
+    labels = torch.where(noise, torch.randint(-1, 9, (200,), generator=rng), truth + 30)
+    labels[truth == -1] = 7
+    score = score_labels(labels, truth)._asdict()
+    expected = scored_by_loops(labels.tolist(), truth.tolist())
+    assert {name: score[name] for name in expected} == pytest.approx(expected, abs=1e-12)
+
+
+def test_indices_by_hand():
+    labels = torch.tensor([1, 1, 1, 1, 2, 2, -1, -1])
+    truth = torch.tensor([5, 5, 5, 6, 6, 6, 6, -1])
+    score = score_labels(labels, truth)
+    assert score.pairs == 2
+    assert score.precision == pytest.approx(100 * (3 / 4 + 1) / 2)
+    assert score.recall == pytest.approx(100 * (1 + 2 / 4) / 2)
+    assert score.f1 == pytest.approx(2 * 87.5 * 75 / (87.5 + 75))
+    assert score.mean_best_iou == pytest.approx((3 / 4 + 2 / 4) / 2)
+    assert (score.precision_iou50, score.recall_iou50) == (0.5, 0.5)
+    assert score.share_labeled == 6 / 8
+
+
+def test_protocols_stand_under_their_names():
+    rng = torch.Generator().manual_seed(1)
+    labels, truth = torch.randint(-1, 5, (2, 60), generator=rng) // 2
+    score, table = score_labels(labels, truth)._asdict(), contingency_table(labels, truth)
+    segcomp, evops = count_segcomp(table)._asdict(), score_evops(table)._asdict()
+    assert {name: score[name] for name in segcomp} == segcomp
+    assert {name: score[f"evops_{name}"] for name in evops} == evops
+
+
+def test_the_truth_itself_scores_full_marks(rng):
+    truth = torch.randint(0, 12, (400,), generator=rng)
+    score = score_labels(100 - truth, truth)._asdict()
+    full = {name: 100.0 if METRICS["labels"][name].unit == "%" else 1.0 for name in SHARES}
+    full |= {name: 0.0 for name in SHARES if METRICS["labels"][name].higher_is_better is False}
+    assert {name: score[name] for name in SHARES} == pytest.approx(full, abs=1e-12)
+    assert score["correct"] == score["pairs"] == score["regions"] == score["faces"] == 12
+    assert score["missed"] == score["noise"] == score["over_segmented"] == 0
+
+
+@pytest.mark.parametrize(
+    ("labels", "truth", "counts", "agreement"),
+    [
+        pytest.param([], [], (0, 0, 0, 0, 0, 0), (1, 1), id="no point"),
+        pytest.param([-1, -1], [-1, -1], (0, 0, 0, 2, 0, 0), (1, 1), id="all unlabelled"),
+        pytest.param([-1, -1, -1], [0, 0, 1], (0, 0, 2, 3, 2, 0), (0, 0), id="no region"),
+        pytest.param([0, 0, 1], [-1, -1, -1], (0, 2, 0, 3, 0, 2), (0, 0), id="no face"),
+        pytest.param([0, -1], [-1, 0], (0, 1, 1, 2, 1, 1), (1, 1), id="nothing in common"),
+    ],
+)
+def test_means_over_nothing_are_zero_and_the_counts_tell(labels, truth, counts, agreement):
+    score = score_labels(
+        torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
+    )
+    assert (
+        (score.pairs, score.regions, score.faces, score.points, score.missed, score.noise)
+    ) == counts
+    assert (score.ari, score.nmi) == agreement
+    zeros = {"precision", "recall", "f1", "mean_best_iou", "recall_iou50", "covering", "evops_f1"}
+    assert {score._asdict()[name] for name in zeros} == {0.0}
+
+
+def test_one_point_is_a_region_and_a_face():
+    score = score_labels(torch.tensor([4]), torch.tensor([9]))
+    assert (score.f1, score.mean_best_iou, score.ari, score.pairs) == (100, 1, 1, 1)
+
+
+def test_scores_do_not_depend_on_point_order_or_on_names(rng):
+    labels, truth = torch.randint(-1, 9, (2, 500), generator=rng)
+    truth = torch.where(torch.rand(500, generator=rng) < 0.7, labels, truth)
+    order = torch.randperm(500, generator=rng)
+    score = score_labels(labels, truth)
+    assert score_labels(labels[order], truth[order]) == score
+    renamed = torch.where(labels == -1, -1, 3 * labels + 100)
+    assert score_labels(renamed, truth) == score
+
+
+def test_ignored_points_change_nothing(rng):
+    labels, truth = torch.randint(-1, 6, (2, 300), generator=rng)
+    truth = torch.where(torch.rand(300, generator=rng) < 0.7, labels, truth)
+    kept = truth != 3
+    assert score_labels(labels, truth, ignore=3) == score_labels(labels[kept], truth[kept])
+
+
+def test_small_regions_score_as_if_they_were_unlabelled(rng):
+    truth = torch.randint(0, 6, (300,), generator=rng)
+    labels = truth.clone()
+    labels[:9] = torch.tensor([20, 20, 20, 20, 21, 21, 21, 22, 23])
+    cleaned = torch.where((labels > 20), -1, labels)
+    assert score_labels(labels, truth, min_size=4) == score_labels(cleaned, truth)
+
+
+def test_numpy_and_tensor_input_score_alike(rng):
+    labels, truth = torch.randint(-1, 6, (2, 300), generator=rng)
+    score = score_labels(labels, truth)
+    assert score_labels(labels.numpy().astype(np.int16), truth.numpy()) == score
+    assert score_labels(labels.int(), truth.numpy().astype(">i8")) == score
+
+
+def test_scores_are_plain_numbers_for_json(rng):
+    labels, truth = torch.randint(-1, 6, (2, 300), generator=rng)
+    score = score_labels(labels, truth)
+    assert json.loads(json.dumps(score._asdict(), allow_nan=False)) == score._asdict()
+    assert all(type(value) in (int, float) for value in score)
+    assert all(math.isfinite(value) for value in score)
+
+
+def test_fields_are_those_of_the_catalog():
+    assert list(METRICS["labels"]) == list(LabelScore._fields)
+
+
+def test_labels_that_do_not_fit_are_refused():
+    whole = torch.zeros(4, dtype=torch.int64)
+    with pytest.raises(ShapeError, match=r"score_labels: expected truth of shape \(N\) with N=4"):
+        score_labels(whole, whole[:3])
+    with pytest.raises(ShapeError, match="score_labels: expected labels of integers, got float32"):
+        score_labels(whole.float(), whole)
+    with pytest.raises(ConfigError, match="score_labels: expected min_size >= 1, got 0"):
+        score_labels(whole, whole, min_size=0)
+
+
+def test_labels_on_the_device_score_as_on_the_cpu(device, rng):
+    labels, truth = torch.randint(-1, 9, (2, 500), generator=rng)
+    assert score_labels(labels.to(device), truth.to(device)) == score_labels(labels, truth)

@@ -1,0 +1,244 @@
+"""The torchmetrics forms against the functions, torchmetrics itself, and a second worker."""
+
+import copy
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+torchmetrics = pytest.importorskip("torchmetrics")
+
+from torchmetrics.clustering import (  # noqa: E402
+    AdjustedRandScore,
+    NormalizedMutualInfoScore,
+)
+
+from tests.metrics.sphere_clusters import scattered  # noqa: E402
+from torchrg.metrics import METRICS, modules, score_clusters, score_labels  # noqa: E402
+from torchrg.metrics import score_normals as score_errors  # noqa: E402
+
+FAMILIES = {
+    "labels": modules.LabelScores,
+    "clusters": modules.ClusterScores,
+    "normals": modules.NormalScores,
+}
+SINGLE = [
+    (part, metric)
+    for part, family in FAMILIES.items()
+    for metric in vars(modules).values()
+    if isinstance(metric, type) and issubclass(metric, family) and metric is not family
+]
+
+
+def values_of(metric):
+    return {name: float(value) for name, value in metric.compute().items()}
+
+
+def scans(part):
+    """Four scans of different size as (arguments, their score as a dict)."""
+    rng = torch.Generator().manual_seed(7)
+    for count in (60, 90, 20, 200):
+        labels, truth = torch.randint(-1, 5, (2, count), generator=rng)
+        truth = torch.where(torch.rand(count, generator=rng) < 0.8, labels, truth)
+        normals, clusters = scattered(rng, [count, 7, 9], 0.1)
+        other = normals + 0.1 * torch.randn(normals.shape, generator=rng, dtype=torch.float64)
+        sharp = torch.rand(len(normals), generator=rng) < 0.3
+        arguments, score = {
+            "labels": ((labels, truth), score_labels),
+            "clusters": ((normals, clusters), score_clusters),
+            "normals": ((normals, other, sharp), score_errors),
+        }[part]
+        yield arguments, score(*arguments)._asdict()
+
+
+@pytest.mark.parametrize("part", FAMILIES)
+def test_compute_is_the_mean_of_the_scores_of_the_scans(part):
+    metric, scores = FAMILIES[part](), []
+    for arguments, score in scans(part):
+        metric.update(*arguments)
+        scores.append(score)
+    means = {name: np.mean([score[name] for score in scores]) for name in scores[0]}
+    assert values_of(metric) == pytest.approx(means, rel=1e-12)
+
+
+@pytest.mark.parametrize("part", FAMILIES)
+def test_forward_gives_the_score_of_one_scan_and_keeps_the_mean(part):
+    metric, updated = FAMILIES[part](), FAMILIES[part]()
+    for arguments, score in scans(part):
+        values = {name: float(value) for name, value in metric(*arguments).items()}
+        assert values == pytest.approx({k: float(v) for k, v in score.items()}, rel=1e-12)
+        updated.update(*arguments)
+    assert values_of(metric) == pytest.approx(values_of(updated), rel=1e-12)
+
+
+@pytest.mark.parametrize(("part", "single"), SINGLE)
+def test_each_index_is_the_one_it_is_named_for(part, single):
+    metric, family = single(), FAMILIES[part]()
+    for arguments, _ in scans(part):
+        metric.update(*arguments)
+        family.update(*arguments)
+    assert metric.compute() == family.compute()[metric.index]
+    assert metric.compute().shape == ()
+
+
+@pytest.mark.parametrize(("part", "single"), SINGLE)
+def test_direction_is_that_of_the_catalog(part, single):
+    assert single.higher_is_better is METRICS[part][single.index].higher_is_better
+    assert single.higher_is_better is not None
+    assert single.full_state_update is False
+    assert single.is_differentiable is False
+
+
+def test_directions_say_which_of_two_results_is_better():
+    truth = torch.repeat_interleave(torch.arange(4), 25)
+    merged = torch.where(truth == 1, 0, truth)
+    assert modules.PlaneF1.higher_is_better
+    assert modules.UnderSegmented.higher_is_better is False
+    for single in (modules.PlaneF1, modules.PlaneARI, modules.UnderSegmented, modules.MissedFaces):
+        right, wrong = single(), single()
+        right.update(truth, truth)
+        wrong.update(merged if single is not modules.MissedFaces else merged * 0 - 1, truth)
+        assert (right.compute() > wrong.compute()) == single.higher_is_better
+
+
+@pytest.mark.filterwarnings("ignore:Sparse invariant checks:UserWarning")
+def test_agreement_with_torchmetrics_on_one_scan():
+    for (labels, truth), _ in scans("labels"):
+        ours, theirs = modules.PlaneARI(), AdjustedRandScore()
+        assert float(ours(labels, truth)) == pytest.approx(float(theirs(labels, truth)), abs=1e-6)
+        shared, reference = modules.PlaneNMI(), NormalizedMutualInfoScore()
+        assert float(shared(labels, truth)) == pytest.approx(
+            float(reference(labels, truth)), abs=1e-6
+        )
+
+
+@pytest.mark.parametrize("part", FAMILIES)
+def test_states_of_two_workers_add_up(part):
+    whole, workers = FAMILIES[part](), [FAMILIES[part](), FAMILIES[part]()]
+    for number, (arguments, _) in enumerate(scans(part)):
+        whole.update(*arguments)
+        workers[number % 2].update(*arguments)
+    states = [{name: getattr(metric, name) for name in metric._defaults} for metric in workers]
+
+    def gather(state, group=None):
+        name = next(n for n, value in states[0].items() if value is state)
+        return [other[name] for other in states]
+
+    workers[0].dist_sync_fn = gather
+    workers[0].distributed_available_fn = lambda: True
+    assert values_of(workers[0]) == pytest.approx(values_of(whole), rel=1e-12)
+
+
+@pytest.mark.slow
+def test_processes_of_a_group_agree(tmp_path):
+    context = torch.multiprocessing.get_context("spawn")
+    queue = context.SimpleQueue()
+    arguments = [(rank, str(tmp_path / "rendezvous"), queue) for rank in range(2)]
+    processes = [context.Process(target=score_a_share, args=one) for one in arguments]
+    for process in processes:
+        process.start()
+    results = [queue.get() for _ in processes]
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    whole = modules.PlaneF1()
+    for labels_and_truth, _ in scans("labels"):
+        whole.update(*labels_and_truth)
+    assert results == pytest.approx([float(whole.compute())] * 2, rel=1e-12)
+
+
+def score_a_share(rank, rendezvous, queue):
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=2
+    )
+    metric = modules.PlaneF1()
+    for number, (arguments, _) in enumerate(scans("labels")):
+        if number % 2 == rank:
+            metric.update(*arguments)
+    queue.put(float(metric.compute()))
+    torch.distributed.destroy_process_group()
+
+
+def test_scans_without_an_index_do_not_count_for_it():
+    metric = modules.ClusterScores()
+    normals, clusters = scattered(torch.Generator().manual_seed(0), [9, 9], 0.1)
+    metric.update(normals, clusters)
+    metric.update(normals, torch.zeros_like(clusters))
+    both, one = score_clusters(normals, clusters), score_clusters(normals, clusters * 0)
+    assert float(metric.compute()["dvi"]) == pytest.approx(both.dvi, rel=1e-12)
+    assert float(metric.compute()["cp"]) == pytest.approx((both.cp + one.cp) / 2, rel=1e-12)
+
+
+def test_an_infinite_index_makes_the_mean_infinite():
+    metric = modules.SphereDaviesBouldin()
+    metric.update(torch.eye(3)[[0, 0]], torch.tensor([0, 1]))
+    metric.update(torch.eye(3)[[0, 1]], torch.tensor([0, 1]))
+    assert metric.compute() == torch.inf
+
+
+def test_no_scan_gives_nan():
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The ``compute`` method", category=UserWarning)
+        assert modules.PlaneF1().compute().isnan()
+
+
+def test_settings_reach_the_function():
+    labels, truth = torch.tensor([0, 0, 0, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 7, 7])
+    metric = modules.LabelScores(min_size=2, ignore=7)
+    metric.update(labels, truth)
+    expected = score_labels(labels, truth, min_size=2, ignore=7)
+    assert values_of(metric) == expected._asdict()
+    normals, clusters = scattered(
+        torch.Generator().manual_seed(0), [90, 90, 5], 0.1, axes=torch.eye(3)[[0, 0, 1]]
+    )
+    settings = {"min_size": 2, "distinct_directions": True, "sample_size": 30}
+    merged = modules.ClusterScores(**settings)
+    merged.update(normals, clusters)
+    assert float(merged.compute()["dbi"]) == score_clusters(normals, clusters, **settings).dbi
+
+
+def test_a_collection_scores_each_scan_once(monkeypatch):
+    calls = []
+
+    def counted(*arguments, **settings):
+        calls.append(arguments)
+        return score_labels(*arguments, **settings)
+
+    monkeypatch.setattr("torchrg.metrics.modules.labels.score_labels", counted)
+    collection = torchmetrics.MetricCollection(
+        [modules.PlaneF1(), modules.PlaneARI(), modules.MeanBestIoU(), modules.MissedFaces()]
+    )
+    data = list(scans("labels"))
+    for arguments, _ in data:
+        collection.update(*arguments)
+    # The first scan shows that the states are the same; after that one of the four is enough.
+    assert len(calls) == 4 + len(data) - 1
+    values = {name: float(value) for name, value in collection.compute().items()}
+    assert values == pytest.approx(
+        {
+            "PlaneF1": np.mean([score["f1"] for _, score in data]),
+            "PlaneARI": np.mean([score["ari"] for _, score in data]),
+            "MeanBestIoU": np.mean([score["mean_best_iou"] for _, score in data]),
+            "MissedFaces": np.mean([score["missed"] for _, score in data]),
+        }
+    )
+
+
+def test_reset_forgets_and_copies_remember():
+    (arguments, score), *_ = scans("labels")
+    metric = modules.PlaneF1()
+    metric.update(*arguments)
+    for twin in (copy.deepcopy(metric), pickle.loads(pickle.dumps(metric))):
+        assert float(twin.compute()) == score["f1"]
+    metric.reset()
+    assert int(metric.scans.sum()) == 0
+
+
+def test_metrics_on_the_device_compute_as_on_the_cpu(device):
+    metric, there = modules.LabelScores(), modules.LabelScores().to(device)
+    for arguments, _ in scans("labels"):
+        metric.update(*arguments)
+        there.update(*(tensor.to(device) for tensor in arguments))
+    assert values_of(there) == values_of(metric)

@@ -1,0 +1,176 @@
+"""Angle errors of normals: known angles, loops, and normals that are not there."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ShapeError
+from torchrg.metrics import METRICS, NormalScore, score_normals
+
+
+def turned(truth, degrees, rng):
+    """Turn unit vectors by given angles about random axes across them."""
+    axis = torch.randn(truth.shape, generator=rng, dtype=torch.float64)
+    across = torch.nn.functional.normalize(torch.linalg.cross(truth, axis), dim=-1)
+    angles = torch.deg2rad(degrees)[..., None]
+    return angles.cos() * truth + angles.sin() * across
+
+
+@pytest.fixture
+def truth(rng):
+    return torch.nn.functional.normalize(
+        torch.randn(200, 3, generator=rng, dtype=torch.float64), dim=1
+    )
+
+
+def test_indices_are_those_of_the_known_angles(rng, truth):
+    degrees = 90 * torch.rand(200, generator=rng, dtype=torch.float64) ** 3
+    score = score_normals(turned(truth, degrees, rng), truth)
+    known = degrees.numpy()
+    assert score.msae == pytest.approx(np.mean(known**2), rel=1e-8)
+    assert score.rms == pytest.approx(np.sqrt(np.mean(known**2)), rel=1e-8)
+    assert score.mean == pytest.approx(np.mean(known), rel=1e-8)
+    assert score.median == pytest.approx(np.median(known), rel=1e-8)
+    assert score.under_5_deg == np.mean(known < 5)
+    assert score.under_10_deg == np.mean(known < 10)
+    assert score.under_20_deg == np.mean(known < 20)
+    assert (score.points, score.invalid) == (200, 0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 6])
+def test_median_is_that_of_numpy(rng, truth, count):
+    degrees = 90 * torch.rand(count, generator=rng, dtype=torch.float64)
+    score = score_normals(turned(truth[:count], degrees, rng), truth[:count])
+    assert score.median == pytest.approx(np.median(degrees.numpy()), rel=1e-8)
+
+
+def test_signs_and_lengths_do_not_matter(rng, truth):
+    normals = turned(truth, torch.full((200,), 30.0).double(), rng)
+    scale = torch.randn(2, 200, 1, generator=rng, dtype=torch.float64)
+    score = score_normals(scale[0] * normals, 1e-200 * scale[1] * truth)
+    assert score.mean == pytest.approx(30, rel=1e-8)
+    assert score.msae == pytest.approx(900, rel=1e-8)
+
+
+@pytest.mark.parametrize("degrees", [1e-9, 1e-5, 0.01, 45.0, 89.9999999, 90.0])
+def test_angles_of_any_size_are_accurate(rng, truth, degrees):
+    score = score_normals(turned(truth, torch.full((200,), degrees).double(), rng), truth)
+    assert score.mean == pytest.approx(degrees, rel=1e-5, abs=1e-13)
+    assert score.mean <= 90
+
+
+def test_equal_normals_have_no_error_in_float32(truth):
+    # The arc cosine of a float32 product would be up to 0.03 degrees.
+    assert score_normals(truth.float(), truth.float()).msae == 0
+
+
+def test_bounds_are_not_included():
+    truth = torch.tensor([[0.0, 0, 1]])
+    assert score_normals(torch.tensor([[1.0, 0, 0]]), truth).under_20_deg == 0
+    assert score_normals(truth, truth).under_5_deg == 1
+
+
+def test_the_split_scores_each_part_alone(rng, truth):
+    normals = turned(truth, 90 * torch.rand(200, generator=rng, dtype=torch.float64), rng)
+    normals[::9] = 0
+    sharp = torch.rand(200, generator=rng) < 0.3
+    score = score_normals(normals, truth, sharp)
+    whole = score_normals(normals, truth)
+    assert score[:9] == whole[:9]
+    for prefix, part in (("sharp", sharp), ("regular", ~sharp)):
+        expected = score_normals(normals[part], truth[part])
+        for name in expected._fields[:8]:
+            assert getattr(score, f"{prefix}_{name}") == getattr(expected, name)
+    assert score.sharp_points + score.regular_points == score.points
+
+
+def test_without_a_split_its_fields_are_none(truth):
+    assert set(score_normals(truth, truth)[9:]) == {None}
+
+
+def test_normals_that_are_not_there_are_left_out_and_counted(rng, truth):
+    normals = turned(truth, torch.full((200,), 7.0).double(), rng)
+    spoiled = normals.clone()
+    spoiled[0] = 0
+    spoiled[1, 2] = math.nan
+    spoiled[2, 0] = math.inf
+    valid = torch.ones(200, dtype=torch.bool)
+    valid[3] = False
+    score = score_normals(spoiled, truth, valid=valid)
+    assert score == score_normals(normals[4:], truth[4:])._replace(invalid=4)
+
+
+def test_points_without_a_true_normal_count_nowhere(truth):
+    unknown = truth.clone()
+    unknown[:3] = torch.tensor([[0.0, 0, 0], [math.nan, 0, 0], [0, math.inf, 0]])
+    normals = truth.clone()
+    normals[0] = 0
+    assert score_normals(normals, unknown) == score_normals(truth[3:], truth[3:])
+
+
+@pytest.mark.parametrize("count", [0, 4])
+def test_errors_over_no_point_are_nan(count):
+    score = score_normals(torch.zeros(count, 3), torch.ones(count, 3))
+    assert all(math.isnan(value) for value in score[:7])
+    assert (score.points, score.invalid) == (0, count)
+
+
+def test_normal_maps_are_accepted(truth):
+    grid = truth.reshape(10, 20, 3)
+    sharp = torch.zeros(10, 20, dtype=torch.bool)
+    sharp[3] = True
+    flat = score_normals(truth, truth.roll(1, 0), sharp.reshape(-1))
+    assert score_normals(grid, truth.roll(1, 0).reshape(10, 20, 3), sharp) == flat
+
+
+def test_numpy_and_mixed_precision_are_accepted(rng, truth):
+    normals = turned(truth, torch.full((200,), 7.0).double(), rng)
+    valid = np.arange(200) > 5
+    score = score_normals(normals.float().numpy(), truth, valid=valid)
+    assert score.mean == pytest.approx(7, rel=1e-6)
+    assert score.points == 194
+
+
+def test_blocks_change_nothing(rng, truth, monkeypatch):
+    normals = turned(truth, 90 * torch.rand(200, generator=rng, dtype=torch.float64), rng)
+    whole = score_normals(normals, truth)
+    monkeypatch.setattr("torchrg.metrics.normals._CHUNK", 7)
+    assert score_normals(normals, truth) == whole
+
+
+def test_errors_do_not_depend_on_the_order_of_the_points(rng, truth):
+    normals = turned(truth, 90 * torch.rand(200, generator=rng, dtype=torch.float64), rng)
+    order = torch.randperm(200, generator=rng)
+    there, back = score_normals(normals, truth), score_normals(normals[order], truth[order])
+    assert there[:9] == pytest.approx(back[:9], rel=1e-13)
+
+
+def test_fields_are_those_of_the_catalog():
+    assert list(METRICS["normals"]) == list(NormalScore._fields)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"normals": torch.zeros(4, 2)}, r"normals of shape \(\*, 3\), got \(4, 2\)"),
+        ({"normals": torch.zeros(5, 3)}, r"truth of shape \(\*, 3\) with \*=\(5,\), got \(4, 3\)"),
+        ({"normals": torch.zeros(4, 3).int()}, "normals of float32 or float64, got int32"),
+        ({"truth": torch.zeros(4, 3).half()}, "truth of float32 or float64, got float16"),
+        ({"sharp": torch.zeros(4)}, "sharp of bool, got float32"),
+        ({"valid": torch.zeros(3) > 0}, r"valid of shape \(\*\) with \*=\(4,\), got \(3,\)"),
+        ({"valid": [True] * 4}, "valid to be a tensor or a NumPy array, got list"),
+        ({"normals": torch.zeros(4, 3, device="meta")}, "on one device, got meta and cpu"),
+    ],
+)
+def test_input_that_does_not_fit_is_refused(arguments, message):
+    whole = {"normals": torch.ones(4, 3), "truth": torch.ones(4, 3), **arguments}
+    with pytest.raises(ShapeError, match=f"score_normals: expected .*{message}"):
+        score_normals(**whole)
+
+
+def test_normals_on_the_device_score_as_on_the_cpu(device, dtype, rng, truth):
+    normals = turned(truth, torch.full((200,), 7.0).double(), rng).to(dtype)
+    there = score_normals(normals.to(device), truth.to(dtype).to(device))
+    assert there[:9] == pytest.approx(score_normals(normals, truth.to(dtype))[:9], rel=1e-9)

@@ -1,0 +1,174 @@
+"""The SegComp and EVOPS protocols against their definitions, written out in loops."""
+
+from itertools import product
+
+import pytest
+import torch
+
+from torchrg.errors import ConfigError
+from torchrg.metrics import SegCompCounts, contingency_table, count_segcomp, score_evops
+
+
+def sets_of(labels):
+    return {a: {i for i, x in enumerate(labels) if x == a} for a in set(labels) - {-1}}
+
+
+def segcomp_by_definition(labels, truth, limit):
+    """Hoover et al., section 2.4: list all instances, then let the best means take their parts."""
+    regions, faces = sets_of(labels), sets_of(truth)
+    instances = []
+    for (a, region), (b, face) in product(regions.items(), faces.items()):
+        shares = len(region & face) / len(region), len(region & face) / len(face)
+        if min(shares) > limit:
+            instances.append((sum(shares) / 2, 0, {("region", a), ("face", b)}))
+    for kind, own, wholes, other, parts in (
+        (1, "face", faces, "region", regions),
+        (2, "region", regions, "face", faces),
+    ):
+        for name, whole in wholes.items():
+            inside = {p: len(s & whole) / len(s) for p, s in parts.items()}
+            inside = {p: value for p, value in inside.items() if value > limit}
+            held = sum(len(parts[p] & whole) for p in inside) / len(whole)
+            if len(inside) >= 2 and held > limit:
+                mean = (sum(inside.values()) / len(inside) + held) / 2
+                instances.append((mean, kind, {(own, name)} | {(other, p) for p in inside}))
+    taken, counts = set(), [0, 0, 0]
+    for _, kind, members in sorted(instances, key=lambda one: (-one[0], one[1])):
+        if not members & taken:
+            taken |= members
+            counts[kind] += 1
+    return SegCompCounts(
+        *counts,
+        missed=len({("face", b) for b in faces} - taken),
+        noise=len({("region", a) for a in regions} - taken),
+    )
+
+
+def evops_by_definition(labels, truth):
+    """Kornilova et al.: over- and under-segmented, noise, missed by counting partners."""
+    regions, faces = sets_of(labels), sets_of(truth)
+    iou = {
+        (a, b): len(regions[a] & faces[b]) / len(regions[a] | faces[b])
+        for a, b in product(regions, faces)
+    }
+
+    def partners(side, name, bound):
+        return [pair[1 - side] for pair, x in iou.items() if pair[side] == name and x >= bound]
+
+    def alone(side, name):
+        part = partners(side, name, 0.2)
+        if len(part) == 1 and not partners(side, name, 0.75):
+            return len(partners(1 - side, part[0], 0.2)) == 1
+        return not part
+
+    matches = [x for x in iou.values() if x >= 0.75]
+    precision = len(matches) / len(regions) if regions else 0
+    recall = len(matches) / len(faces) if faces else 0
+
+    def mean(values, count):
+        return sum(values) / count if count else 0
+
+    return {
+        "precision": precision,
+        "recall": recall,
+        "f1": 2 * precision * recall / (precision + recall) if matches else 0,
+        "mean_iou": mean(matches, len(matches)),
+        "mean_dice": mean([2 * x / (1 + x) for x in matches], len(matches)),
+        "over_segmented": mean([len(partners(1, b, 0.2)) > 1 for b in faces], len(faces)),
+        "under_segmented": mean([len(partners(0, a, 0.2)) > 1 for a in regions], len(regions)),
+        "missed": mean([alone(1, b) for b in faces], len(faces)),
+        "noise": mean([alone(0, a) for a in regions], len(regions)),
+    }
+
+
+def spoiled_labels(seed):
+    """Truth with faces of all sizes, and labels that split, merge, drop and blur some of them."""
+    rng = torch.Generator().manual_seed(seed)
+    truth = torch.randint(4, 30, (12,), generator=rng).tolist()
+    truth = torch.repeat_interleave(torch.arange(12), torch.tensor(truth))
+    part = torch.rand(len(truth), generator=rng)
+    labels = truth.clone()
+    cut = 0.02 + 0.5 * float(torch.rand(1, generator=rng))
+    labels[(truth < 4) & (part < cut)] += 20
+    labels[(truth == 0) & (part > 0.9)] = 50
+    labels[(truth == 5) | ((truth == 6) & (part > 0.1 * float(seed % 3)))] = 30
+    labels[(truth == 7) & (part < 0.95)] = 8
+    labels[(truth == 9) & (part < 0.7)] = -1
+    stray = torch.rand(len(truth), generator=rng) < 0.05
+    labels[stray] = torch.randint(-1, 12, (int(stray.sum()),), generator=rng)
+    truth[torch.rand(len(truth), generator=rng) < 0.03] = -1
+    return labels, truth
+
+
+@pytest.mark.parametrize("limit", [0.5, 0.6, 0.8, 0.95])
+@pytest.mark.parametrize("seed", range(25))
+def test_segcomp_counts_are_those_of_the_definition(seed, limit):
+    labels, truth = spoiled_labels(seed)
+    expected = segcomp_by_definition(labels.tolist(), truth.tolist(), limit)
+    assert count_segcomp(contingency_table(labels, truth), threshold=limit) == expected
+
+
+@pytest.mark.parametrize(
+    ("labels", "truth", "expected"),
+    [
+        ("aaaaabbbbb", "aaaaabbbbb", (2, 0, 0, 0, 0)),
+        ("aaaaabbbbb", "aaaaaaaaaa", (0, 1, 0, 0, 0)),
+        ("aaaaaaaaaa", "aaaaabbbbb", (0, 0, 1, 0, 0)),
+        ("aaaaa.....", ".....aaaaa", (0, 0, 0, 1, 1)),
+        ("..........", "aaaaabbbbb", (0, 0, 0, 2, 0)),
+        ("aaaaabbbbb", "..........", (0, 0, 0, 0, 2)),
+        # Exactly 80 % is not more than 80 %.
+        ("aaaa......", "aaaaa.....", (0, 0, 0, 1, 1)),
+        # A crumb inside the face: both together explain the face better than the big one alone.
+        ("aaaaaaaaab", "aaaaaaaaaa", (0, 1, 0, 0, 0)),
+        # Three pieces of a face, one of them mostly elsewhere.
+        ("aaaaabbbbbcc", "aaaaaaaaaaac", (0, 1, 0, 1, 1)),
+    ],
+)
+def test_segcomp_counts_by_hand(labels, truth, expected):
+    ours, true = (
+        torch.tensor([-1 if letter == "." else ord(letter) for letter in word])
+        for word in (labels, truth)
+    )
+    assert count_segcomp(contingency_table(ours, true)) == expected
+
+
+def test_segcomp_classifies_every_face_and_region_once():
+    for seed in range(10):
+        table = contingency_table(*spoiled_labels(seed))
+        counts = count_segcomp(table)
+        assert counts.correct + counts.over_segmented + counts.missed <= len(table.face_labels)
+        assert counts.correct + counts.under_segmented + counts.noise <= len(table.region_labels)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_evops_indices_are_those_of_the_definition(seed):
+    labels, truth = spoiled_labels(seed)
+    score = score_evops(contingency_table(labels, truth))
+    expected = evops_by_definition(labels.tolist(), truth.tolist())
+    assert score._asdict() == pytest.approx(expected, abs=1e-14)
+
+
+def test_evops_counts_merged_faces_as_under_segmented_and_not_missed():
+    table = contingency_table(torch.tensor([1, 1, 1, 1]), torch.tensor([1, 1, 2, 4]))
+    score = score_evops(table)
+    assert (score.under_segmented, score.over_segmented, score.noise, score.missed) == (1, 0, 0, 0)
+
+
+def test_evops_of_nothing_is_zero():
+    empty = torch.tensor([-1, -1])
+    assert set(score_evops(contingency_table(empty, empty))) == {0.0}
+
+
+@pytest.mark.parametrize("threshold", [0.4, 1.0])
+def test_segcomp_refuses_a_threshold_without_unique_classes(threshold):
+    table = contingency_table(torch.tensor([0]), torch.tensor([0]))
+    with pytest.raises(ConfigError, match=r"count_segcomp: expected threshold in \[0.5, 1\), got"):
+        count_segcomp(table, threshold=threshold)
+
+
+@pytest.mark.parametrize("bounds", [(0.5, 0.2), (1.1, 0.2), (0.75, 0.8), (0.75, 0.0)])
+def test_evops_refuses_bounds_that_do_not_match_one_to_one(bounds):
+    table = contingency_table(torch.tensor([0]), torch.tensor([0]))
+    with pytest.raises(ConfigError, match="score_evops: expected 0 < part_iou <= full_iou"):
+        score_evops(table, full_iou=bounds[0], part_iou=bounds[1])
