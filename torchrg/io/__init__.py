@@ -11,10 +11,10 @@ import numpy as np
 
 from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path, check_place
-from torchrg.io.e57 import read_e57, write_e57
+from torchrg.io.e57 import check_e57, read_e57, write_e57
 from torchrg.io.fields import FileCloud, checked_coordinates
 from torchrg.io.files import check_file
-from torchrg.io.las import read_las, write_las
+from torchrg.io.las import check_las, read_las, write_las
 from torchrg.io.npy import (
     cloud_arrays,
     read_npy,
@@ -33,10 +33,17 @@ __all__ = ["FORMATS", "FileCloud", "atomic_path", "check_output", "read_cloud", 
 
 
 class Format(NamedTuple):
-    """How a kind of file is read and written."""
+    """How a kind of file is read and written.
+
+    Attributes:
+        read: Reads a file.
+        write: Writes a cloud.
+        check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
+    """
 
     read: Callable[[Path], Cloud]
     write: Callable[[Path, Cloud], None]
+    check: Callable[[Path, Cloud | None], None] | None = None
 
 
 FORMATS: dict[str, Format] = {
@@ -44,9 +51,9 @@ FORMATS: dict[str, Format] = {
     ".npy": Format(read_npy, write_npy),
     ".ply": Format(read_ply, write_ply),
     ".pcd": Format(read_pcd, write_pcd),
-    ".las": Format(read_las, write_las),
-    ".laz": Format(read_las, write_las),
-    ".e57": Format(read_e57, write_e57),
+    ".las": Format(read_las, write_las, check_las),
+    ".laz": Format(read_las, write_las, check_las),
+    ".e57": Format(read_e57, write_e57, check_e57),
     ".xyz": Format(read_text, write_text),
     ".txt": Format(read_text, write_text),
 }
@@ -74,9 +81,10 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "corner.xyz"
-        >>> _ = path.write_text("0 0 0 255 0 0\n0.5 0 0 0 255 0\n")
-        >>> cloud = read_cloud(path)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "corner.xyz"
+        ...     _ = path.write_text("0 0 0 255 0 0\n0.5 0 0 0 255 0\n")
+        ...     cloud = read_cloud(path)
         >>> cloud.coordinates.shape, cloud.fields["color"].tolist()
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
@@ -121,14 +129,15 @@ def write_cloud(
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "corner.ply"
-        >>> write_cloud(path, Cloud(np.eye(3), {"labels": np.array([0, 0, -1])}))
-        >>> read_cloud(path).fields["labels"].tolist()
+        >>> cloud = Cloud(np.eye(3), {"labels": np.array([0, 0, -1])})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_cloud(Path(folder) / "corner.ply", cloud)
+        ...     read_cloud(Path(folder) / "corner.ply").fields["labels"].tolist()
         [0, 0, -1]
     """
     target = Path(path)
     found = _format_of(target)
-    check_place(target)
+    check_output(target, cloud)
     cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
     if segmentation is not None:
         check_segmentation(target, cloud, segmentation)
@@ -146,14 +155,17 @@ def write_cloud(
         found.write(target, written)
 
 
-def check_output(path: str | os.PathLike[str]) -> None:
+def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:
     """Check before long work that its result has a place: known suffix, folder there.
 
     Args:
         path: Where a file shall be written.
+        cloud: The cloud that shall be written, if it is known yet: LAS holds no points that are
+            not finite.
 
     Raises:
-        FormatError: If :func:`write_cloud` would refuse the path.
+        FormatError: If :func:`write_cloud` would refuse the path, or the cloud.
+        MissingDependencyError: If the format needs an optional package.
 
     Example:
         >>> check_output("planes.stl")
@@ -162,8 +174,10 @@ def check_output(path: str | os.PathLike[str]) -> None:
         torchrg.errors.FormatError: planes.stl: expected a file that ends in one of .npz .npy \
 .ply .pcd .las .laz .e57 .xyz .txt, got '.stl'.
     """
-    _format_of(Path(path))
+    found = _format_of(Path(path))
     check_place(path)
+    if found.check is not None:
+        found.check(Path(path), cloud)
 
 
 def _format_of(path: Path) -> Format:

@@ -27,13 +27,14 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Example:
         >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> with atomic_path(folder / "a.txt") as beside:
-        ...     _ = beside.write_text("whole")
-        ...     (folder / "a.txt").exists()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "a.txt"
+        ...     with atomic_path(path) as beside:
+        ...         _ = beside.write_text("whole")
+        ...         print(path.exists())
+        ...     print(path.read_text())
         False
-        >>> (folder / "a.txt").read_text()
-        'whole'
+        whole
     """
     target = Path(os.path.realpath(path))
     beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")

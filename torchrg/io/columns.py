@@ -19,12 +19,14 @@ class Spelling(NamedTuple):
         color: Names of the three channels.
         curvature: Name of the curvature.
         color_bits: Width of a channel, 8 or 16; colours of 16 bits are rounded to 8, not widened.
+        vectors: Whether other fields of several columns stay one, shape ``(N, C)``.
     """
 
     normals: tuple[str, str, str] = ("nx", "ny", "nz")
     color: tuple[str, str, str] = ("red", "green", "blue")
     curvature: str = "curvature"
     color_bits: int = 8
+    vectors: bool = False
 
 
 def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, NDArray[Any]]:
@@ -37,7 +39,7 @@ def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, NDA
 
     Returns:
         Columns of shape ``(N,)`` by name. Labels are int32 where they fit, colours uint8, a field
-        of several columns is ``name_0``, ``name_1`` and so on.
+        of several columns is ``name_0``, ``name_1`` and so on, unless the format has ``vectors``.
 
     Raises:
         FormatError: If a field is not numbers, has too many axes or another length, or two columns
@@ -146,6 +148,8 @@ def _spread(name: str, values: NDArray[Any], spelling: Spelling) -> list[tuple[s
     triples = {"normals": spelling.normals, "color": spelling.color}
     if name in triples and values.shape[1] == 3:
         names: tuple[str, ...] = triples[name]
+    elif spelling.vectors:
+        return [(word, values)]
     else:
         names = tuple(f"{word}_{i}" for i in range(values.shape[1]))
     return [(column_name, values[:, i]) for i, column_name in enumerate(names)]

@@ -7,28 +7,25 @@ Pictures and what else a file holds beside points are not kept.
 """
 
 import re
-import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, flatten_cloud, narrow_integers
+from torchrg.io.e57_points import AXES, COLOR, STATE, Block, read_points, write_points
 from torchrg.io.e57_pose import Scan, to_cartesian
 from torchrg.io.fields import FileCloud, assemble_cloud
 from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
 from torchrg.structures import Cloud
 
-AXES = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+STATES = (STATE, "sphericalInvalidState")
 NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
-COLOR = ("colorRed", "colorGreen", "colorBlue")
 CHANNELS = ("red", "green", "blue")
 SPELLING = Spelling(normals=NORMALS, color=COLOR)
 STANDARD = {*NORMALS, *COLOR, "intensity", "rowIndex", "columnIndex", "returnIndex", "returnCount"}
@@ -36,7 +33,6 @@ EXTENSIONS = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "torchrg": "urn:torchrg:point-fields",
 }
-Block = dict[str, NDArray[Any]]
 
 
 def read_e57(path: Path) -> Cloud:
@@ -71,7 +67,7 @@ def read_e57(path: Path) -> Cloud:
             )
             scans = tuple(_pose(header) for header in headers)
             blocks = [
-                _to_world(path, _read_block(pye57, file, header), scan)
+                _to_world(path, read_points(pye57, file, header), scan)
                 for header, scan in zip(headers, scans, strict=True)
             ]
     except FormatError:
@@ -83,6 +79,15 @@ def read_e57(path: Path) -> Cloud:
     if not blocks:
         raise FormatError(f"{path}: expected at least one scan, got none; fetch the file again.")
     return assemble_cloud(path, _joined(blocks), header={"scans": scans})
+
+
+def check_e57(path: Path, cloud: Cloud | None) -> None:
+    """Check that pye57 is installed; E57 holds any cloud.
+
+    Raises:
+        MissingDependencyError: If pye57 is not installed.
+    """
+    require("pye57", extra="e57", purpose="write E57 files")
 
 
 def write_e57(path: Path, cloud: Cloud) -> None:
@@ -110,7 +115,7 @@ def write_e57(path: Path, cloud: Cloud) -> None:
                 file.image_file.extensionsAdd(prefix, uri)
             for scan, rows in _groups(columns, stored):
                 block = {name: column[rows] for name, column in columns.items()}
-                _write_block(pye57.libe57, file, scan, _to_scan(block, scan))
+                write_points(pye57.libe57, file, scan, _to_scan(block, scan))
     except (pye57.libe57.E57Exception, ValueError, RuntimeError) as error:
         if isinstance(error, FormatError):
             raise
@@ -125,37 +130,6 @@ def _pose(header: Any) -> Scan:  # noqa: ANN401
     return Scan(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
 
 
-def _read_block(pye57: Any, file: Any, header: Any) -> Block:  # noqa: ANN401
-    """Return what the points of a scan hold, by the standard's names."""
-    libe57, count = pye57.libe57, header.point_count
-    prototype = libe57.StructureNode(header.points.prototype())
-    block: Block = {}
-    buffers = libe57.VectorSourceDestBuffer()
-    for name in header.point_fields:
-        node = pye57.utils.get_node(prototype, name)
-        if isinstance(node, libe57.StringNode):
-            continue
-        block[name] = np.empty(count, _letter(libe57, node))
-        if count:
-            buffer = libe57.SourceDestBuffer(file.image_file, name, block[name], count, True, True)
-            buffers.append(buffer)
-    if count:
-        reader = header.points.reader(buffers)
-        found = reader.read()
-        reader.close()
-        if found != count:
-            raise EOFError(f"{found:,} of {count:,} points")
-    return block
-
-
-def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
-    """Return the letter of NumPy's type for a field; q is libe57's only one for 64 bits."""
-    if isinstance(node, libe57.IntegerNode):
-        return "q"
-    single = isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
-    return "f" if single else "d"
-
-
 def _to_world(path: Path, block: Block, scan: Scan) -> Block:
     """Move the points of a scan by its pose, and give the fields the names of columns."""
     if all(axis in block for axis in AXES):
@@ -166,7 +140,7 @@ def _to_world(path: Path, block: Block, scan: Scan) -> Block:
         raise FormatError(
             f"{path}: expected points with {', '.join(AXES)}, got {', '.join(block) or 'none'}."
         )
-    for name in INVALID:
+    for name in STATES:
         if name in block:
             points[block.pop(name) != 0] = np.nan
     if all(name in block for name in NORMALS):
@@ -201,7 +175,8 @@ def _groups(columns: Block, scans: Sequence[Scan]) -> Iterator[tuple[Scan, slice
         if bounds[0] == 0 and bounds[-1] == count:
             del columns["scan"]
             for scan, start, stop in zip(scans, bounds, bounds[1:], strict=False):
-                yield scan, slice(start, stop)
+                if start < stop:
+                    yield scan, slice(start, stop)
             return
     yield scans[0] if len(scans) == 1 else Scan(), slice(0, count)
 
@@ -217,70 +192,8 @@ def _to_scan(block: Block, scan: Scan) -> Block:
     if not finite.all():
         points = np.where(finite[:, None], points, 0)
         # 2: there is nothing meaningful in the coordinates.
-        named[INVALID[0]] = np.where(finite, 0, 2)
+        named[STATE] = np.where(finite, 0, 2)
     for name, column in block.items():
         word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
         named[name if name in STANDARD else f"torchrg:{word}"] = column
     return {**dict(zip(AXES, points.T, strict=True)), **named}
-
-
-def _write_block(libe57: Any, file: Any, scan: Scan, block: Block) -> None:  # noqa: ANN401
-    """Add a scan to a file."""
-    image, count = file.image_file, len(block[AXES[0]])
-
-    def tree(values: dict[str, Any]) -> Any:  # noqa: ANN401
-        node = libe57.StructureNode(image)
-        kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
-        for name, value in values.items():
-            is_tree = isinstance(value, dict)
-            node.set(name, tree(value) if is_tree else kinds[type(value)](image, value))
-        return node
-
-    limits = {
-        f"{axis[-1].lower()}{end}": float(take(block[axis])) if count else 0.0
-        for axis in AXES
-        for end, take in (("Minimum", np.min), ("Maximum", np.max))
-    }
-    values: dict[str, Any] = {
-        "guid": f"{{{uuid.uuid4()}}}",
-        "name": scan.name,
-        "pose": {
-            "rotation": dict(zip("wxyz", scan.rotation, strict=True)),
-            "translation": dict(zip("xyz", scan.translation, strict=True)),
-        },
-    }
-    if not scan.is_moved:
-        values["cartesianBounds"] = limits
-    if "intensity" in block:
-        known = block["intensity"][np.isfinite(block["intensity"])]
-        values["intensityLimits"] = {
-            "intensityMinimum": float(known.min(initial=np.inf)) if known.size else 0.0,
-            "intensityMaximum": float(known.max(initial=-np.inf)) if known.size else 0.0,
-        }
-    if all(name in block for name in COLOR):
-        values["colorLimits"] = {
-            f"{c}{end}": v for c in COLOR for end, v in (("Minimum", 0), ("Maximum", 255))
-        }
-    node = tree(values)
-    prototype = libe57.StructureNode(image)
-    buffers = libe57.VectorSourceDestBuffer()
-    kept = []
-    for name, column in block.items():
-        whole = column.dtype.kind != "f"
-        if whole:
-            low, high = (int(column.min()), int(column.max())) if count else (0, 0)
-            prototype.set(name, libe57.IntegerNode(image, low, low, high))
-        else:
-            double = column.dtype.itemsize > 4
-            precision = libe57.E57_DOUBLE if double else libe57.E57_SINGLE
-            prototype.set(name, libe57.FloatNode(image, 0.0, precision))
-        kept.append(np.ascontiguousarray(column, dtype="q" if whole else column.dtype))
-        if count:
-            buffers.append(libe57.SourceDestBuffer(image, name, kept[-1], count, True, True))
-    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
-    node.set("points", points)
-    file.data3d.append(node)
-    if count:
-        writer = points.writer(buffers)
-        writer.write(count)
-        writer.close()

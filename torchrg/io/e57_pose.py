@@ -49,21 +49,25 @@ class Scan(NamedTuple):
         if not self.is_moved:
             return points
         moved: NDArray[np.float64] = points.astype(np.float64) @ self.matrix.T
-        return moved + np.array(self.translation)
+        moved += np.array(self.translation)
+        return moved
 
     def to_scan(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the world to the scan, shape ``(N, 3)``."""
         if not self.is_moved:
             return points
-        moved: NDArray[np.float64] = points.astype(np.float64) - np.array(self.translation)
-        return np.dot(moved, self.matrix)
+        moved: NDArray[np.float64] = points.astype(np.float64)
+        moved -= np.array(self.translation)
+        moved @= self.matrix
+        return moved
 
     def rotate(self, vectors: NDArray[np.floating], *, back: bool = False) -> NDArray[np.floating]:
         """Turn vectors from the scan to the world, or back, shape ``(N, 3)``, in their own type."""
         if not self.is_moved:
             return vectors
         matrix = self.matrix if back else self.matrix.T
-        return (vectors.astype(np.float64) @ matrix).astype(vectors.dtype)
+        turned: NDArray[np.float64] = vectors.astype(np.float64) @ matrix
+        return turned.astype(vectors.dtype)
 
 
 def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.structures import UNLABELED, Cloud
+from torchrg.io.field_types import are_unit, are_whole, as_color, as_labels, as_normals
+from torchrg.structures import Cloud
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -149,11 +150,11 @@ def name_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
         names[3] = "intensity"
     if values.shape[1] in (6, 7):
         three = values[:, 3:6]
-        if _are_unit(three):
+        if are_unit(three):
             names[3:6] = ["nx", "ny", "nz"]
-        elif _are_whole(three) and three.min() >= 0 and three.max() <= 255:
+        elif are_whole(three) and three.min() >= 0 and three.max() <= 255:
             names[3:6] = ["red", "green", "blue"]
-        if values.shape[1] == 7 and names[3] != "column_4" and _are_whole(values[:, 6]):
+        if values.shape[1] == 7 and names[3] != "column_4" and are_whole(values[:, 6]):
             names[6] = "label"
     return {name: values[:, i] for i, name in enumerate(names)}
 
@@ -161,7 +162,7 @@ def name_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
 def _renamed(path: Path, columns: Columns) -> dict[str, NDArray[Any]]:
     """Give columns torchrg's names and types."""
     fields = _grouped(columns)
-    for name, check in (("labels", _as_labels), ("normals", _as_normals), ("color", _as_color)):
+    for name, check in (("labels", as_labels), ("normals", as_normals), ("color", as_color)):
         if name in fields:
             fields[name] = check(path, fields[name])
     return fields
@@ -223,76 +224,3 @@ def _stacked(columns: list[NDArray[Any]]) -> NDArray[Any]:
     for i, column in enumerate(columns):
         stacked[:, i] = column
     return stacked
-
-
-def _are_whole(values: NDArray[Any]) -> bool:
-    """Whether all values are finite whole numbers."""
-    if values.dtype.kind in "iub":
-        return True
-    return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
-
-
-def _reach(values: NDArray[Any]) -> float:
-    """Return the largest magnitude, 0 for none."""
-    return float(np.abs(values.astype(np.float64)).max(initial=0))
-
-
-def _are_unit(rows: NDArray[Any]) -> bool:
-    """Whether rows are unit vectors up to 1e-3, or zero or not numbers where there is none."""
-    squares = np.square(rows.astype(np.float64)).sum(axis=1)
-    rest = squares[np.isfinite(squares) & (squares != 0)]
-    return len(rest) > 0 and bool((np.abs(rest - 1) < 2e-3).all())
-
-
-def _as_labels(path: Path, labels: NDArray[Any]) -> NDArray[np.int64]:
-    """Return labels as int64, shape ``(N,)``; not-a-number means no label, as in CloudCompare."""
-    flat = labels.reshape(-1) if labels.shape[1:] == (1,) else labels
-    if flat.ndim != 1 or flat.dtype.kind not in "biuf":
-        raise FormatError(
-            f"{path}: expected one whole number a point as labels, got shape {labels.shape} "
-            f"of {labels.dtype}; rename or remove that field."
-        )
-    if flat.dtype.kind == "f":
-        flat = np.where(np.isnan(flat), flat.dtype.type(UNLABELED), flat)
-    if not _are_whole(flat) or (flat.dtype.kind in "uf" and _reach(flat) >= 2.0**63):
-        raise FormatError(
-            f"{path}: expected labels to be whole numbers of 64 bits; rename or remove that field."
-        )
-    return flat.astype(np.int64)
-
-
-def _as_normals(path: Path, normals: NDArray[Any]) -> NDArray[np.floating]:
-    """Return normals as float32 or float64, shape ``(N, 3)``."""
-    if normals.ndim != 2 or normals.shape[1] != 3 or normals.dtype.kind not in "fiu":
-        raise FormatError(
-            f"{path}: expected normals to be three numbers a point, got shape {normals.shape} "
-            f"of {normals.dtype}; rename or remove that field."
-        )
-    return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
-
-
-def _as_color(path: Path, color: NDArray[Any]) -> NDArray[Any]:
-    """Return colours as uint8 0..255, shape ``(N, 3)``; uint16 where 8 bits do not hold them.
-
-    Floating-point colours are 0..1 if none is larger, otherwise 0..255.
-    """
-    if color.ndim != 2 or color.shape[1] != 3 or color.dtype.kind not in "fiu":
-        raise FormatError(
-            f"{path}: expected color to be three numbers a point, got shape {color.shape} "
-            f"of {color.dtype}; rename or remove that field."
-        )
-    if color.dtype == np.uint8 or color.size == 0:
-        return color.astype(np.uint8)
-    values = np.nan_to_num(color, copy=True) if color.dtype.kind == "f" else color
-    low, high = values.min(), values.max()
-    if low < 0 or high > (255 if color.dtype.kind == "f" else 65535):
-        raise FormatError(
-            f"{path}: expected color in 0..255, got {low} to {high}; rename or remove that field."
-        )
-    if color.dtype.kind == "f":
-        return np.rint(values * 255 if high <= 1 else values).astype(np.uint8)
-    if high <= 255:
-        return values.astype(np.uint8)
-    wide = values.astype(np.uint16)
-    # 65535 / 255 = 257: what eight bits become in sixteen, and back without loss.
-    return wide if (wide % 257).any() else (wide // 257).astype(np.uint8)

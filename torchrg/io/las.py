@@ -6,7 +6,6 @@ Normals, curvature and labels are extra dimensions named ``NormalX``, ``NormalY`
 
 import copy
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, flatten_cloud
 from torchrg.io.fields import FileCloud, assemble_cloud
 from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
+from torchrg.io.las_checks import check_chunks, check_header
 from torchrg.structures import Cloud
 
 POINTS_AT_ONCE = 1 << 20
@@ -29,7 +29,6 @@ WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 UNFIT = "_value"
 """Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
 LARGEST_INTEGER = 2**31 - 1
-VARIABLE_CHUNKS = 2**32 - 1
 DATE_BYTES = (90, 4)
 
 
@@ -50,7 +49,7 @@ def read_las(path: Path) -> Cloud:
     """
     laspy = require("laspy", extra="las", purpose="read LAS and LAZ files")
     size = check_file(path)
-    _check_counts(path, size)
+    check_header(path, size)
     try:
         with (
             np.errstate(over="ignore", invalid="ignore"),
@@ -68,7 +67,7 @@ def read_las(path: Path) -> Cloud:
                 content=f"{header.point_count:,} points",
             )
             if header.are_points_compressed:
-                _check_chunks(path, header, size)
+                check_chunks(path, header, size)
             # By blocks, so that memory grows with the points that are really there.
             blocks = [_columns(block) for block in reader.chunk_iterator(POINTS_AT_ONCE)]
     except FormatError:
@@ -87,13 +86,33 @@ def read_las(path: Path) -> Cloud:
     if not blocks:
         raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
     columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    standard = set(header.point_format.standard_dimension_names)
-    used = {name: c for name, c in columns.items() if name not in standard or c.any()}
+    unused = _unused(header.point_format, columns)
     named = {
-        name.removesuffix(UNFIT) if name.removesuffix(UNFIT) not in used else name: column
-        for name, column in used.items()
+        name.removesuffix(UNFIT) if name.removesuffix(UNFIT) in unused else name: column
+        for name, column in columns.items()
+        if name not in unused
     }
     return assemble_cloud(path, named, header={"las": header})
+
+
+def check_las(path: Path, cloud: Cloud | None) -> None:
+    """Check that a cloud can be written as LAS: laspy is installed, and all points are finite.
+
+    Args:
+        path: The file to write.
+        cloud: The cloud; None if it is not known yet.
+
+    Raises:
+        FormatError: If a point is not finite.
+        MissingDependencyError: If laspy is not installed.
+    """
+    require("laspy", extra="las", purpose="write LAS and LAZ files")
+    if cloud is not None and not cloud.finite.all():
+        raise FormatError(
+            f"{path}: expected finite coordinates, as LAS has no others, got "
+            f"{int((~cloud.finite).sum())} points that are not (first: "
+            f"{int(np.argmin(cloud.finite))}); write .npz, .ply or .pcd."
+        )
 
 
 def write_las(path: Path, cloud: Cloud) -> None:
@@ -101,23 +120,16 @@ def write_las(path: Path, cloud: Cloud) -> None:
 
     Args:
         path: The file.
-        cloud: The cloud. If it came from a LAS file, scale, offset, reference system and point
+        cloud: The cloud, all of it finite. If it came from a LAS file, scale, offset, reference system and point
             format are kept; otherwise the scale is the smallest power of ten that the grid of 32
             bits allows.
 
     Raises:
-        FormatError: If a point is not finite or off the grid, a field has no place in a LAS file,
-            or the file cannot be written.
+        FormatError: If a point is off the grid, a field has no place in a LAS file, or the file
+            cannot be written.
         MissingDependencyError: If laspy is not installed.
     """
     laspy = require("laspy", extra="las", purpose="write LAS and LAZ files")
-    if not cloud.finite.all():
-        first = int(np.argmin(cloud.finite))
-        raise FormatError(
-            f"{path}: expected finite coordinates, as LAS has no others, got "
-            f"{int((~cloud.finite).sum())} points that are not (first: {first}); "
-            "write .npz, .ply or .pcd."
-        )
     columns = flatten_cloud(path, cloud, SPELLING)
     header, has_date = _header(laspy, cloud, colored=all(name in columns for name in COLOR))
     named = _fitted(path, header.point_format, columns)
@@ -143,67 +155,6 @@ def write_las(path: Path, cloud: Cloud) -> None:
         raise FormatError(f"{path}: cannot be written: {first_line(error)}.") from error
 
 
-def _check_counts(path: Path, size: int) -> None:
-    """Check the numbers of records that laspy would otherwise loop over."""
-    with path.open("rb") as stream:
-        head = stream.read(255)
-        if head[:4] != b"LASF" or len(head) < 227:
-            raise FormatError(f"{path}: byte 0: expected the header of a LAS file; fetch it again.")
-        (num_records,) = struct.unpack_from("<I", head, 100)
-        check_promise(
-            path, byte=100, promised=54 * num_records, available=size, content="header records"
-        )
-        if head[25] < 4 or len(head) < 247:
-            return
-        start, num_extended = struct.unpack_from("<QI", head, 235)
-        for _ in range(num_extended):
-            content = f"{num_extended:,} extended header records"
-            check_promise(path, byte=start, promised=60, available=size - start, content=content)
-            stream.seek(start)
-            (length,) = struct.unpack_from("<Q", stream.read(60), 20)
-            start += 60
-            check_promise(
-                path, byte=start, promised=length, available=size - start, content=content
-            )
-            start += length
-
-
-def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
-    """Check the number of compressed chunks; lazrs ends the process if memory for it fails."""
-    start = header.offset_to_point_data
-    with path.open("rb") as stream:
-        stream.seek(start)
-        offset = int.from_bytes(stream.read(8), "little", signed=True)
-        if offset == -1:
-            # The writer could not go back to the beginning, so the offset is at the end.
-            stream.seek(size - 8)
-            offset = int.from_bytes(stream.read(8), "little", signed=True)
-        content = "the table of chunks"
-        if offset < 0:
-            raise FormatError(
-                f"{path}: byte {start}: expected the place of {content}; fetch it again."
-            )
-        check_promise(path, byte=offset, promised=8, available=size - offset, content=content)
-        stream.seek(offset)
-        _, num_chunks = struct.unpack("<II", stream.read(8))
-        # The first point of a chunk is stored as it is.
-        check_promise(
-            path,
-            byte=offset + 4,
-            promised=num_chunks * header.point_format.size,
-            available=size,
-            content=f"{num_chunks:,} chunks",
-            at_least=True,
-        )
-    (record,) = header.vlrs.get("LasZipVlr")
-    (chunk_size,) = struct.unpack_from("<I", record.record_data, 12)
-    if chunk_size != VARIABLE_CHUNKS and header.point_count > num_chunks * chunk_size:
-        raise FormatError(
-            f"{path}: byte {offset}: expected chunks for {header.point_count:,} points, got "
-            f"{num_chunks:,} of {chunk_size:,}; the file is damaged, fetch it again."
-        )
-
-
 def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
     """Return the dimensions of a block of points."""
     columns: dict[str, NDArray[Any]] = {axis: np.asarray(block[axis]) for axis in "xyz"}
@@ -216,6 +167,15 @@ def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
         else:
             columns |= {f"{dimension.name}_{i}": part for i, part in enumerate(values.T)}
     return columns
+
+
+def _unused(point_format: Any, columns: dict[str, NDArray[Any]]) -> set[str]:  # noqa: ANN401
+    """Return the standard dimensions that are zero everywhere; the channels of a colour as one."""
+    standard = set(point_format.standard_dimension_names)
+    used = {name for name, column in columns.items() if name not in standard or column.any()}
+    if not used.isdisjoint(COLOR):
+        used.update(COLOR)
+    return columns.keys() - used
 
 
 def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401

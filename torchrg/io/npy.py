@@ -211,8 +211,8 @@ def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> ND
         shape, _, dtype = read(stream)
     except (*DAMAGES, SyntaxError, tokenize.TokenError) as error:
         raise FormatError(
-            f"{path}: byte 0: expected the header of a NumPy array in {content}, got: {first_line(error)}; "
-            "write it again with numpy.save or numpy.savez."
+            f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
+            f"{first_line(error)}; write it again with numpy.save or numpy.savez."
         ) from error
     if dtype.hasobject:
         raise FormatError(

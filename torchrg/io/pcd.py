@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path
-from torchrg.io.columns import check_fields
+from torchrg.io.columns import Spelling, flatten_cloud
 from torchrg.io.fields import FileCloud, assemble_cloud
 from torchrg.io.files import check_file, check_promise
 from torchrg.io.pcd_header import DEFAULT_VIEWPOINT, PADDING, Header, format_header, read_header
 from torchrg.io.tables import read_table
 from torchrg.structures import Cloud
 
+SPELLING = Spelling(normals=("normal_x", "normal_y", "normal_z"), vectors=True)
 PACKED_COLORS = ("rgb", "rgba")
 # A reference of three bytes in LZF stands for at most 264 bytes.
 LARGEST_LZF_RATIO = 88
@@ -74,20 +75,7 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
             f"{path}: expected a grid of {len(cloud)} points, got {height} rows of {width}; "
             "set grid_shape to None."
         )
-    columns: dict[str, NDArray[Any]] = {
-        axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")
-    }
-    for name, values in check_fields(path, cloud).items():
-        if name == "normals":
-            # Open3D reads normals as if they had the type of the coordinates.
-            values = values.astype(np.result_type(values, cloud.coordinates))
-        packed = _packed(name, values)
-        if not columns.keys().isdisjoint(packed):
-            twice = ", ".join(columns.keys() & packed.keys())
-            raise FormatError(
-                f"{path}: expected fields of different names, got {twice} twice; rename one."
-            )
-        columns |= packed
+    columns = _packed(flatten_cloud(path, cloud, SPELLING))
     records = np.empty(
         len(cloud),
         [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in columns.items()],
@@ -108,11 +96,11 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
 
 def _read_text(path: Path, stream: BinaryIO, header: Header, size: int) -> dict[str, NDArray[Any]]:
     """Read the fields of an ASCII file."""
-    # Padding has no type of its own; in ASCII it is so many words to skip.
+    # Padding has no type of its own; in ASCII it is COUNT words to skip.
     parts = [
         (
             name,
-            "f8" if name.startswith(PADDING) else header.dtype[name].base,
+            "f8" if name.startswith(f"{PADDING} ") else header.dtype[name].base,
             header.dtype[name].shape,
         )
         for name in header.dtype.names or ()
@@ -199,18 +187,25 @@ def _unpacked(name: str, values: NDArray[Any]) -> dict[str, NDArray[Any]]:
     if name.lower() not in PACKED_COLORS or values.ndim != 1 or values.dtype.itemsize != 4:
         return {name: values}
     channels = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-    alpha, color = "alpha", channels.view(np.uint8).reshape(-1, 4)
     # Least significant byte first: blue, green, red, alpha.
-    unpacked = {"color": np.ascontiguousarray(color[:, 2::-1])}
-    return unpacked if name.lower() == "rgb" else unpacked | {alpha: color[:, 3].copy()}
+    quadruples = channels.view(np.uint8).reshape(-1, 4)
+    unpacked = {"color": np.ascontiguousarray(quadruples[:, 2::-1])}
+    return unpacked | ({"alpha": quadruples[:, 3].copy()} if name.lower() == "rgba" else {})
 
 
-def _packed(name: str, values: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Return the fields of a PCD file for a field of the cloud."""
-    if name == "color" and values.shape[1:] == (3,):
-        packed = np.zeros((len(values), 4), np.uint8)
-        packed[:, 2::-1] = values
-        return {"rgb": packed.view("<f4")[:, 0]}
-    if name == "normals" and values.shape[1:] == (3,):
-        return {f"normal_{axis}": values[:, i] for i, axis in enumerate("xyz")}
-    return {"label" if name == "labels" else "_".join(name.split()) or "field": values}
+def _packed(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Pack the channels of a colour as PCL does, and give normals the type of the coordinates."""
+    packed: dict[str, NDArray[Any]] = {}
+    has_color = all(name in columns for name in SPELLING.color)
+    for name, column in columns.items():
+        if has_color and name == SPELLING.color[0]:
+            quadruples = np.zeros((len(column), 4), np.uint8)
+            for i, channel in enumerate(SPELLING.color):
+                quadruples[:, 2 - i] = columns[channel]
+            packed["rgb"] = quadruples.view("<f4")[:, 0]
+        elif name in SPELLING.normals:
+            # Open3D reads normals as if they had the type of the coordinates.
+            packed[name] = column.astype(np.result_type(column, columns["x"]))
+        elif not (has_color and name in SPELLING.color):
+            packed[name] = column
+    return packed

@@ -147,13 +147,14 @@ def _record_type(entries: _Entries) -> np.dtype[np.void]:
     used = [name for name in names if name != PADDING]
     if not used or len(set(used)) != len(used):
         raise entries.error("FIELDS", "names that differ")
-    if 0 in counts or sum(s * c for s, c in zip(sizes, counts, strict=True)) > LARGEST_RECORD:
+    num_bytes = [size * count for size, count in zip(sizes, counts, strict=True)]
+    if 0 in num_bytes or sum(num_bytes) > LARGEST_RECORD:
         raise entries.error("COUNT", f"sizes of 1 to {LARGEST_RECORD} bytes")
     parts: list[tuple[Any, ...]] = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         shape = () if count == 1 else (count,)
         if name == PADDING:
-            parts.append((f"{PADDING} {i}", "V1", (size * count,)))
+            parts.append((f"{PADDING} {i}", f"V{size}", shape))
         elif f"{kind}{size}" in TYPES:
             parts.append((name, f"<{kind.lower()}{size}", shape))
         else:

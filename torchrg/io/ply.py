@@ -8,7 +8,7 @@ and face, and takes the memory a header promises; trimesh writes float32 and dro
 import io
 import itertools
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,59 +18,13 @@ from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, flatten_cloud, narrow_integers
 from torchrg.io.fields import assemble_cloud
 from torchrg.io.files import check_file, check_promise
+from torchrg.io.ply_header import TYPES, Element, Header, read_header
 from torchrg.io.tables import read_table
 from torchrg.structures import Cloud
 
-TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-}
-READ_TYPES = TYPES | {
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
-}
-BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-LONGEST_HEADER = 1 << 20
 LONGEST_LIST = 1 << 20
-
-
-class Property(NamedTuple):
-    """A property of an element: one number, or a list with its length before it."""
-
-    name: str
-    code: str
-    length_code: str | None = None
-
-
-class Element(NamedTuple):
-    """An element of a PLY file: so many records of some properties."""
-
-    name: str
-    num_records: int
-    properties: list[Property]
-
-
-class Header(NamedTuple):
-    """What a PLY header says, and where the data begin."""
-
-    byte_order: str
-    elements: list[Element]
-    num_lines: int
-    num_bytes: int
+# Names in a PLY file have no spaces, so these cannot meet one.
+LENGTH, LIST = " length", " list"
 
 
 def read_ply(path: Path) -> Cloud:
@@ -87,17 +41,19 @@ def read_ply(path: Path) -> Cloud:
     """
     size = check_file(path)
     with path.open("rb") as stream:
-        header = _read_header(path, stream)
-        if not any(name == "vertex" and properties for name, _, properties in header.elements):
-            found = ", ".join(element.name for element in header.elements) or "none"
+        header = read_header(path, stream)
+        names = [element.name for element in header.elements if element.properties]
+        if "vertex" not in names:
             raise FormatError(
-                f"{path}: expected an element vertex with properties, got elements {found}; "
-                "write the points as vertices."
+                f"{path}: expected an element vertex with properties, got elements "
+                f"{', '.join(names) or 'none'}; write the points as vertices."
             )
+        needed = [element for element in header.elements if element.properties]
+        needed = needed[: names.index("vertex") + 1]
         read = _read_binary if header.byte_order else _read_text
-        records = read(path, stream, header, size)
-    names = records.dtype.names or ()
-    return assemble_cloud(path, {name.removesuffix(" list"): records[name] for name in names})
+        records = read(path, stream, header._replace(elements=needed), size)
+    names = [name for name in records.dtype.names or () if not name.endswith(LENGTH)]
+    return assemble_cloud(path, {name.removesuffix(LIST): records[name] for name in names})
 
 
 def write_ply(path: Path, cloud: Cloud) -> None:
@@ -146,62 +102,10 @@ def _storable(path: Path, name: str, column: NDArray[Any]) -> NDArray[Any]:
     return column.astype(column.dtype.newbyteorder("<"), copy=False)
 
 
-def _read_header(path: Path, stream: BinaryIO) -> Header:
-    """Read the header and leave the stream at the first byte of data."""
-    byte_order: str | None = None
-    elements: list[Element] = []
-    number = 0
-    while True:
-        number += 1
-        raw = stream.readline(LONGEST_HEADER)
-        words = raw.decode("latin-1").split()
-        if number == 1 and words != ["ply"]:
-            raise FormatError(f"{path}: line 1: expected 'ply', got {_shown(raw)}.")
-        if not raw.endswith(b"\n") or stream.tell() > LONGEST_HEADER:
-            raise FormatError(
-                f"{path}: line {number}: expected the header to end with 'end_header'; "
-                "the file is cut off, fetch it again."
-            )
-        match words:
-            case [] | ["ply" | "comment" | "obj_info", *_]:
-                pass
-            case ["format", word, _] if word in BYTE_ORDERS:
-                byte_order = BYTE_ORDERS[word]
-            case ["element", name, count] if count.isdecimal() and len(count) < 19:
-                elements.append(Element(name, int(count), []))
-            case ["property", "list", length, code, name] if (
-                elements and code in READ_TYPES and READ_TYPES.get(length, "f")[0] != "f"
-            ):
-                _add(path, number, elements, Property(name, READ_TYPES[code], READ_TYPES[length]))
-            case ["property", code, name] if elements and code in READ_TYPES:
-                _add(path, number, elements, Property(name, READ_TYPES[code]))
-            case ["end_header"] if byte_order is not None:
-                return Header(byte_order, elements, number, stream.tell())
-            case _:
-                raise FormatError(
-                    f"{path}: line {number}: expected a line of a PLY header, got {_shown(raw)}; "
-                    "write the file again."
-                )
-
-
-def _add(path: Path, number: int, elements: list[Element], new: Property) -> None:
-    """Add a property to the last element; two of one name are an error."""
-    if any(new.name == known.name for known in elements[-1].properties):
-        raise FormatError(
-            f"{path}: line {number}: expected properties of different names, got {new.name!r} "
-            "twice; rename one."
-        )
-    elements[-1].properties.append(new)
-
-
-def _shown(raw: bytes) -> str:
-    """Return the beginning of a line for a message."""
-    return repr(raw[:40].decode("latin-1").strip())
-
-
 def _read_binary(path: Path, stream: BinaryIO, header: Header, size: int) -> NDArray[np.void]:
-    """Read the vertices of a binary file."""
+    """Read the last of the elements of a binary file."""
     start = header.num_bytes
+    vertex = header.elements[-1]
     for element in header.elements:
         stream.seek(start)
         dtype = _record_type(path, stream, element, header.byte_order, size)
@@ -213,14 +117,12 @@ def _read_binary(path: Path, stream: BinaryIO, header: Header, size: int) -> NDA
             available=size - start,
             content=f"{element.num_records:,} records of {element.name}",
         )
-        if element.name == "vertex" or any(p.length_code for p in element.properties):
+        if element is vertex or any(prop.length_code for prop in element.properties):
             stream.seek(start)
             records = np.fromfile(stream, dtype, count=element.num_records)
             _check_lists(path, element, records)
-        if element.name == "vertex":
-            return records
         start += promised
-    raise FormatError(f"{path}: expected an element vertex.")
+    return records
 
 
 def _record_type(
@@ -243,15 +145,15 @@ def _record_type(
                 f"{length:,}; the file is damaged, fetch it again."
             )
         stream.seek(num_bytes, io.SEEK_CUR)
-        parts.append((f"{prop.name} length", length_type))
-        parts.append((f"{prop.name} list", byte_order + prop.code, (length,)))
+        parts.append((prop.name + LENGTH, length_type))
+        parts.append((prop.name + LIST, byte_order + prop.code, (length,)))
     return np.dtype(parts)
 
 
 def _check_lists(path: Path, element: Element, records: NDArray[np.void]) -> None:
     """Check that the lists of an element all have one length, so that records have one size."""
     for name in records.dtype.names or ():
-        if not name.endswith(" length") or len(records) == 0:
+        if not name.endswith(LENGTH) or len(records) == 0:
             continue
         if (records[name] != records[name][0]).any():
             raise FormatError(
@@ -261,26 +163,27 @@ def _check_lists(path: Path, element: Element, records: NDArray[np.void]) -> Non
 
 
 def _read_text(path: Path, stream: BinaryIO, header: Header, size: int) -> NDArray[np.void]:
-    """Read the vertices of an ASCII file."""
-    lines = (raw.decode("latin-1") for raw in stream)
-    line_number = header.num_lines + 1
-    for element in header.elements:
-        if element.name != "vertex":
-            line_number += sum(1 for _ in itertools.islice(lines, element.num_records))
-            continue
-        if any(prop.length_code for prop in element.properties):
-            raise FormatError(
-                f"{path}: expected vertices without lists in an ASCII file; write it as binary."
-            )
-        dtype = np.dtype([(prop.name, prop.code) for prop in element.properties])
-        check_promise(
-            path,
-            byte=header.num_bytes,
-            # A digit and what separates it from the next; the last may end with the file.
-            promised=element.num_records * max(2 * len(element.properties), 1) - 1,
-            available=size - header.num_bytes,
-            content=f"{element.num_records:,} vertices",
-            at_least=True,
+    """Read the last of the elements of an ASCII file."""
+    *before, vertex = header.elements
+    if any(prop.length_code for prop in vertex.properties):
+        raise FormatError(
+            f"{path}: expected vertices without lists in an ASCII file; write it as binary."
         )
-        return read_table(path, lines, dtype, first_line=line_number, num_rows=element.num_records)
-    raise FormatError(f"{path}: expected an element vertex.")
+    check_promise(
+        path,
+        byte=header.num_bytes,
+        # A digit and what separates it from the next; the last may end with the file.
+        promised=vertex.num_records * 2 * len(vertex.properties) - 1,
+        available=size - header.num_bytes,
+        content=f"{vertex.num_records:,} vertices",
+        at_least=True,
+    )
+    lines = (raw.decode("latin-1") for raw in stream)
+    skipped = sum(1 for element in before for _ in itertools.islice(lines, element.num_records))
+    return read_table(
+        path,
+        lines,
+        [(prop.name, prop.code) for prop in vertex.properties],
+        first_line=header.num_lines + 1 + skipped,
+        num_rows=vertex.num_records,
+    )
