@@ -2,7 +2,18 @@
 
 from torchrg.robust.fastmcd import fit_fastmcd
 from torchrg.robust.mcd import fit_detmcd
+from torchrg.robust.mm import fit_detmm, fit_dets
 from torchrg.robust.result import RobustFit
 from torchrg.robust.scale import mad, median, qn, qn_exceeds
 
-__all__ = ["RobustFit", "fit_detmcd", "fit_fastmcd", "mad", "median", "qn", "qn_exceeds"]
+__all__ = [
+    "RobustFit",
+    "fit_detmcd",
+    "fit_detmm",
+    "fit_dets",
+    "fit_fastmcd",
+    "mad",
+    "median",
+    "qn",
+    "qn_exceeds",
+]

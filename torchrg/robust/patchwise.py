@@ -31,10 +31,12 @@ def fit_patchwise(
     support_fraction: float,
     chunk_size: int,
     estimator: Estimator,
+    majority: Callable[[int], int] | None = None,
 ) -> RobustFit:
     """Apply an estimator to every patch, and answer the degenerate ones.
 
-    Patches are grouped by their number of points that count, so that every group is dense.
+    Patches are grouped by their number of points that count, so that every group is dense. The
+    points on one plane are an exact fit where they are ``majority(n)`` of n, by default h.
     """
     patches = as_tensor(caller, "patches", patches)
     check_floating(caller, patches=patches)
@@ -52,7 +54,7 @@ def fit_patchwise(
         counted &= mask.reshape(-1, num_points)
 
     def fit_dense(chunk: Tensor) -> RobustFit:
-        return _fit_chunk(chunk, support_fraction, estimator)
+        return _fit_chunk(chunk, support_fraction, estimator, majority)
 
     fit = _fit_groups(dense, counted, chunk_size, fit_dense)
     return RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in fit))
@@ -126,12 +128,18 @@ class _Frame(NamedTuple):
         return lanes / length / length
 
 
-def _fit_chunk(patches: Tensor, support_fraction: float, estimator: Estimator) -> RobustFit:
+def _fit_chunk(
+    patches: Tensor,
+    support_fraction: float,
+    estimator: Estimator,
+    majority: Callable[[int], int] | None,
+) -> RobustFit:
     """Fit finite patches ``(B, n, P)``."""
     num_patches, num_points, size = patches.shape
     subset = subset_size(num_points, size, support_fraction)
+    enough = subset if majority is None else majority(num_points)
     columns, frame, tolerance = _to_lanes(patches)
-    flats = find_flats(columns, tolerance, subset)
+    flats = find_flats(columns, tolerance, enough)
     out = no_fit(torch.Size([num_patches]), num_points, size, patches)
 
     def lanes_of(rows: Tensor) -> list[Tensor]:
@@ -146,7 +154,7 @@ def _fit_chunk(patches: Tensor, support_fraction: float, estimator: Estimator) -
         if len(thin):
             rows, chosen = regular[thin], estimate.raw_support[:, thin]
             members = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
-            found = members.sum(dim=0) >= subset
+            found = members.sum(dim=0) >= enough
             rows, members = rows[found], members[:, found]
             _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
     exact = torch.nonzero(flats.dimension == size - 1).squeeze(1)
@@ -160,7 +168,7 @@ def _fit_chunk(patches: Tensor, support_fraction: float, estimator: Estimator) -
             patches[lower],
             rest,
             CHUNK_SIZE,
-            lambda chunk: _fit_chunk(chunk, support_fraction, estimator),
+            lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
         )
         _store(out, lower, fit)
         lower = lower[~fit.valid]
