@@ -7,6 +7,7 @@ from scipy.stats import kstest
 
 from torchrg.errors import ConfigError
 from torchrg.scenes import (
+    SHAPES,
     Camera,
     RoomLayout,
     SceneModel,
@@ -18,6 +19,7 @@ from torchrg.scenes import (
     render_depth,
     sample_scene,
 )
+from torchrg.scenes.bumps import Bumpy
 from torchrg.scenes.cones import Cone
 from torchrg.scenes.extrusions import extrude
 from torchrg.scenes.frames import Frame, unit
@@ -25,7 +27,7 @@ from torchrg.scenes.kinect import KINECT_LAYOUT, fuse_frames
 from torchrg.scenes.outlines import Outline
 from torchrg.scenes.rays import cast_rays
 from torchrg.scenes.rings import Ring
-from torchrg.scenes.scene import Part
+from torchrg.scenes.scene import Part, plane_table
 from torchrg.scenes.surfaces import Flat
 from torchrg.structures import UNLABELED
 
@@ -78,6 +80,21 @@ def test_nearest_hit_is_that_of_brute_force_over_triangles(directions):
         assert hits.faces[row, column] == np.argmin(found)
 
 
+def test_rays_meet_a_convex_body_between_its_planes():
+    surfaces = SHAPES["dodecahedron"]()
+    normals, offsets = plane_table(surfaces)
+    rng = np.random.default_rng(0)
+    origin = np.array([[0.3, -2.0, 0.4]])
+    steps = rng.uniform(-0.7, 0.7, (2000, 3)) - origin
+    found = np.min([surface.intersect(origin, steps) for surface in surfaces], axis=0)
+    slopes = steps @ normals.T
+    distances = (offsets - origin @ normals.T) / slopes
+    entry = np.where(slopes < 0, distances, -np.inf).max(axis=1)
+    leave = np.where(slopes > 0, distances, np.inf).min(axis=1)
+    assert 500 < (entry < leave).sum() < 1900
+    assert np.allclose(found, np.where(entry < leave, entry, np.inf), rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     "surface",
     [
@@ -99,6 +116,7 @@ def test_nearest_hit_is_that_of_brute_force_over_triangles(directions):
             ),
             0.5,
         )[1],
+        Bumpy("", TURNED, 0.7, np.eye(3), np.full(3, 0.06), 5),
     ],
     ids=lambda surface: f"{type(surface).__name__}-{surface.plane is not None}",
 )
@@ -108,7 +126,10 @@ def test_rays_meet_curved_surfaces_where_their_points_are(surface):
     # A ray to a point of the surface meets it there or before, at a point of the surface.
     targets = surface.sample(rng, 3000)
     found = surface.intersect(origin, targets - origin)
-    assert (found <= 1 + 1e-7).all()
+    met = found <= 1 + 1e-7
+    # A body with bumps is followed in steps, and may be missed where it is only grazed.
+    assert met.mean() > (0.995 if isinstance(surface, Bumpy) else 1 - 1e-9)
+    targets, found = targets[met], found[met]
     first = origin + found[:, None] * (targets - origin)
     cloud = torch.from_numpy(surface.sample(rng, 60_000))
     gaps = torch.cdist(torch.from_numpy(first[:300]), cloud).min(dim=1).values
@@ -142,8 +163,8 @@ def test_path_to_the_nearest_hit_is_free_and_what_is_behind_is_not(seed, directi
     ids=["room", "curved", "storey"],
 )
 def test_no_ray_escapes(model):
-    directions = unit(np.random.default_rng(1).standard_normal((100, 200, 3)))
-    for viewpoint in model.viewpoints[:4]:
+    directions = unit(np.random.default_rng(1).standard_normal((60, 100, 3)))
+    for viewpoint in model.viewpoints[::3]:
         hits = cast_rays(model, viewpoint, directions)
         assert (hits.faces != UNLABELED).all()
         assert np.isfinite(hits.distances).all()
@@ -313,7 +334,7 @@ def test_unknown_sensor_is_refused():
 
 
 def test_exact_frames_fuse_to_points_on_their_faces():
-    scene = make_kinect_room(5000, seed=1, num_frames=2, sensor="exact")
+    scene = make_kinect_room(5000, seed=1, num_frames=1, sensor="exact")
     points, labels = scene.points.double(), scene.labels
     residuals = (points * scene.face_normals[labels]).sum(dim=1) - scene.face_offsets[labels]
     assert residuals.abs().max() < 3e-6
@@ -321,10 +342,12 @@ def test_exact_frames_fuse_to_points_on_their_faces():
 
 
 def test_fused_frames_come_in_random_order_without_doubles():
-    scene = make_kinect_room(5000, seed=1, num_frames=2, sensor="exact")
-    assert len(scene.points.unique(dim=0)) == 5000
-    again = make_kinect_room(5000, seed=1, num_frames=2, sensor="exact")
+    model = build_room(1, layout=KINECT_LAYOUT)
+    cameras = cameras_around(model, 3, width=64, height=48)
+    frames = [render_depth(model, camera) for camera in cameras]
+    scene, again = (fuse_frames(model, frames, 5000) for _ in range(2))
     assert torch.equal(scene.points, again.points)
+    assert len(scene.points.unique(dim=0)) == 5000
     places = scene.points[:, 0].double().numpy()
     assert kstest(places[:2500], places[2500:]).pvalue > 1e-3
 

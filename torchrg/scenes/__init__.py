@@ -4,7 +4,7 @@ from torchrg.scenes.cameras import Camera, cameras_around
 from torchrg.scenes.depth import DepthFrame, render_depth
 from torchrg.scenes.halls import HALL_LAYOUT, make_hall
 from torchrg.scenes.kinect import KINECT_LAYOUT, fuse_frames, make_kinect_room
-from torchrg.scenes.layout import RoomLayout
+from torchrg.scenes.layout import BENT_LAYOUT, CURVED_LAYOUT, THIN_LAYOUT, RoomLayout
 from torchrg.scenes.rooms import build_room, make_room
 from torchrg.scenes.sampling import sample_scene
 from torchrg.scenes.scene import Scene, SceneModel
@@ -12,9 +12,12 @@ from torchrg.scenes.shapes import SHAPES, make_shape
 from torchrg.scenes.storeys import StoreyLayout, build_storey, make_storey
 
 __all__ = [
+    "BENT_LAYOUT",
+    "CURVED_LAYOUT",
     "HALL_LAYOUT",
     "KINECT_LAYOUT",
     "SHAPES",
+    "THIN_LAYOUT",
     "Camera",
     "DepthFrame",
     "RoomLayout",

@@ -76,6 +76,28 @@ class RoomLayout:
             )
 
 
+CURVED_LAYOUT = RoomLayout(
+    num_windows=1,
+    num_tables=4,
+    num_columns=2,
+    num_round_tables=2,
+    num_balls=2,
+    num_lamps=2,
+    num_bent_walls=1,
+)
+"""A room with columns, balls, lamps, round tables and a bent wall."""
+
+BENT_LAYOUT = RoomLayout(
+    num_doors=0, num_windows=0, num_cabinets=0, num_shelves=0, num_bent_walls=4
+)
+"""A room whose walls are all slightly bent."""
+
+THIN_LAYOUT = RoomLayout(
+    num_windows=2, num_cabinets=1, num_shelves=4, num_panels=3, plate_thickness=0.02
+)
+"""A room with many thin plates: tables and shelves of 2 cm, panels of 1.5 to 3 cm."""
+
+
 def wall_places(size: Triple) -> list[WallPlace]:
     """Return where things fit on the four walls: wall, and distance from its start.
 

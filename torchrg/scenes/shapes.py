@@ -6,6 +6,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from torchrg.errors import ConfigError
+from torchrg.scenes.bumps import Bumpy
 from torchrg.scenes.cones import Cone
 from torchrg.scenes.extrusions import extrude
 from torchrg.scenes.frames import Array, Frame, cos_sin, unit
@@ -177,6 +178,12 @@ def _capsule() -> tuple[Surface, ...]:
     )
 
 
+def _bumpy(radius: float, height: float, degree: int) -> tuple[Surface, ...]:
+    """Return a ball with waves about four axes."""
+    axes = unit(np.array([(1.0, 0.3, 0.2), (-0.4, 1, 0.1), (0.2, -0.3, 1), (1, 1, -1)]))
+    return (Bumpy("ball", _HERE, radius, axes, np.full(4, height), degree),)
+
+
 SHAPES: dict[str, Callable[[], tuple[Surface, ...]]] = {
     "cube": lambda: _box(1, 1, 1),
     "cuboid": lambda: _box(1, 0.6, 0.35),
@@ -193,5 +200,7 @@ SHAPES: dict[str, Callable[[], tuple[Surface, ...]]] = {
     "cone": _cone,
     "sphere": lambda: (Ring("ball", _HERE, 0, 0.5),),
     "torus": lambda: (Ring("torus", _HERE, 0.35, 0.15, (-np.pi, np.pi)),),
+    "pebble": lambda: _bumpy(0.45, 0.04, 3),
+    "coral": lambda: _bumpy(0.4, 0.05, 7),
 }
 """The shapes :func:`make_shape` knows, each with what builds it."""
