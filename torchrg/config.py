@@ -68,6 +68,15 @@ class GrowingConfig:
     coplanarity_floor: float = 0.005
     """Least value of that Qn, as a fraction of the distance to the farthest neighbour: exact and
     quantised surfaces, where most residuals are equal, have Qn = 0."""
+    signed_normals: bool = False
+    """Whether opposite normals differ by 180 degrees instead of 0, so that the two faces of a thin
+    wall never join. For normals that are oriented."""
+    max_distance: float | None = None
+    """A neighbour farther than this does not join, in the unit of the cloud: the k nearest
+    neighbours reach across gaps where points are few. None: not tested."""
+    max_color_distance: float | None = None
+    """A neighbour whose colour differs by more than this (Euclidean, in the unit of the colours)
+    does not join. None: not tested."""
     min_size: int = 50
     """Smaller regions are not labelled."""
 
@@ -77,6 +86,9 @@ class GrowingConfig:
         within = self.connectivity is None or 0 <= self.connectivity <= 1
         _require(self, "connectivity", "in [0, 1] or none", within)
         _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
+        for name in ("max_distance", "max_color_distance"):
+            value = getattr(self, name)
+            _require(self, name, ">= 0 or none", value is None or value >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
 
     @property

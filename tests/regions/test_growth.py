@@ -101,7 +101,7 @@ def test_points_without_finite_normal_or_curvature_do_not_join():
 @pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
 @pytest.mark.parametrize("num_points", [0, 1, 2, 3])
 def test_tiny_clouds_work(config, num_points):
-    points = torch.rand(num_points, 3)
+    points = torch.eye(3)[:num_points] * torch.tensor([1.0, 1, 0])
     k = min(num_points, 3)
     neighbors = Neighbors(torch.zeros(0, 0, dtype=torch.int32))
     if num_points:
@@ -147,6 +147,38 @@ def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
     )
     seeds = np.arange(num_points, dtype=np.int32)
     assert not first_to_reach(edges, seeds, num_points).any()
+
+
+def test_neighbours_across_a_gap_join_only_within_the_distance():
+    points, normals, curvature, _ = strip(10, 0.0)
+    points[5:, 0] += 3
+    neighbors = search_knn(points, 4)
+    assert grow_regions(points, normals, curvature, neighbors, CLASSIC).max() == 0
+    config = GrowingConfig(**{**vars(CLASSIC), "max_distance": 3.5})
+    labels = grow_regions(points, normals, curvature, neighbors, config)
+    assert labels.tolist() == [0] * 5 + [1] * 5
+
+
+def test_points_of_another_color_join_only_within_the_distance():
+    cloud = strip(10, 0.0)
+    colors = torch.zeros(10, 3, dtype=torch.uint8)
+    colors[5:] = 20
+    for limit, expected in ((34.0, [0] * 5 + [1] * 5), (35.0, [0] * 10)):
+        config = GrowingConfig(**{**vars(CLASSIC), "max_color_distance": limit})
+        assert grow_regions(*cloud, config, colors=colors).tolist() == expected
+    with pytest.raises(ConfigError, match="grow_regions: expected colors"):
+        grow_regions(*cloud, config)
+
+
+def test_two_faces_of_a_thin_wall_join_only_if_normals_have_no_sign():
+    points, normals, curvature, _ = strip(20, 0.0)
+    points[1::2] += torch.tensor([-1.0, 0.0, 0.1], dtype=torch.float64)
+    normals[1::2] *= -1
+    neighbors = search_knn(points, 6)
+    assert grow_regions(points, normals, curvature, neighbors, CLASSIC).max() == 0
+    config = GrowingConfig(**{**vars(CLASSIC), "signed_normals": True})
+    labels = grow_regions(points, normals, curvature, neighbors, config)
+    assert labels.tolist() == [0, 1] * 10
 
 
 def test_numpy_arrays_are_accepted():

@@ -33,6 +33,7 @@ class GrowingCloud(NamedTuple):
         curvature: Shape ``(N,)``.
         neighbors: Neighbours of each point.
         valid: Points that may belong to a region, shape ``(N,)``, bool.
+        colors: Shape ``(N, C)``, floating point, or None.
     """
 
     points: Tensor
@@ -40,6 +41,7 @@ class GrowingCloud(NamedTuple):
     curvature: Tensor
     neighbors: Neighbors
     valid: Tensor
+    colors: Tensor | None = None
 
 
 class AcceptedEdges(NamedTuple):
@@ -76,6 +78,12 @@ def accept_edges(
     if counted is not None:
         joins &= counted
     joins &= _within_angle(cloud.normals, rows, indices, config)
+    if config.max_distance is not None:
+        sq_distances = _sq_differences(cloud.points, rows, indices)
+        joins &= sq_distances <= config.max_distance**2
+    if config.max_color_distance is not None and cloud.colors is not None:
+        sq_distances = _sq_differences(cloud.colors, rows, indices)
+        joins &= sq_distances <= config.max_color_distance**2
     connected: Tensor | None = None
     min_shared = min_shared_neighbors(config.connectivity, indices.shape[1])
     if config.coplanarity and config.coplanarity_scope == "connected":
@@ -176,13 +184,24 @@ def _is_candidate(cloud: GrowingCloud, rows: slice, indices: Tensor) -> Tensor:
 
 def _within_angle(normals: Tensor, rows: slice, indices: Tensor, config: GrowingConfig) -> Tensor:
     """Return which neighbours' normals are within the angle limit, shape ``(n, K)``."""
-    if config.max_angle_deg >= 90:
+    if config.max_angle_deg >= 90 and not config.signed_normals:
         return torch.ones_like(indices, dtype=torch.bool)
     flat = indices.reshape(-1)
     columns = normals.unbind(dim=1)
     own = [column[rows, None] for column in columns]
     theirs = [column.index_select(0, flat).view(indices.shape) for column in columns]
-    return sq_chords(own, theirs) <= sq_chord_limit(config.max_angle_deg)
+    chords = sq_chords(own, theirs, signed=config.signed_normals)
+    return chords <= sq_chord_limit(config.max_angle_deg)
+
+
+def _sq_differences(values: Tensor, rows: slice, indices: Tensor) -> Tensor:
+    """Return squared distances between the values of points and of neighbours, ``(n, K)``."""
+    flat = indices.reshape(-1)
+    total = torch.zeros(indices.shape, dtype=values.dtype, device=values.device)
+    for column in values.unbind(dim=1):
+        difference = column.index_select(0, flat).view(indices.shape) - column[rows, None]
+        total += difference.mul_(difference)
+    return total
 
 
 def _coplanar(

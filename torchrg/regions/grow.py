@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.config import GrowingConfig
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
 from torchrg.regions.components import claim_leftovers, first_to_reach
 from torchrg.regions.edges import EdgeFinder, GrowingCloud
@@ -24,6 +24,7 @@ def grow_regions(
     config: GrowingConfig | None = None,
     *,
     valid: Tensor | None = None,
+    colors: Tensor | NDArray[np.generic] | None = None,
     canonical: bool = False,
     chunk_size: int = 16384,
 ) -> Tensor:
@@ -42,13 +43,14 @@ def grow_regions(
 
     Args:
         points: Finite points, shape ``(N, 3)``.
-        normals: Unit normals, shape ``(N, 3)``; their sign does not matter.
+        normals: Unit normals, shape ``(N, 3)``; their sign only matters for ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
         config: Settings. Default: the paper's.
         valid: Points that have a normal, shape ``(N,)``, bool; the others join no region, and no
             region passes through them. Default: all. Points whose normal or curvature is not
             finite never join.
+        colors: Colours of the points, shape ``(N, C)``, for ``max_color_distance``.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
 
@@ -58,6 +60,7 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
+        ConfigError: If the settings ask for colours, and there are none.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -70,8 +73,13 @@ def grow_regions(
         >>> grow_regions(points, normals, curvature, neighbors, GrowingConfig(min_size=9)).unique()
         tensor([0])
     """
-    cloud = _checked_cloud(points, normals, curvature, neighbors, valid)
+    cloud = _checked_cloud(points, normals, curvature, neighbors, valid, colors)
     config = GrowingConfig() if config is None else config
+    if config.max_color_distance is not None and colors is None:
+        raise ConfigError(
+            "grow_regions: expected colors, which max_color_distance needs, got None; pass them or "
+            "set max_color_distance to None."
+        )
     device = cloud.points.device
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=device)
@@ -134,6 +142,7 @@ def _checked_cloud(
     curvature: Tensor | NDArray[np.floating],
     neighbors: Neighbors,
     valid: Tensor | None,
+    colors: Tensor | NDArray[np.generic] | None,
 ) -> GrowingCloud:
     """Check what the user passed, and settle which points are valid."""
     caller = "grow_regions"
@@ -141,6 +150,7 @@ def _checked_cloud(
     normals = as_tensor(caller, "normals", normals).detach()
     curvature = as_tensor(caller, "curvature", curvature).detach()
     valid = None if valid is None else as_tensor(caller, "valid", valid)
+    colors = None if colors is None else as_tensor(caller, "colors", colors)
     check_shapes(
         caller,
         points=(points, "N 3"),
@@ -149,6 +159,7 @@ def _checked_cloud(
         neighbors=(neighbors.indices, "N K"),
         neighbors_valid=(neighbors.valid, "N K"),
         valid=(valid, "N"),
+        colors=(colors, "N C"),
     )
     check_floating(caller, points=points, normals=normals, curvature=curvature)
     if valid is not None and valid.dtype != torch.bool:
@@ -160,7 +171,10 @@ def _checked_cloud(
         )
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
-    return GrowingCloud(_by_column(points), _by_column(normals), curvature, neighbors, valid)
+    colors = None if colors is None else _by_column(colors.to(points.dtype))
+    return GrowingCloud(
+        _by_column(points), _by_column(normals), curvature, neighbors, valid, colors
+    )
 
 
 def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
@@ -176,11 +190,12 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
         cloud.curvature[order],
         Neighbors(indices, None if mask is None else mask[order]),
         cloud.valid[order],
+        None if cloud.colors is None else _by_column(cloud.colors[order]),
     )
 
 
 def _by_column(vectors: Tensor) -> Tensor:
-    """Return vectors ``(N, 3)`` laid out column by column."""
+    """Return vectors ``(N, C)`` laid out column by column."""
     return vectors.T.contiguous().T
 
 
