@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.scenes.frames import Array, Frame, cos_sin, cross, unit
-from torchrg.scenes.sampling import random_stream
 from torchrg.scenes.scene import SceneModel
+from torchrg.scenes.streams import random_stream
 
 _CAMERA_STREAM = 300
 _GOLDEN_ANGLE = (3 - np.sqrt(5)) * np.pi

@@ -10,8 +10,8 @@ from torchrg.errors import ConfigError
 from torchrg.scenes.cameras import Camera, cameras_around
 from torchrg.scenes.frames import Array
 from torchrg.scenes.rays import cast_rays
-from torchrg.scenes.sampling import random_stream
 from torchrg.scenes.scene import SceneModel
+from torchrg.scenes.streams import random_stream
 from torchrg.structures import UNLABELED
 
 Sensor = Literal["exact", "kinect"]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Triple = tuple[float, float, float]
 
 _QUARTER_TURN = np.pi / 2

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -12,13 +11,12 @@ from torchrg.scenes import objects
 from torchrg.scenes.frames import Array, Frame, dot
 from torchrg.scenes.layout import Place, RoomLayout, floor_places, wall_places
 from torchrg.scenes.objects import between
-from torchrg.scenes.scene import Part, plane_table
+from torchrg.scenes.scene import Part
 from torchrg.scenes.shells import Hole, recess, room_walls, shell
+from torchrg.scenes.spacing import shares_plane
 
 T = TypeVar("T")
 _TRIES = 1000
-_PARALLEL = 1 - 0.02**2 / 2  # cosine of about one degree
-_CLEARANCES = (1.0, 0.6, 0.4, 0.2)  # around a scanner, as much as there is, metres
 _DOORWAY_AISLE = 1.6  # from the middle of a doorway to what is on walls, metres
 _DOORWAY_SPACE = 1.9  # from there to what stands on the floor, for an open door
 
@@ -47,32 +45,6 @@ def furnish(
         ConfigError: If the room is too small for its furniture.
     """
     return _Furnisher(layout, room, rng, doorways, with_floor=with_floor).furnish()
-
-
-def free_places(
-    layout: RoomLayout, room: Frame, parts: Sequence[Part], rng: np.random.Generator
-) -> Array:
-    """Return places for a scanner, spread along a room, shape ``(num_viewpoints, 3)``.
-
-    Raises:
-        ConfigError: If there is no free space.
-    """
-    solids = [solid for part in parts for solid in part.solids]
-    length, width, _ = layout.size
-    found: list[Array] = []
-    for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
-        for _ in range(_TRIES // 20 if len(found) == number else 0):
-            x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
-            place = room.moved(x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)).origin
-            near = place + clearance * (2 * rng.random((64, 3)) - 1)
-            if not any(solid.contains(near).any() for solid in solids):
-                found.append(place)
-                break
-    if len(found) < layout.num_viewpoints:
-        raise ConfigError(
-            "build_room: expected free space for a scanner in the room, got none; enlarge it."
-        )
-    return np.stack(found)
 
 
 class _Furnisher:
@@ -210,29 +182,6 @@ class _Furnisher:
         )
         if with_box:
             self._place(lambda: objects.draw_small_box(self.rng, _table_top(desk)))
-
-
-def shares_plane(part: Part, others: Sequence[Part], min_gap: float) -> bool:
-    """Return whether a face of a part is closer than ``min_gap`` to the plane of a parallel one.
-
-    Args:
-        part: The new object.
-        others: The objects that are there.
-        min_gap: In metres; zero allows everything.
-
-    Returns:
-        Whether there is such a face.
-    """
-    mine = [surface for surface in part.surfaces if surface.plane is not None]
-    theirs = [surface for other in others for surface in other.surfaces if surface.plane]
-    if not mine or not theirs:
-        return False
-    middles = np.stack([surface.bounds.mean(axis=0) for surface in mine])
-    normals, _ = plane_table(mine)
-    planes, offsets = plane_table(theirs)
-    parallel = np.abs(dot(normals[:, None], planes[None])) > _PARALLEL
-    near = np.abs(dot(middles[:, None], planes[None]) - offsets) < min_gap
-    return bool((parallel & near).any())
 
 
 def _table_top(desk: Part) -> Frame:

@@ -9,10 +9,11 @@ from torchrg.errors import ConfigError
 from torchrg.scenes.cameras import cameras_around
 from torchrg.scenes.depth import DepthFrame, Sensor, render_depth
 from torchrg.scenes.frames import Array
+from torchrg.scenes.labeling import label_points
 from torchrg.scenes.layout import RoomLayout
 from torchrg.scenes.rooms import build_room
-from torchrg.scenes.sampling import label_points, random_stream
 from torchrg.scenes.scene import Scene, SceneModel
+from torchrg.scenes.streams import random_stream
 
 KINECT_LAYOUT = RoomLayout(
     size=(5.4, 4.4, 2.6),

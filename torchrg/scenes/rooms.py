@@ -3,10 +3,12 @@
 import numpy as np
 
 from torchrg.scenes.frames import Frame
-from torchrg.scenes.furnishing import free_places, furnish
+from torchrg.scenes.furnishing import furnish
 from torchrg.scenes.layout import RoomLayout
-from torchrg.scenes.sampling import Density, NoiseDirection, Order, random_stream, sample_scene
+from torchrg.scenes.sampling import Density, NoiseDirection, Order, sample_scene
 from torchrg.scenes.scene import Scene, SceneModel
+from torchrg.scenes.spacing import free_places
+from torchrg.scenes.streams import random_stream
 
 _ROOM_STREAM = 100
 

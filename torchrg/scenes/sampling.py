@@ -3,20 +3,19 @@
 from typing import Literal, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from torchrg.errors import ConfigError
-from torchrg.scenes.frames import Array, dot
+from torchrg.scenes.frames import Array, Floats, dot
+from torchrg.scenes.labeling import label_points
 from torchrg.scenes.scans import scan_places
 from torchrg.scenes.scene import Scene, SceneModel
+from torchrg.scenes.streams import random_stream
 from torchrg.structures import UNLABELED
 
 NoiseDirection = Literal["normal", "isotropic", "ray"]
 Density = Literal["uniform", "falloff", "scan"]
 Order = Literal["random", "face", "scan"]
-
-Floats = NDArray[np.float32]
 
 _NEAR = 1.0  # density stops growing nearer to the scanner than this, metres
 
@@ -104,48 +103,6 @@ def sample_scene(
     return label_points(model, points, labels, normals, paint if colors else None)
 
 
-def random_stream(seed: int, number: int) -> np.random.Generator:
-    """Return one of several independent random generators that belong to a seed."""
-    if seed < 0:
-        raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
-    return np.random.Generator(np.random.PCG64([seed, number]))
-
-
-def label_points(
-    model: SceneModel,
-    points: Floats,
-    labels: NDArray[np.int64],
-    normals: Floats,
-    paint: np.random.Generator | None,
-) -> Scene:
-    """Return points of known faces as a cloud with the tables of its scene.
-
-    Args:
-        model: The scene.
-        points: Shape ``(N, 3)``, float32.
-        labels: Faces, or ``UNLABELED``, shape ``(N,)``.
-        normals: Shape ``(N, 3)``, float32.
-        paint: Generator of the colours; None for none.
-
-    Returns:
-        The cloud and its truth.
-    """
-    colors = None if paint is None else torch.from_numpy(_colors(model, labels, paint))
-    face_normals, face_offsets = model.planes
-    return Scene(
-        points=torch.from_numpy(points),
-        labels=torch.from_numpy(labels),
-        normals=torch.from_numpy(normals),
-        planar=torch.tensor([surface.plane is not None for surface in model.surfaces]),
-        face_normals=torch.from_numpy(face_normals),
-        face_offsets=torch.from_numpy(face_offsets),
-        face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),
-        kinds=tuple(surface.kind for surface in model.surfaces),
-        objects=torch.from_numpy(model.objects),
-        colors=colors,
-    )
-
-
 def _draw_places(
     model: SceneModel, num_points: int, density: Density, rng: np.random.Generator
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
@@ -207,18 +164,6 @@ def _to_viewpoint(model: SceneModel, points: Floats | Array) -> tuple[Array, Arr
         nearer = lengths < distances
         lines[nearer], distances[nearer] = others[nearer], lengths[nearer]
     return lines / distances[:, None], distances
-
-
-def _colors(
-    model: SceneModel, labels: NDArray[np.int64], rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Return a colour for each point: that of its object, grey for outliers, a little uneven."""
-    palette = rng.integers(60, 230, size=(len(model.parts) + 1, 3))
-    object_of = np.append(model.objects, len(model.parts))
-    shades: NDArray[np.int64] = palette[object_of[labels]] + rng.integers(
-        -12, 13, size=(len(labels), 1)
-    )
-    return shades.astype(np.uint8)
 
 
 def _float32(values: Array) -> Floats:

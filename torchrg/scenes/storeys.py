@@ -6,14 +6,16 @@ import numpy as np
 
 from torchrg.errors import ConfigError
 from torchrg.scenes.frames import Frame, Triple
-from torchrg.scenes.furnishing import free_places, furnish
+from torchrg.scenes.furnishing import furnish
 from torchrg.scenes.furniture import SIDES, block
 from torchrg.scenes.halls import HALL_LAYOUT
 from torchrg.scenes.layout import RoomLayout
 from torchrg.scenes.objects import between
-from torchrg.scenes.sampling import Density, NoiseDirection, Order, random_stream, sample_scene
+from torchrg.scenes.sampling import Density, NoiseDirection, Order, sample_scene
 from torchrg.scenes.scene import Part, Scene, SceneModel
 from torchrg.scenes.shells import Hole, passage, room_walls
+from torchrg.scenes.spacing import free_places
+from torchrg.scenes.streams import random_stream
 from torchrg.scenes.surfaces import Flat
 
 _STOREY_STREAM = 500
