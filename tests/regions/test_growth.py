@@ -151,10 +151,10 @@ def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
 
 def test_neighbours_across_a_gap_join_only_within_the_distance():
     points, normals, curvature, _ = strip(10, 0.0)
-    points[5:, 0] += 3
+    points[5:, 0] += 1
     neighbors = search_knn(points, 4)
     assert grow_regions(points, normals, curvature, neighbors, CLASSIC).max() == 0
-    config = GrowingConfig(**{**vars(CLASSIC), "max_distance": 3.5})
+    config = GrowingConfig(**{**vars(CLASSIC), "max_distance": 1.5})
     labels = grow_regions(points, normals, curvature, neighbors, config)
     assert labels.tolist() == [0] * 5 + [1] * 5
 
