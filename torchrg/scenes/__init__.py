@@ -9,7 +9,8 @@ from torchrg.scenes.rooms import build_room, make_room
 from torchrg.scenes.sampling import sample_scene
 from torchrg.scenes.scene import Scene, SceneModel
 from torchrg.scenes.shapes import SHAPES, make_shape
-from torchrg.scenes.storeys import StoreyLayout, build_storey, make_storey
+from torchrg.scenes.storey_layout import StoreyLayout
+from torchrg.scenes.storeys import build_storey, make_storey
 
 __all__ = [
     "BENT_LAYOUT",

@@ -1,67 +1,24 @@
 """Storeys: a hallway and furnished rooms along it, joined by open doors."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from torchrg.errors import ConfigError
-from torchrg.scenes.frames import Frame, Triple
+from torchrg.scenes.frames import Frame
 from torchrg.scenes.furnishing import furnish
 from torchrg.scenes.furniture import SIDES, block
-from torchrg.scenes.halls import HALL_LAYOUT
-from torchrg.scenes.layout import RoomLayout
 from torchrg.scenes.objects import between
 from torchrg.scenes.sampling import Density, NoiseDirection, Order, sample_scene
 from torchrg.scenes.scene import Part, Scene, SceneModel
-from torchrg.scenes.shells import Hole, passage, room_walls
+from torchrg.scenes.shells import passage, room_walls
 from torchrg.scenes.spacing import free_places
+from torchrg.scenes.storey_layout import HALL_WALLS, StoreyLayout, StoreyRoom, draw_rooms
 from torchrg.scenes.streams import random_stream
 from torchrg.scenes.surfaces import Flat
 
 _STOREY_STREAM = 500
 _DOOR_LEAF = 0.04  # thickness, metres
-_DOOR_HEIGHT = (1.98, 2.15)
-_HALL_WALLS = (0, 2)  # the long walls of the hallway
 _FIRST_WALL = 0  # of a room: the one along the hallway
-_HALL = replace(HALL_LAYOUT, size=(24.0, 2.4, 2.5), num_doors=2, num_cabinets=1, num_panels=2)
-_ROOM = RoomLayout(
-    num_doors=0,
-    num_windows=1,
-    num_cabinets=1,
-    num_shelves=1,
-    num_tables=2,
-    num_boxes=0,
-    num_small_boxes=1,
-    num_pillars=0,
-)
-
-
-@dataclass(frozen=True)
-class StoreyLayout:
-    """Rooms on both sides of a hallway, with open doors; lengths in metres."""
-
-    rooms_per_side: int = 4
-    room_width: tuple[float, float] = (4.6, 6.2)
-    """Least and greatest width, along the hallway."""
-    room_depth: tuple[float, float] = (4.3, 5.1)
-    room_height: tuple[float, float] = (2.6, 2.9)
-    wall_thickness: tuple[float, float] = (0.33, 0.42)
-    hall: RoomLayout = _HALL
-    """The hallway; its length is that of the rooms. A short one has place for less."""
-    room: RoomLayout = _ROOM
-    """What is in each room; its size is drawn."""
-
-    def __post_init__(self) -> None:
-        if self.rooms_per_side < 1:
-            raise ConfigError(
-                f"StoreyLayout: expected rooms_per_side >= 1, got {self.rooms_per_side}."
-            )
-        for name in ("room_width", "room_depth", "room_height", "wall_thickness"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise ConfigError(
-                    f"StoreyLayout: expected {name} as (least, greatest), got {(low, high)}."
-                )
 
 
 def make_storey(
@@ -128,7 +85,7 @@ def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneM
     """
     layout, rng = layout or StoreyLayout(), random_stream(seed, _STOREY_STREAM)
     width = layout.hall.size[1]
-    rooms = _draw_rooms(layout, width, rng)
+    rooms = draw_rooms(layout, width, rng)
     length = max(room.left + room.size[0] for room in rooms) + between(rng, 0.2, 0.5)
     hall_layout = replace(layout.hall, size=(length, width, layout.hall.size[2]))
     hall = Frame.upright(np.zeros(3))
@@ -148,81 +105,7 @@ def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneM
     return SceneModel(tuple(parts), np.concatenate(viewpoints))
 
 
-@dataclass(frozen=True)
-class _Room:
-    """A room along the hallway; lengths along it are those of the world's first axis."""
-
-    size: Triple
-    left: float
-    hall_wall: int
-    hall_width: float
-    thickness: float
-    door: tuple[float, float, float]  # left, right and upper end in the room's own axes
-
-    @property
-    def frame(self) -> Frame:
-        """The room's own axes: the second leads away from the hallway."""
-        if self.hall_wall == _HALL_WALLS[0]:
-            corner = (self.left + self.size[0], -self.thickness, 0)
-            return Frame.upright(np.array(corner), heading_deg=180)
-        return Frame.upright(np.array([self.left, self.hall_width + self.thickness, 0]))
-
-    @property
-    def doorway(self) -> Hole:
-        """Hole in the room's first wall, which starts at its right end."""
-        left, right, top = self.door
-        return self.size[0] - right, self.size[0] - left, 0.0, top
-
-    def span(self) -> tuple[float, float]:
-        """Return left and right end of the doorway in the world."""
-        ends = self.frame.to_world(np.array([(x, 0, 0) for x in self.door[:2]]))[:, 0]
-        return float(ends.min()), float(ends.max())
-
-    def hall_doorway(self, length: float) -> Hole:
-        """Return the hole in the hallway's wall; its first wall starts at the far end."""
-        left, right = self.span()
-        if self.hall_wall == _HALL_WALLS[0]:
-            left, right = length - right, length - left
-        return left, right, 0.0, self.door[2]
-
-
-def _draw_rooms(layout: StoreyLayout, hall_width: float, rng: np.random.Generator) -> list[_Room]:
-    """Return the rooms on both sides, with walls, ceilings and doors in planes of their own."""
-    count = 2 * layout.rooms_per_side
-    depths = _spread(rng, count, layout.room_depth)
-    heights = _spread(rng, count, layout.room_height)
-    thicknesses = _spread(rng, count, layout.wall_thickness)
-    tops = _spread(rng, count, _DOOR_HEIGHT)
-    rooms: list[_Room] = []
-    for number in range(count):
-        side, first = _HALL_WALLS[number % 2], number < 2
-        left = between(rng, 0.1, 0.4) if first else rooms[-2].left + rooms[-2].size[0]
-        left += 0 if first else between(rng, *layout.wall_thickness)
-        width, door_width = between(rng, *layout.room_width), between(rng, 0.85, 1.0)
-        door_left = between(rng, 0.35, 0.5)
-        if rng.random() < 0.5:
-            door_left = width - door_left - door_width
-        rooms.append(
-            _Room(
-                size=(width, depths[number], heights[number]),
-                left=left,
-                hall_wall=side,
-                hall_width=hall_width,
-                thickness=thicknesses[number],
-                door=(door_left, door_left + door_width, tops[number]),
-            )
-        )
-    return rooms
-
-
-def _spread(rng: np.random.Generator, count: int, ends: tuple[float, float]) -> list[float]:
-    """Return random numbers in random order, one in the middle half of each of equal steps."""
-    steps = rng.permutation(count) + 0.25 + rng.random(count) / 2
-    low, high = ends
-    return [float(value) for value in low + (high - low) * steps / count]
-
-
-def _floor(rooms: list[_Room], length: float, width: float) -> Flat:
+def _floor(rooms: list[StoreyRoom], length: float, width: float) -> Flat:
     """Return the floor of the hallway, the rooms and the doorways between them."""
     pieces = [[(0.0, 0.0), (length, 0.0), (0.0, width)]]
     for room in rooms:
@@ -230,12 +113,12 @@ def _floor(rooms: list[_Room], length: float, width: float) -> Flat:
         (left, low), (right, high) = np.sort(room.frame.to_world(corners)[:, :2], axis=0)
         pieces.append([(left, low), (right - left, 0), (0, high - low)])
         start, end = room.span()
-        below = -room.thickness if room.hall_wall == _HALL_WALLS[0] else width
+        below = -room.thickness if room.hall_wall == HALL_WALLS[0] else width
         pieces.append([(start, below), (end - start, 0), (0, room.thickness)])
     return Flat("floor", Frame.upright(np.zeros(3)), np.array(pieces))
 
 
-def _open_door(room: _Room, rng: np.random.Generator) -> Part:
+def _open_door(room: StoreyRoom, rng: np.random.Generator) -> Part:
     """Return the leaf of an open door, inside the room beside the doorway."""
     left, right, top = room.door
     hinge = left - 0.1 if left < room.size[0] / 2 else right + 0.1
