@@ -94,8 +94,8 @@ def _facts(scan: Scan, block: Block) -> dict[str, Any]:
         "guid": f"{{{uuid.uuid4()}}}",
         "name": scan.name,
         "pose": {
-            "rotation": dict(zip("wxyz", scan.rotation, strict=True)),
-            "translation": dict(zip("xyz", scan.translation, strict=True)),
+            "rotation": dict(zip("wxyz", map(float, scan.rotation), strict=True)),
+            "translation": dict(zip("xyz", map(float, scan.translation), strict=True)),
         },
         "cartesianBounds": {
             f"{axis[-1].lower()}{end}": float(limit(block[axis][there])) if there.any() else 0.0

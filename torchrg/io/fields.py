@@ -123,7 +123,9 @@ def checked_coordinates(path: Path, coordinates: NDArray[Any]) -> NDArray[np.flo
             f"{path}: expected real numbers as coordinates, got {dtype}; convert them to float64."
         )
     if len(coordinates) == 0:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+        raise FormatError(
+            f"{path}: expected at least one point, got none; check where it comes from."
+        )
     single = dtype.itemsize <= (4 if dtype.kind == "f" else 2)
     return np.ascontiguousarray(coordinates, dtype=np.float32 if single else np.float64)
 

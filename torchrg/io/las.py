@@ -120,9 +120,9 @@ def write_las(path: Path, cloud: Cloud) -> None:
 
     Args:
         path: The file.
-        cloud: The cloud, all of it finite. If it came from a LAS file, scale, offset, reference system and point
-            format are kept; otherwise the scale is the smallest power of ten that the grid of 32
-            bits allows.
+        cloud: The cloud, all of it finite. If it came from a LAS file, scale, offset, reference
+            system and point format are kept; otherwise the scale is the smallest power of ten that
+            the grid of 32 bits allows.
 
     Raises:
         FormatError: If a point is off the grid, a field has no place in a LAS file, or the file

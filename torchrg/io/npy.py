@@ -1,11 +1,13 @@
 """NumPy's own files: ``.npy``, one array, and ``.npz``, several by name. No pickle is ever loaded.
 
 ``.npz``: ``points`` (or ``coord``), shape (N, 3), and any arrays of N rows, which become fields.
-Arrays of another length are left out, and so is what a result file says about planes.
+Arrays of another length are left out, and so is what a result file says about its planes, under
+names that begin with ``plane_``.
 ``.npy``: an array (N, 3) or wider, see :func:`torchrg.io.fields.name_columns` for its columns, or
 a structured array with named fields ``x``, ``y``, ``z``.
 """
 
+import math
 import struct
 import tokenize
 import zipfile
@@ -171,7 +173,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         for name, values in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy", EARLIEST_ZIP_TIME)
             with archive.open(member, "w", force_zip64=True) as stream:
-                npy_format.write_array(stream, np.ascontiguousarray(values), allow_pickle=False)
+                npy_format.write_array(stream, np.asarray(values, order="C"), allow_pickle=False)
 
 
 def _read_member(
@@ -219,19 +221,18 @@ def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> ND
             f"{path}: expected numbers or text in {content}, got pickled Python objects, which are "
             "never loaded; convert them with numpy.asarray(..., dtype=float) and save again."
         )
-    count = 1
-    for length in shape:
-        count *= length
+    if min(shape, default=0) < 0:
+        raise FormatError(
+            f"{path}: byte 0: expected a shape in {content}, got {shape}; write it again."
+        )
     start = stream.tell()
     check_promise(
         path,
         byte=start,
-        promised=count * dtype.itemsize,
+        promised=math.prod(shape) * dtype.itemsize,
         available=size - start,
         content=f"{content} of shape {shape}",
     )
-    if min(shape, default=0) < 0:
-        raise FormatError(f"{path}: byte 0: expected a shape in {content}, got {shape}.")
     stream.seek(0)
     values: NDArray[Any] = npy_format.read_array(stream, allow_pickle=False)
     return values

@@ -1,0 +1,74 @@
+"""Clouds and segmentations to write, the same for all formats."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.structures import Cloud, Planes, Segmentation
+
+
+@pytest.fixture
+def make_cloud():
+    """A cloud with a field of every kind that all formats hold."""
+
+    def make(num_points=60, dtype=np.float32, origin=(0.0, 0.0, 0.0), **options):
+        rng = np.random.default_rng(0)
+        normals = rng.normal(size=(num_points, 3)).astype(np.float32)
+        fields = {
+            "color": rng.integers(0, 256, (num_points, 3)).astype(np.uint8),
+            "intensity": rng.random(num_points).astype(np.float32),
+            "labels": rng.integers(-1, 5, num_points),
+            "normals": normals / np.linalg.norm(normals, axis=1, keepdims=True),
+            "curvature": (rng.random(num_points) / 3).astype(np.float32),
+            "histogram": rng.random((num_points, 4)).astype(np.float32),
+            "ring": rng.integers(0, 200, num_points).astype(np.uint8),
+        }
+        coordinates = (rng.normal(size=(num_points, 3)) + np.array(origin)).astype(dtype)
+        return Cloud(coordinates, fields, **options)
+
+    return make
+
+
+@pytest.fixture
+def make_segmentation():
+    """A segmentation of so many points with three planes, about an origin of its own."""
+
+    def make(num_points):
+        rng = torch.Generator().manual_seed(0)
+        normal = torch.nn.functional.normalize(torch.randn(3, 3, generator=rng), dim=1)
+        centroid = torch.randn(3, 3, generator=rng)
+        columns = {
+            "normal": normal,
+            "offset": (normal * centroid).sum(dim=1),
+            "centroid": centroid,
+            "area": torch.rand(3, generator=rng),
+            "count": torch.tensor([30, 20, 10]),
+            "rms": torch.rand(3, generator=rng),
+            "extent": torch.rand(3, 2, generator=rng),
+            "axes": torch.randn(3, 2, 3, generator=rng),
+            "center": torch.randn(3, 3, generator=rng),
+            "curved": torch.zeros(3, dtype=torch.bool),
+        }
+        return Segmentation(
+            labels=torch.randint(-1, 3, (num_points,), generator=rng),
+            normals=torch.randn(num_points, 3, generator=rng),
+            curvature=torch.rand(num_points, generator=rng) / 3,
+            sharp=torch.rand(num_points, generator=rng) > 0.5,
+            valid=torch.rand(num_points, generator=rng) > 0.1,
+            planes=Planes(**columns),
+        )
+
+    return make
+
+
+def assert_same(found, expected):
+    """Check that two clouds hold the same points and fields, to the last bit."""
+    np.testing.assert_array_equal(found.coordinates, expected.coordinates)
+    assert found.fields.keys() == expected.fields.keys()
+    for name, values in expected.fields.items():
+        np.testing.assert_array_equal(found.fields[name], values, err_msg=name)
+
+
+@pytest.fixture(name="assert_same")
+def assert_same_fixture():
+    return assert_same

@@ -1,0 +1,79 @@
+"""Files appear whole or not at all."""
+
+import os
+import stat
+
+import numpy as np
+import pytest
+
+from torchrg.errors import FormatError
+from torchrg.io import FORMATS, read_cloud, write_cloud
+from torchrg.io.atomic import atomic_path
+from torchrg.structures import Cloud
+
+
+def test_interrupted_writing_leaves_the_older_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def write_half():
+        with atomic_path(path) as beside:
+            beside.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_file_is_moved_into_place_at_the_end(tmp_path):
+    path = tmp_path / "a.txt"
+    with atomic_path(path) as beside:
+        beside.write_text("new")
+        assert beside.parent == tmp_path
+        assert beside.suffix == ".txt"
+        assert not path.exists()
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_failing_disk_is_a_line_that_names_the_file(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(FormatError, match=r"a\.npz: cannot be written: No space left on device\."):
+        write_cloud(tmp_path / "a.npz", Cloud(np.zeros((2, 3))))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
+def test_new_files_have_the_usual_permissions(tmp_path):
+    write_cloud(tmp_path / "a.ply", Cloud(np.zeros((2, 3))))
+    (tmp_path / "b").touch()
+    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("a.ply", "b")}
+    assert len(modes) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights there")
+def test_links_are_followed(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link.ply").symlink_to(tmp_path / "real" / "a.ply")
+    write_cloud(tmp_path / "link.ply", Cloud(np.zeros((2, 3))))
+    assert (tmp_path / "link.ply").is_symlink()
+    assert len(read_cloud(tmp_path / "real" / "a.ply")) == 2
+
+
+def test_every_format_writes_through_it(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    optional = {".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}
+    for suffix in FORMATS:
+        if suffix in optional:
+            pytest.importorskip(optional[suffix])
+        with pytest.raises(FormatError, match=r"a\.\w+: cannot be written: Input/output error\."):
+            write_cloud(tmp_path / f"a{suffix}", Cloud(np.ones((2, 3))))
+        assert list(tmp_path.iterdir()) == []

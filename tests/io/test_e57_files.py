@@ -1,0 +1,164 @@
+"""E57: scans with poses, extensions, invalid points."""
+
+import numpy as np
+import pytest
+
+from torchrg.errors import FormatError
+from torchrg.io import read_cloud, write_cloud
+from torchrg.io.e57_pose import Scan, to_cartesian
+from torchrg.io.fields import FileCloud
+
+pye57 = pytest.importorskip("pye57")
+
+QUARTER = np.array([0.5**0.5, 0.0, 0.0, 0.5**0.5])
+
+
+@pytest.fixture
+def scans(tmp_path):
+    """A file that pye57 itself wrote: two scans with poses, the first with colour."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(2, 20, 3)).astype(np.float32).astype(np.float64)
+    path = tmp_path / "scans.e57"
+    with pye57.E57(str(path), "w") as file:
+        for number in range(2):
+            columns = dict(
+                zip(["cartesianX", "cartesianY", "cartesianZ"], points[number].T, strict=True)
+            )
+            columns["intensity"] = np.linspace(0, 1, 20, dtype=np.float32)
+            if number == 0:
+                columns |= dict.fromkeys(["colorRed", "colorGreen"], np.arange(20, dtype=np.uint8))
+                columns["colorBlue"] = np.zeros(20, np.uint8)
+            file.write_scan_raw(
+                columns,
+                name=f"scan {number}",
+                rotation=QUARTER,
+                translation=np.array([500_000.0, 4_500_000.0, float(number)]),
+            )
+    turned = np.stack([-points[..., 1], points[..., 0], points[..., 2]], axis=-1)
+    world = turned + [500_000.0, 4_500_000.0, 0] + np.array([[[0.0]], [[1.0]]]) * [0, 0, 1]
+    return path, world.reshape(40, 3)
+
+
+def test_scans_are_moved_by_their_poses(scans):
+    path, world = scans
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.coordinates, world, rtol=0, atol=2e-9)
+    assert cloud.fields["scan"].tolist() == [0] * 20 + [1] * 20
+    assert cloud.fields["color"][:, 0].tolist() == [*range(20), *[0] * 20]
+    assert [scan.name for scan in cloud.header["scans"]] == ["scan 0", "scan 1"]
+
+
+def test_scans_are_written_with_their_poses(tmp_path, scans, make_segmentation):
+    path, world = scans
+    seg = make_segmentation(40)
+    write_cloud(tmp_path / "out.e57", read_cloud(path), seg)
+    with pye57.E57(str(tmp_path / "out.e57")) as file:
+        assert file.scan_count == 2
+        headers = [file.get_header(number) for number in range(2)]
+        np.testing.assert_allclose(headers[1].translation, [500_000.0, 4_500_000.0, 1.0])
+        np.testing.assert_allclose(headers[1].rotation, QUARTER)
+        assert "nor:normalX" in headers[0].point_fields
+        assert "torchrg:label" in headers[0].point_fields
+        raw = file.read_scan_raw(0, ignore_unsupported_fields=True)
+        scan = file.read_scan(1, intensity=True, ignore_missing_fields=True)
+    np.testing.assert_allclose(scan["cartesianX"], world[20:, 0], rtol=0, atol=2e-9)
+    assert raw["colorRed"].tolist() == list(range(20))
+    again = read_cloud(tmp_path / "out.e57")
+    np.testing.assert_allclose(again.coordinates, world, rtol=0, atol=2e-9)
+    np.testing.assert_array_equal(again.fields["labels"], seg.labels)
+    np.testing.assert_allclose(again.fields["normals"], seg.normals, atol=1e-6)
+    assert again.fields["scan"].tolist() == [0] * 20 + [1] * 20
+
+
+def test_normals_turn_with_the_points(tmp_path):
+    normals = np.array([[1.0, 0, 0], [0, 1, 0]])
+    cloud = FileCloud(
+        np.eye(3)[:2], {"normals": normals}, header={"scans": (Scan("a", tuple(QUARTER)),)}
+    )
+    write_cloud(tmp_path / "a.e57", cloud)
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        raw = file.read_scan_raw(0, ignore_unsupported_fields=True)
+    np.testing.assert_allclose(raw["cartesianX"], [0, 1], atol=1e-15)
+    np.testing.assert_allclose(
+        read_cloud(tmp_path / "a.e57").fields["normals"], normals, atol=1e-15
+    )
+
+
+def test_shuffled_scans_are_written_as_one(tmp_path, scans):
+    cloud = read_cloud(scans[0])
+    order = np.random.default_rng(0).permutation(40)
+    shuffled = FileCloud(
+        cloud.coordinates[order], {"scan": cloud.fields["scan"][order]}, header=cloud.header
+    )
+    write_cloud(tmp_path / "a.e57", shuffled)
+    again = read_cloud(tmp_path / "a.e57")
+    np.testing.assert_array_equal(again.coordinates, shuffled.coordinates)
+    np.testing.assert_array_equal(again.fields["scan"], shuffled.fields["scan"])
+    assert len(again.header["scans"]) == 1
+
+
+def test_scans_without_points_left_are_left_out(tmp_path, scans):
+    cloud = read_cloud(scans[0])
+    second = FileCloud(
+        cloud.coordinates[20:], {"scan": cloud.fields["scan"][20:]}, header=cloud.header
+    )
+    write_cloud(tmp_path / "a.e57", second)
+    again = read_cloud(tmp_path / "a.e57")
+    np.testing.assert_allclose(again.coordinates, second.coordinates, rtol=0, atol=2e-9)
+    assert [scan.name for scan in again.header["scans"]] == ["scan 1"]
+
+
+def test_points_that_are_not_finite_are_marked_as_invalid(tmp_path, make_cloud):
+    cloud = make_cloud()
+    cloud.coordinates[3] = [1.0, np.inf, np.nan]
+    write_cloud(tmp_path / "a.e57", cloud)
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        state = file.read_scan_raw(0, ignore_unsupported_fields=True)["cartesianInvalidState"]
+    assert np.flatnonzero(state).tolist() == [3]
+    found = read_cloud(tmp_path / "a.e57")
+    assert np.flatnonzero(~found.finite).tolist() == [3]
+    np.testing.assert_array_equal(found.coordinates[4:], cloud.coordinates[4:])
+
+
+def test_spherical_coordinates_are_the_standards():
+    spherical = np.array([[2.0, 0, 0], [2.0, np.pi / 2, 0], [2.0, 1.0, np.pi / 2]])
+    expected = [[2, 0, 0], [0, 2, 0], [0, 0, 2]]
+    np.testing.assert_allclose(to_cartesian(spherical), expected, atol=1e-15)
+
+
+def test_names_are_made_fit_for_xml(tmp_path, make_cloud):
+    cloud = FileCloud(np.eye(3), {"a b/c": np.arange(3.0)})
+    write_cloud(tmp_path / "a.e57", cloud)
+    assert read_cloud(tmp_path / "a.e57").fields["a_b_c"].tolist() == [0, 1, 2]
+
+
+def test_integers_beyond_the_format_are_refused(tmp_path):
+    cloud = FileCloud(np.eye(3), {"id": np.full(3, 2**63, np.uint64)})
+    with pytest.raises(FormatError, match=r"a\.e57: expected field id below 2\^63; leave it out"):
+        write_cloud(tmp_path / "a.e57", cloud)
+
+
+def test_truncated_files_are_refused_wherever_they_end(scans):
+    path, _ = scans
+    whole = path.read_bytes()
+    for end in [3, 40, 1024, len(whole) // 2, len(whole) - 1]:
+        path.write_bytes(whole[:end])
+        with pytest.raises(
+            FormatError, match=r"scans\.e57: expected an E57 file, got: .*; fetch it"
+        ):
+            read_cloud(path)
+
+
+def test_promised_points_are_compared_with_the_file(scans, monkeypatch):
+    path, _ = scans
+    monkeypatch.setattr(pye57.ScanHeader, "point_count", 10**12)
+    message = r"scans\.e57: byte 0: expected at least 250,000,000,000 bytes for 2,000,000,000,000 p"
+    with pytest.raises(FormatError, match=message):
+        read_cloud(path)
+
+
+def test_file_without_scans_is_refused(tmp_path):
+    with pye57.E57(str(tmp_path / "a.e57"), "w"):
+        pass
+    with pytest.raises(FormatError, match=r"a\.e57: expected at least one scan, got none"):
+        read_cloud(tmp_path / "a.e57")

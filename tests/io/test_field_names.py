@@ -1,0 +1,97 @@
+"""One name and one type for what formats call otherwise."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrg.errors import FormatError
+from torchrg.io.fields import assemble_cloud
+
+PATH = Path("a.any")
+
+
+def fields_of(**columns):
+    axes = {axis: np.zeros(2) for axis in "xyz"}
+    return assemble_cloud(PATH, {**axes, **{k: np.asarray(v) for k, v in columns.items()}}).fields
+
+
+@pytest.mark.parametrize(
+    ("columns", "name", "expected"),
+    [
+        ({"label": [1, 2]}, "labels", [1, 2]),
+        ({"Label": [1.0, 2.0]}, "labels", [1, 2]),
+        ({"scalar_label": [1.0, np.nan]}, "labels", [1, -1]),
+        ({"labels": np.array([[1], [2]])}, "labels", [1, 2]),
+        ({"labels": [True, False]}, "labels", [1, 0]),
+        ({"intensities": [1.5, 2]}, "intensity", [1.5, 2]),
+        ({"scalar_Intensity": [1.5, 2]}, "intensity", [1.5, 2]),
+        (
+            {"NormalX": [1, 0], "NormalY": [0, 1], "NormalZ": [0, 0]},
+            "normals",
+            [[1, 0, 0], [0, 1, 0]],
+        ),
+        ({"normal": np.eye(3)[:2]}, "normals", [[1, 0, 0], [0, 1, 0]]),
+        ({"colors": np.full((2, 3), 0.5)}, "color", [[128] * 3] * 2),
+        ({"rgb": np.full((2, 3), 200.0)}, "color", [[200] * 3] * 2),
+        ({"color": np.full((2, 3), 65535, np.uint16)}, "color", [[255] * 3] * 2),
+        ({"color": np.full((2, 3), 65534, np.uint16)}, "color", [[65534] * 3] * 2),
+        ({"color": np.full((2, 3), np.nan)}, "color", [[0] * 3] * 2),
+        ({"w_0": [1, 2], "w_1": [3, 4]}, "w", [[1, 3], [2, 4]]),
+    ],
+)
+def test_names_and_types_are_normalised(columns, name, expected):
+    fields = fields_of(**columns)
+    assert list(fields) == [name]
+    assert fields[name].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"w_0": [1, 2], "w_2": [3, 4]},
+        {"w_1": [1, 2], "w_2": [3, 4]},
+        {"w_0": [1, 2]},
+        {"w_0": [1, 2], "w_1": [3.0, 4.0]},
+        {"w": [1, 2], "w_0": [1, 2], "w_1": [3, 4]},
+        {"rgb": [1.0, 2.0]},
+        {"normal": [1.0, 2.0]},
+        {"red": [1, 2], "green": [1, 2]},
+    ],
+)
+def test_what_is_no_group_keeps_its_names(columns):
+    assert fields_of(**columns).keys() == columns.keys()
+
+
+def test_no_column_is_lost_when_two_have_one_name():
+    fields = fields_of(label=[1, 2], labels=[3, 4], scalar_label=[5, 6], Label=[7, 8])
+    assert sorted(int(values[0]) for values in fields.values()) == [1, 3, 5, 7]
+    assert fields["labels"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"labels": np.zeros((2, 2))}, r"expected one whole number a point as labels, got shape"),
+        ({"labels": ["a", "b"]}, "expected one whole number a point as labels"),
+        ({"labels": [0.5, 1]}, "expected labels to be whole numbers of 64 bits"),
+        ({"labels": [np.inf, 1]}, "expected labels to be whole numbers of 64 bits"),
+        ({"labels": np.array([2**64 - 1, 0], np.uint64)}, "expected labels to be whole numbers"),
+        ({"normals": np.zeros(2)}, "expected normals to be three numbers a point"),
+        ({"normals": np.zeros((2, 3), complex)}, "expected normals to be three numbers a point"),
+        ({"color": np.zeros((2, 4))}, "expected color to be three numbers a point"),
+        ({"color": np.full((2, 3), 256.0)}, r"expected color in 0\.\.255, got 256"),
+        ({"color": np.full((2, 3), -1)}, r"expected color in 0\.\.255, got -1"),
+        ({"color": np.full((2, 3), 65536)}, r"expected color in 0\.\.255, got 65536"),
+    ],
+)
+def test_values_that_make_no_sense_are_refused(columns, message):
+    with pytest.raises(FormatError, match=rf"a\.any: {message}"):
+        fields_of(**columns)
+
+
+def test_coordinates_need_their_names_and_one_number_each():
+    with pytest.raises(FormatError, match="expected fields x, y, z, got 'x', 'y'; rename or add"):
+        assemble_cloud(PATH, {"x": np.zeros(2), "y": np.zeros(2)})
+    with pytest.raises(FormatError, match="expected one number a point in each of x, y, z"):
+        assemble_cloud(PATH, {axis: np.zeros((2, 2)) for axis in "xyz"})

@@ -1,0 +1,247 @@
+"""LAS and LAZ: what came in goes out, in the format's own form."""
+
+import pickle
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import torchrg._optional
+from torchrg.errors import FormatError, MissingDependencyError
+from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.structures import Cloud
+
+laspy = pytest.importorskip("laspy")
+pytest.importorskip("lazrs")
+
+WKT = 'LOCAL_CS["hand made"]'
+
+
+@pytest.fixture
+def scanned(tmp_path):
+    """A file as a scanner writes it: own scale, reference system, dimensions, wide colours."""
+
+    def write(point_format=3, version="1.2", suffix=".las"):
+        header = laspy.LasHeader(point_format=point_format, version=version)
+        header.scales, header.offsets = [0.001, 0.001, 0.01], [5e5, 4.5e6, 0]
+        header.system_identifier = "scanner"
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(WKT))
+        header.add_extra_dim(laspy.ExtraBytesParams("Range", "f8"))
+        header.add_extra_dim(laspy.ExtraBytesParams("zero", "u2"))
+        header.add_extra_dim(laspy.ExtraBytesParams("pair", "2f4"))
+        data = laspy.LasData(header)
+        rng = np.random.default_rng(0)
+        data.x, data.y, data.z = (5e5 + rng.random(50), 4.5e6 + rng.random(50), rng.random(50))
+        data.intensity = rng.integers(0, 65536, 50)
+        data.return_number = rng.integers(1, 5, 50)
+        data.number_of_returns = np.full(50, 4)
+        data.classification = rng.integers(0, 20, 50)
+        data.gps_time = rng.random(50)
+        if "red" in data.point_format.dimension_names:
+            data.green, data.blue = rng.integers(0, 65536, (2, 50))
+        data.Range, data.pair = rng.random(50), rng.random((50, 2))
+        data.write(tmp_path / f"scan{suffix}")
+        return tmp_path / f"scan{suffix}"
+
+    return write
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(("point_format", "version"), [(3, "1.2"), (7, "1.4")])
+def test_everything_that_came_in_goes_out(
+    tmp_path, scanned, make_segmentation, suffix, point_format, version
+):
+    source = scanned(point_format, version, suffix)
+    cloud = read_cloud(source)
+    assert cloud.fields["color"].dtype == np.uint16
+    assert "user_data" not in cloud.fields
+    assert "zero" in cloud.fields
+    seg = make_segmentation(50)
+    write_cloud(tmp_path / f"out{suffix}", cloud, seg)
+    before, after = laspy.read(source), laspy.read(tmp_path / f"out{suffix}")
+    for name in before.point_format.dimension_names:
+        if name == "pair":
+            written = np.stack([after["pair_0"], after["pair_1"]], axis=1)
+        else:
+            written = after[name]
+        np.testing.assert_array_equal(written, before[name], err_msg=name)
+    assert after.header.version == before.header.version
+    assert after.header.point_format.id == point_format
+    assert after.header.scales.tolist() == [0.001, 0.001, 0.01]
+    assert after.header.offsets.tolist() == [5e5, 4.5e6, 0]
+    assert after.header.system_identifier == "scanner"
+    assert after.header.vlrs.get("WktCoordinateSystemVlr")[0].string == WKT
+    assert after["label"].dtype == np.int32
+    np.testing.assert_array_equal(after["label"], seg.labels)
+    np.testing.assert_array_equal(after["NormalX"], seg.normals[:, 0])
+    np.testing.assert_array_equal(after["Curvature"], seg.curvature)
+    again = read_cloud(tmp_path / f"out{suffix}")
+    np.testing.assert_array_equal(again.coordinates, cloud.coordinates)
+    for name in cloud.fields:
+        np.testing.assert_array_equal(again.fields[name], cloud.fields[name], err_msg=name)
+    np.testing.assert_array_equal(again.fields["labels"], seg.labels)
+
+
+def test_read_clouds_can_be_sent_to_another_process(scanned):
+    cloud = pickle.loads(pickle.dumps(read_cloud(scanned())))
+    assert cloud.header["las"].scales.tolist() == [0.001, 0.001, 0.01]
+
+
+def test_colour_finds_a_point_format_that_has_it(tmp_path, scanned):
+    cloud = read_cloud(scanned(point_format=1))
+    color = np.arange(150, dtype=np.uint8).reshape(50, 3)
+    write_cloud(tmp_path / "b.las", replace(cloud, fields={**cloud.fields, "color": color}))
+    after = laspy.read(tmp_path / "b.las")
+    assert after.header.point_format.id == 3
+    np.testing.assert_array_equal(after.red, color[:, 0].astype(np.uint16) * 257)
+    assert read_cloud(tmp_path / "b.las").fields["color"].dtype == np.uint8
+
+
+def test_values_that_a_standard_dimension_cannot_hold_get_their_own(tmp_path):
+    fields = {
+        "intensity": np.array([0.25, 0.5, np.nan], np.float32),
+        "classification": np.array([0, 300, 2]),
+        "user_data": np.array([0.0, 255.0, 7.0]),
+        "gps_time": np.array([0.1, 0.2, 0.3]),
+    }
+    write_cloud(tmp_path / "a.las", Cloud(np.eye(3), fields))
+    names = set(laspy.read(tmp_path / "a.las").point_format.extra_dimension_names)
+    assert names == {"intensity_value", "classification_value"}
+    found = read_cloud(tmp_path / "a.las").fields
+    assert found.keys() == fields.keys()
+    for name, values in fields.items():
+        np.testing.assert_array_equal(found[name], values)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3, 1e9])
+def test_grid_follows_the_size_of_the_cloud(tmp_path, scale):
+    coordinates = np.random.default_rng(0).random((100, 3)) * scale
+    write_cloud(tmp_path / "a.las", Cloud(coordinates))
+    found = read_cloud(tmp_path / "a.las").coordinates
+    assert np.abs(found - coordinates).max() <= scale * 2**-31 * 10
+
+
+def test_a_cloud_of_one_place_is_written(tmp_path):
+    write_cloud(tmp_path / "a.laz", Cloud(np.full((5, 3), 7.25)))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.laz").coordinates, np.full((5, 3), 7.25))
+
+
+def test_points_that_are_not_finite_are_refused_before_the_work(tmp_path):
+    cloud = Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]]))
+    message = r"a\.las: expected finite coordinates, .* got 1 points that are not \(first: 1\); wr"
+    with pytest.raises(FormatError, match=message):
+        check_output(tmp_path / "a.las", cloud)
+    with pytest.raises(FormatError, match=message):
+        write_cloud(tmp_path / "a.las", cloud)
+
+
+def test_points_off_the_grid_are_refused(tmp_path, scanned):
+    cloud = read_cloud(scanned())
+    far = replace(cloud, coordinates=cloud.coordinates + 1e9)
+    with pytest.raises(FormatError, match=r"b\.las: cannot be written: Values given do not fit"):
+        write_cloud(tmp_path / "b.las", far)
+
+
+@pytest.mark.parametrize("name", ["n" * 33, "X"])
+def test_names_that_have_no_place_are_refused(tmp_path, name):
+    with pytest.raises(FormatError, match="expected names of at most 32 bytes other than X, Y, Z"):
+        write_cloud(tmp_path / "a.las", Cloud(np.eye(3), {name: np.zeros(3)}))
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_truncated_files_are_refused_wherever_they_end(scanned, suffix):
+    path = scanned(7, "1.4", suffix)
+    whole = path.read_bytes()
+    for end in [3, 100, 240, 500, len(whole) // 2, len(whole) - 1]:
+        path.write_bytes(whole[:end])
+        with pytest.raises(FormatError, match=r"scan\.la[sz]: (byte \d+: )?expected"):
+            read_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(
+    ("place", "layout", "value", "message"),
+    [
+        (247, "<Q", 10**12, r"byte \d+: expected .* for 1,000,000,000,000 points, got"),
+        (247, "<Q", 0, "expected at least one point, got none"),
+        (100, "<I", 2**32 - 1, "byte 100: expected 231,928,233,930 bytes for header records"),
+        (243, "<I", 2**32 - 1, r"byte \d+: expected [\d,]+ bytes for 4,294,967,295 extended"),
+        (104, "<B", 63, "expected a LAS or LAZ file, got: "),
+    ],
+)
+def test_promises_of_the_header_are_checked(scanned, suffix, place, layout, value, message):
+    path = scanned(7, "1.4", suffix)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, place, value)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=rf"scan\{suffix}: {message}"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ("table", 2**32 - 1, r"byte \d+: expected at least [\d,]+ bytes for 4,294,967,295 chunks"),
+        ("offset", 2**31, r"byte 2147483648: expected 8 bytes for the table of chunks, got -"),
+        ("offset", -2, r"byte \d+: expected the place of the table of chunks"),
+        ("layer", 2**32 - 1, r"byte \d+: expected [\d,]+ bytes for the layers of a chunk, got"),
+    ],
+)
+def test_promises_of_compressed_chunks_are_checked(scanned, place, value, message):
+    path = scanned(7, "1.4", ".laz")
+    with laspy.open(path) as reader:
+        start, size = reader.header.offset_to_point_data, reader.header.point_format.size
+    data = bytearray(path.read_bytes())
+    (table,) = struct.unpack_from("<q", data, start)
+    if place == "offset":
+        struct.pack_into("<q", data, start, value)
+    else:
+        struct.pack_into("<I", data, {"table": table + 4, "layer": start + 12 + size}[place], value)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=rf"scan\.laz: {message}"):
+        read_cloud(path)
+
+
+def test_table_of_chunks_may_be_named_at_the_end(scanned):
+    path = scanned(7, "1.4", ".laz")
+    expected = read_cloud(path).coordinates
+    with laspy.open(path) as reader:
+        start = reader.header.offset_to_point_data
+    data = bytearray(path.read_bytes())
+    data += data[start : start + 8]
+    struct.pack_into("<q", data, start, -1)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_cloud(path).coordinates, expected)
+
+
+def test_panic_of_the_decoder_is_a_format_error(scanned, monkeypatch):
+    class PanicException(BaseException):
+        pass
+
+    def panic(*_, **__):
+        raise PanicException("index out of bounds")
+
+    path = scanned()
+    monkeypatch.setattr(laspy, "open", panic)
+    with pytest.raises(FormatError, match="expected whole compressed points, got: index out of b"):
+        read_cloud(path)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(laspy, "open", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        read_cloud(path)
+
+
+def test_missing_package_is_named(tmp_path, monkeypatch):
+    def absent(name):
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(torchrg._optional.importlib, "import_module", absent)
+    (tmp_path / "a.las").write_bytes(b"LASF")
+    with pytest.raises(MissingDependencyError, match=r"laspy is needed to read LAS and LAZ files"):
+        read_cloud(tmp_path / "a.las")
+    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[las\]'"):
+        check_output(tmp_path / "a.laz")

@@ -1,0 +1,192 @@
+"""Arrays of other programs, whole and broken."""
+
+import io
+import pickle
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+
+from torchrg.errors import FormatError
+from torchrg.io import read_cloud, write_cloud
+from torchrg.structures import Cloud
+
+POINTS = np.arange(12, dtype=np.float64).reshape(4, 3)
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+@pytest.mark.parametrize("name", ["points", "coord"])
+def test_archives_of_numpy_are_read(tmp_path, save, name):
+    arrays = {
+        name: POINTS,
+        "normal": np.ones((4, 3), np.float32),
+        "segment": np.arange(4, dtype=np.int16)[:, None],
+        "labels": np.array([[2], [1], [0], [-1]], np.int16),
+        "intrinsics": np.eye(3),
+        "scale": np.float64(2),
+    }
+    save(tmp_path / "a.npz", **arrays)
+    cloud = read_cloud(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.coordinates, POINTS)
+    assert cloud.fields.keys() == {"normals", "segment", "labels"}
+    assert cloud.fields["labels"].tolist() == [2, 1, 0, -1]
+    assert cloud.fields["labels"].dtype == np.int64
+
+
+def test_fortran_order_and_foreign_bytes_are_read(tmp_path):
+    np.save(tmp_path / "a.npy", np.asfortranarray(POINTS.astype(">f4")))
+    cloud = read_cloud(tmp_path / "a.npy")
+    np.testing.assert_array_equal(cloud.coordinates, POINTS)
+    assert cloud.coordinates.flags.c_contiguous
+    assert cloud.coordinates.dtype == np.dtype("=f4")
+
+
+@pytest.mark.parametrize(
+    ("rest", "names"),
+    [
+        (np.zeros((4, 0)), set()),
+        (np.full((4, 1), 0.5), {"intensity"}),
+        (np.full((4, 2), 0.5), {"column_4", "column_5"}),
+        (np.tile([255.0, 0, 7], (4, 1)), {"color"}),
+        (np.tile([0.6, 0, -0.8], (4, 1)), {"normals"}),
+        (np.tile([0.0, 0, 1], (4, 1)), {"normals"}),
+        (np.zeros((4, 3)), {"color"}),
+        (np.full((4, 3), 1e200), {"column_4", "column_5", "column_6"}),
+        (np.full((4, 3), 0.3), {"column_4", "column_5", "column_6"}),
+        (np.tile([255.0, 0, 7, 3], (4, 1)), {"color", "labels"}),
+        (np.tile([255.0, 0, 7, 0.5], (4, 1)), {"color", "column_7"}),
+        (np.tile([256.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
+    ],
+)
+def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
+    table = np.hstack([POINTS, rest])
+    np.save(tmp_path / "a.npy", table)
+    cloud = read_cloud(tmp_path / "a.npy")
+    np.testing.assert_array_equal(cloud.coordinates, POINTS)
+    assert cloud.fields.keys() == names
+    np.savetxt(tmp_path / "a.txt", table)
+    assert read_cloud(tmp_path / "a.txt").fields.keys() == names
+
+
+def test_structured_arrays_are_read_by_name(tmp_path):
+    values = np.zeros(4, [("X", "f4"), ("Y", "f4"), ("Z", "f8"), ("label", "u1"), ("d", "f4", 2)])
+    values["Z"] = 1e6 + 0.125
+    np.save(tmp_path / "a.npy", values)
+    cloud = read_cloud(tmp_path / "a.npy")
+    np.testing.assert_array_equal(cloud.coordinates[:, 2], values["Z"])
+    assert {name: v.shape for name, v in cloud.fields.items()} == {"labels": (4,), "d": (4, 2)}
+
+
+class Bomb:
+    """Says so if anybody unpickles it."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was loaded",))
+
+
+def test_pickles_are_never_loaded(tmp_path):
+    bomb = np.array([Bomb()] * 4, dtype=object)
+    message = "got pickled Python objects, which are never loaded; convert them"
+    np.save(tmp_path / "a.npy", bomb, allow_pickle=True)
+    with pytest.raises(FormatError, match=rf"a\.npy: expected numbers .* {message}"):
+        read_cloud(tmp_path / "a.npy")
+    np.savez(tmp_path / "a.npz", allow_pickle=True, points=POINTS, meta=bomb)
+    with pytest.raises(FormatError, match=rf"a\.npz: expected .* in 'meta\.npy', {message}"):
+        read_cloud(tmp_path / "a.npz")
+    for kind in (".npy", ".npz"):
+        (tmp_path / f"b{kind}").write_bytes(pickle.dumps(Bomb()))
+        with pytest.raises(FormatError, match=rf"b\{kind}: .*expected"):
+            read_cloud(tmp_path / f"b{kind}")
+
+
+def array_bytes(shape, descr="'<f8'", data=b""):
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (array_bytes((10**12, 3)), r"byte \d+: expected 24,000,000,000,000 bytes for the array of"),
+        (array_bytes((4, 3), data=b"0" * 95), r"byte \d+: expected 96 bytes .*, got 95; the file"),
+        (array_bytes((-4, 3)), r"byte 0: expected a shape in the array, got \(-4, 3\)"),
+        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: expected a shape in the array"),
+        (array_bytes((4, 2), data=b"0" * 64), r"expected an array of shape \(N, 3\) or wider, got"),
+        (array_bytes((), data=b"0" * 8), r"expected an array of shape \(N, 3\) or wider, got \(\)"),
+        (array_bytes((0, 3)), "expected at least one point, got none"),
+        (array_bytes((4, 3), "'|O'", b"0" * 96), "expected numbers .*, got pickled Python objects"),
+        (array_bytes((4, 3), "'<q9'"), "byte 0: expected the header of a NumPy array"),
+        (array_bytes("(4, 3", data=b"0" * 96), "byte 0: expected the header of a NumPy array"),
+        (array_bytes("('a', 3)", data=b"0" * 96), "byte 0: expected the header of a NumPy array"),
+        (b"\x93NUMPY\x09\x00", "byte 0: expected the header of a NumPy array"),
+        (b"\x93NUM", "byte 0: expected the header of a NumPy array"),
+    ],
+)
+def test_broken_arrays_are_refused(tmp_path, content, message):
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(FormatError, match=rf"a\.npy: {message}"):
+        read_cloud(tmp_path / "a.npy")
+    if "shape (N" not in message and "wider" not in message:
+        with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("points.npy", content)
+        with pytest.raises(FormatError, match=r"a\.npz: "):
+            read_cloud(tmp_path / "a.npz")
+
+
+def test_archives_without_points_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", x=POINTS, y=POINTS)
+    with pytest.raises(
+        FormatError, match=r"a\.npz: expected an array points \(or coord\), got 'x'"
+    ):
+        read_cloud(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", points=POINTS.reshape(2, 2, 3))
+    with pytest.raises(
+        FormatError, match=r"expected coordinates of shape \(N, 3\), got \(2, 2, 3\)"
+    ):
+        read_cloud(tmp_path / "a.npz")
+    (tmp_path / "a.npz").write_bytes(b"PK" * 50)
+    with pytest.raises(
+        FormatError, match=r"a\.npz: expected an archive of NumPy arrays, got: File"
+    ):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_sizes_in_archives_are_compared_with_the_bytes(tmp_path):
+    stored = io.BytesIO()
+    with zipfile.ZipFile(stored, "w") as archive:
+        archive.writestr("points.npy", array_bytes((10**9, 3), data=b"0" * 96))
+    data = bytearray(stored.getvalue())
+    place = data.index(b"PK\x01\x02")
+    # What the directory says about the size of the member, whole and packed.
+    data[place + 24 : place + 28] = struct.pack("<I", 2**32 - 2)
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(FormatError, match=r"a\.npz: byte 0: expected 4,294,967,294 bytes for"):
+        read_cloud(tmp_path / "a.npz")
+    data[place + 20 : place + 24] = struct.pack("<I", 2**32 - 2)
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(FormatError, match=r"a\.npz: byte 0: expected 4,294,967,294 bytes for"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_unusual_compression_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("points.npy", array_bytes((4, 3), data=b"0" * 96))
+    with pytest.raises(FormatError, match=r"expected 'points\.npy' stored or deflated, got compr"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_damaged_member_is_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", points=POINTS)
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    data[data.index(POINTS[2:].tobytes())] ^= 1
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(FormatError, match=r"a\.npz: 'points\.npy': Bad CRC-32"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_plain_array_is_written_without_fields(tmp_path):
+    write_cloud(tmp_path / "a.npy", Cloud(POINTS))
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), POINTS)
+    write_cloud(tmp_path / "a.npy", Cloud(POINTS, {"labels": np.arange(4)}))
+    assert np.load(tmp_path / "a.npy").dtype.names == ("x", "y", "z", "label")

@@ -1,0 +1,196 @@
+"""PLY files of other programs, whole and broken."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from torchrg.errors import FormatError
+from torchrg.io import read_cloud
+
+POINTS = [(1.5, -2.0, 3.0), (4.0, 5.25, -6.0), (float("nan"), 0.0, 1e30)]
+HEADER = """ply
+format {order} 1.0
+comment made by hand
+element vertex 3
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+property short label
+end_header
+"""
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def save(path, header, body=b"", newline="\n"):
+    path.write_bytes(header.replace("\n", newline).encode() + body)
+    return path
+
+
+def binary_body(order):
+    return b"".join(struct.pack(order + "fffBBBh", *p, 255, 128, 7, -1) for p in POINTS)
+
+
+def text_body():
+    return "".join(f"{x} {y} {z} 255 128 7 -1\n" for x, y, z in POINTS).encode()
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("order", ["ascii", *ORDERS])
+def test_every_encoding_gives_the_same_cloud(tmp_path, order, newline):
+    body = text_body() if order == "ascii" else binary_body(ORDERS[order])
+    cloud = read_cloud(save(tmp_path / "a.ply", HEADER.format(order=order), body, newline))
+    np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
+    assert cloud.coordinates.dtype == np.float32
+    assert cloud.fields["color"].tolist() == [[255, 128, 7]] * 3
+    assert cloud.fields["color"].dtype == np.uint8
+    assert cloud.fields["labels"].tolist() == [-1, -1, -1]
+    assert all(values.dtype.isnative for values in cloud.fields.values())
+
+
+@pytest.mark.parametrize(
+    ("properties", "values", "name", "expected"),
+    [
+        ("float nx\nproperty float ny\nproperty float nz", "fff", "normals", [[0.0, 0.0, 1.0]]),
+        (
+            "uchar diffuse_red\nproperty uchar diffuse_green\nproperty uchar diffuse_blue",
+            "BBB",
+            "color",
+            [[0, 0, 1]],
+        ),
+        ("float red\nproperty float green\nproperty float blue", "fff", "color", [[0, 0, 255]]),
+        ("float scalar_Label\nproperty char a\nproperty char b", "fbb", "labels", [0]),
+        ("float scalar_Curvature\nproperty char a\nproperty char b", "fbb", "curvature", [0.0]),
+        ("double scalar_mine\nproperty char a\nproperty char b", "dbb", "mine", [0.0]),
+        ("char f_0\nproperty char f_1\nproperty char f_2", "bbb", "f", [[0, 0, 1]]),
+        ("uint64 label\nproperty int64 a\nproperty uint8 b", "QqB", "labels", [0]),
+    ],
+)
+def test_names_of_other_programs_are_known(tmp_path, properties, values, name, expected):
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty double x\n"
+        f"property double y\nproperty double z\nproperty {properties}\nend_header\n"
+    )
+    body = struct.pack("<ddd" + values, 1, 2, 3, 0, 0, 1)
+    cloud = read_cloud(save(tmp_path / "a.ply", header, body))
+    assert cloud.fields[name].tolist() == expected
+    assert cloud.coordinates.dtype == np.float64
+
+
+@pytest.mark.parametrize("order", ["ascii", *ORDERS])
+def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
+    header = HEADER.format(order=order).replace(
+        "element vertex",
+        "obj_info x\nelement camera 1\nproperty double f\nelement strip 2\n"
+        "property list uchar int i\nelement empty 4\nelement vertex",
+    )
+    header = header.replace(
+        "end_header", "element face 2\nproperty list uchar int vertex_indices\nend_header"
+    )
+    if order == "ascii":
+        body = b"1.5\n2 0 1\n2 1 2\n" + text_body() + b"3 0 1 2\n4 0 1 2 0\n"
+    else:
+        mark = ORDERS[order]
+        strips = struct.pack(mark + "dBiiBii", 1.5, 2, 0, 1, 2, 1, 2)
+        body = strips + binary_body(mark) + struct.pack(mark + "Biii", 3, 0, 1, 2)
+    cloud = read_cloud(save(tmp_path / "a.ply", header, body))
+    np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
+    assert set(cloud.fields) == {"color", "labels"}
+
+
+def test_lists_of_one_length_in_vertices_become_columns(tmp_path):
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
+        "property float y\nproperty float z\nproperty list uint float spectrum\nend_header\n"
+    )
+    body = struct.pack("<fffIfffffIff", 1, 2, 3, 2, 7, 8, 4, 5, 6, 2, 9, 10)
+    cloud = read_cloud(save(tmp_path / "a.ply", header, body))
+    assert cloud.fields["spectrum"].tolist() == [[7, 8], [9, 10]]
+    assert set(cloud.fields) == {"spectrum"}
+    broken = struct.pack("<fffIfffffIff", 1, 2, 3, 2, 7, 8, 4, 5, 6, 1, 9, 10)
+    with pytest.raises(FormatError, match=r"a\.ply: expected lists of one length in element"):
+        read_cloud(save(tmp_path / "a.ply", header, broken))
+    huge = struct.pack("<fffIff", 1, 2, 3, 2**32 - 1, 7, 8)
+    with pytest.raises(FormatError, match=r"byte \d+: expected a list that fits .* 4,294,967,295"):
+        read_cloud(save(tmp_path / "a.ply", header, huge))
+    header = header.replace("binary_little_endian", "ascii")
+    with pytest.raises(FormatError, match="expected vertices without lists in an ASCII file"):
+        read_cloud(save(tmp_path / "a.ply", header, b"1 2 3 2 7 8\n4 5 6 2 9 10\n"))
+
+
+@pytest.mark.parametrize("order", ["ascii", *ORDERS])
+@pytest.mark.parametrize("count", [4, 10**12, 10**17])
+def test_promised_points_are_compared_with_the_file(tmp_path, order, count):
+    body = text_body() if order == "ascii" else binary_body(ORDERS[order])
+    header = HEADER.format(order=order).replace("vertex 3", f"vertex {count}")
+    with pytest.raises(FormatError, match=r"a\.ply: (byte|line) \d+: expected .* got [\d,]+; the"):
+        read_cloud(save(tmp_path / "a.ply", header, body))
+
+
+def test_truncated_file_names_the_byte(tmp_path):
+    header = HEADER.format(order="binary_little_endian")
+    path = save(tmp_path / "a.ply", header, binary_body("<")[:-1])
+    message = rf"a\.ply: byte {len(header)}: expected 51 bytes for 3 records of vertex, got 50; "
+    with pytest.raises(FormatError, match=message):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("ply\n", "plx\n"), "line 1: expected 'ply', got 'plx'"),
+        (
+            ("end_header", "end-header"),
+            "line 12: expected a line of a PLY header, got 'end-header'",
+        ),
+        (
+            ("format {order} 1.0\n", ""),
+            "line 11: expected a line of a PLY header, got 'end_header'",
+        ),
+        (("{order}", "binary_middle_endian"), "line 2: expected a line of a PLY header"),
+        (("vertex 3", "vertex -3"), "line 4: expected a line of a PLY header"),
+        (("vertex 3", "vertex 1e3"), "line 4: expected a line of a PLY header"),
+        (("float y", "quad y"), "line 6: expected a line of a PLY header, got 'property quad y'"),
+        (("float y", "float x"), "line 6: expected names that differ, got 'x' twice; rename one"),
+        (("float y", "list float int y"), "line 6: expected a line of a PLY header"),
+        (("vertex 3", "point 3"), "expected an element vertex with properties, got elements point"),
+        (("float y", "float why"), "expected fields x, y, z, got 'x', 'why', 'z', 'red'"),
+        (("vertex 3", "vertex 0"), "expected at least one point, got none"),
+        (("float z", "list uchar float z"), "expected vertices without lists in an ASCII file"),
+    ],
+)
+def test_broken_headers_name_the_line(tmp_path, change, message):
+    header = HEADER.replace(*change).format(order="ascii")
+    with pytest.raises(FormatError, match=rf"a\.ply: {message}"):
+        read_cloud(save(tmp_path / "a.ply", header, text_body()))
+
+
+def test_header_without_end_is_cut_off(tmp_path):
+    header = HEADER.format(order="ascii").replace("end_header\n", "")
+    with pytest.raises(FormatError, match=r"line 12: expected the header to end with 'end_header'"):
+        read_cloud(save(tmp_path / "a.ply", header))
+    with pytest.raises(FormatError, match=r"line 1: expected the header to end with 'end_header'"):
+        read_cloud(save(tmp_path / "a.ply", "ply"))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (b"4 five -6 1 2 3 0", r"line 13: expected 7 numbers, got '4 five -6 1 2 3 0'; repair"),
+        (b"4 5 -6 1 2 3", "line 13: expected 7 numbers, got '4 5 -6 1 2 3'"),
+        (b"4 5 -6 1 2 3 4 5", "line 13: expected 7 numbers"),
+        (b"4 5 -6 1 2 256 4", "line 13: expected 7 numbers, got '4 5 -6 1 2 256 4'"),
+        (b"4 5 -6 1 2 0.5 4", "line 13: expected 7 numbers"),
+        (b"", "line 16: expected 3 rows of numbers, got 2"),
+        (b"4" * 100, "line 13: expected 7 numbers, got '4444.*4...'; repair or delete"),
+    ],
+)
+def test_broken_lines_are_named(tmp_path, line, message):
+    lines = text_body().splitlines()
+    lines[0] = line
+    body = b"\n".join(lines) + b"\n"
+    with pytest.raises(FormatError, match=rf"a\.ply: {message}"):
+        read_cloud(save(tmp_path / "a.ply", HEADER.format(order="ascii"), body))

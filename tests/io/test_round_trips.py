@@ -1,0 +1,317 @@
+"""What torchrg writes, it reads back, in every format."""
+
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import torchrg.io
+from torchrg.errors import FormatError
+from torchrg.io import FORMATS, check_output, read_cloud, write_cloud
+from torchrg.structures import Cloud
+
+EXACT = [".npz", ".npy", ".ply", ".pcd", ".e57"]
+TEXT = [".xyz", ".txt"]
+GRID = [".las", ".laz"]
+UTM = (500_000.0, 4_500_000.0, 100.0)
+
+
+def needs(suffix):
+    pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
+
+
+@pytest.fixture(params=list(FORMATS))
+def suffix(request):
+    needs(request.param)
+    return request.param
+
+
+@pytest.mark.parametrize("kind", EXACT)
+@pytest.mark.parametrize(("number", "origin"), [("f4", (0, 0, 0)), ("f8", UTM)])
+def test_binary_formats_keep_every_bit(tmp_path, make_cloud, assert_same, kind, number, origin):
+    needs(kind)
+    cloud = make_cloud(dtype=number, origin=origin)
+    write_cloud(tmp_path / f"a{kind}", cloud)
+    found = read_cloud(tmp_path / f"a{kind}")
+    assert_same(found, cloud)
+    assert found.coordinates.dtype == cloud.coordinates.dtype
+    assert found.fields["labels"].dtype == np.int64
+    assert found.fields["color"].dtype == np.uint8
+    assert found.source == str(tmp_path / f"a{kind}")
+
+
+@pytest.mark.parametrize("kind", TEXT)
+@pytest.mark.parametrize(("number", "origin"), [("f4", (0, 0, 0)), ("f8", UTM)])
+def test_text_keeps_every_value(tmp_path, make_cloud, kind, number, origin):
+    cloud = make_cloud(dtype=number, origin=origin)
+    write_cloud(tmp_path / f"a{kind}", cloud)
+    found = read_cloud(tmp_path / f"a{kind}")
+    assert found.coordinates.dtype == np.float64
+    np.testing.assert_array_equal(found.coordinates.astype(number), cloud.coordinates)
+    for name, values in cloud.fields.items():
+        np.testing.assert_array_equal(found.fields[name].astype(values.dtype), values)
+
+
+@pytest.mark.parametrize("kind", GRID)
+def test_las_keeps_coordinates_to_its_grid_and_fields_exactly(tmp_path, make_cloud, kind):
+    needs(kind)
+    cloud = make_cloud(dtype="f8", origin=UTM)
+    write_cloud(tmp_path / f"a{kind}", cloud)
+    found = read_cloud(tmp_path / f"a{kind}")
+    # Half a step of the grid (32 bits over a few metres, in powers of ten) and half a float64.
+    np.testing.assert_allclose(found.coordinates, cloud.coordinates, rtol=0, atol=0.5e-8 + 1e-9)
+    for name, values in cloud.fields.items():
+        np.testing.assert_array_equal(found.fields[name], values, err_msg=name)
+
+
+def test_files_grow_stable_after_the_first_round(tmp_path, make_cloud, suffix):
+    write_cloud(tmp_path / f"a{suffix}", make_cloud())
+    once = read_cloud(tmp_path / f"a{suffix}")
+    write_cloud(tmp_path / f"b{suffix}", once)
+    twice = read_cloud(tmp_path / f"b{suffix}")
+    np.testing.assert_array_equal(twice.coordinates, once.coordinates)
+    for name in once.fields:
+        np.testing.assert_array_equal(twice.fields[name], once.fields[name])
+
+
+# E57 files carry random identifiers.
+@pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != ".e57"])
+def test_equal_clouds_give_equal_bytes(tmp_path, make_cloud, kind, monkeypatch):
+    needs(kind)
+    write_cloud(tmp_path / f"a{kind}", make_cloud())
+    monkeypatch.setattr("time.time", lambda: 2e9)
+    monkeypatch.setattr("time.localtime", lambda *_: (2033, 5, 18, 3, 33, 20, 2, 138, 0))
+    write_cloud(tmp_path / f"b{kind}", make_cloud())
+    assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
+
+
+@pytest.mark.parametrize("kind", [*EXACT[:4], *TEXT])
+def test_points_that_are_not_finite_stay_in_place(tmp_path, make_cloud, kind):
+    cloud = make_cloud()
+    cloud.coordinates[3] = np.nan
+    cloud.coordinates[7] = [np.inf, 0.0, -np.inf]
+    write_cloud(tmp_path / f"a{kind}", cloud)
+    found = read_cloud(tmp_path / f"a{kind}")
+    np.testing.assert_array_equal(found.coordinates.astype("f4"), cloud.coordinates)
+    assert np.flatnonzero(~found.finite).tolist() == [3, 7]
+
+
+def test_segmentation_is_written_beside_the_own_fields(
+    tmp_path, make_cloud, make_segmentation, suffix
+):
+    cloud, seg = make_cloud(), make_segmentation(60)
+    write_cloud(tmp_path / f"a{suffix}", cloud, seg)
+    fields = read_cloud(tmp_path / f"a{suffix}").fields
+    np.testing.assert_array_equal(fields["labels"], seg.labels)
+    np.testing.assert_array_equal(fields["normals"].astype("f4"), seg.normals)
+    np.testing.assert_array_equal(fields["curvature"].astype("f4"), seg.curvature)
+    if suffix != ".npz":
+        np.testing.assert_array_equal(fields["color"], cloud.fields["color"])
+        np.testing.assert_array_equal(fields["intensity"].astype("f4"), cloud.fields["intensity"])
+
+
+def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, make_segmentation):
+    seg = make_segmentation(60)
+    cloud = make_cloud(dtype="f8", origin=UTM)
+    write_cloud(tmp_path / "a.npz", cloud, seg, provenance={"torchrg": "1", "config": {"k": 50}})
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as result:
+        arrays = dict(result)
+    points = ["points", "labels", "normals", "curvature", "sharp", "valid"]
+    planes = ["normal", "offset", "centroid", "area", "count", "rms"]
+    assert list(arrays) == [*points, *(f"plane_{name}" for name in planes), "provenance"]
+    assert json.loads(str(arrays["provenance"])) == {"torchrg": "1", "config": {"k": 50}}
+    assert arrays["points"].dtype == np.float64
+    assert arrays["labels"].dtype == np.int64
+    assert arrays["sharp"].dtype == arrays["valid"].dtype == bool
+    np.testing.assert_array_equal(arrays["points"], cloud.coordinates)
+    np.testing.assert_array_equal(arrays["plane_count"], [30, 20, 10])
+
+
+def test_planes_are_written_in_the_coordinates_of_the_input(
+    tmp_path, make_cloud, make_segmentation
+):
+    seg, cloud = make_segmentation(60), make_cloud(dtype="f8", origin=UTM)
+    assert cloud.origin.any()
+    write_cloud(tmp_path / "a.npz", cloud, seg)
+    with np.load(tmp_path / "a.npz") as result:
+        normal, offset = result["plane_normal"], result["plane_offset"]
+        centroid = result["plane_centroid"]
+    assert offset.dtype == centroid.dtype == np.float64
+    np.testing.assert_allclose(centroid - cloud.origin, seg.planes.centroid, atol=1e-8)
+    # The centroids lie in their planes, there and here; float32 at a few metres is good for 1e-6.
+    distance = (normal.astype(np.float64) * centroid).sum(axis=1) - offset
+    np.testing.assert_allclose(distance, 0, atol=2e-6)
+
+
+def test_reading_a_result_gives_fields_of_points_only(tmp_path, make_cloud, make_segmentation):
+    # As many planes as points must not make fields of them.
+    seg = make_segmentation(3)
+    cloud = make_cloud(3)
+    write_cloud(tmp_path / "a.npz", cloud, seg)
+    fields = read_cloud(tmp_path / "a.npz").fields
+    assert set(fields) == {"labels", "normals", "curvature", "sharp", "valid"}
+
+
+def test_archives_carry_no_times(tmp_path, make_cloud):
+    write_cloud(tmp_path / "a.npz", make_cloud(), provenance={"a": 1})
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+        assert "provenance.npy" in archive.namelist()
+
+
+def test_segmentation_of_another_cloud_is_refused(tmp_path, make_cloud, make_segmentation):
+    with pytest.raises(FormatError, match=r"a\.ply: expected a segmentation of 60 points, got 59"):
+        write_cloud(tmp_path / "a.ply", make_cloud(), make_segmentation(59))
+    assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "kept"),
+    [("i2", "f4"), ("u1", "f4"), ("f2", "f4"), ("i4", "f8"), ("i8", "f8"), (">f8", "f8")],
+)
+def test_other_numbers_become_floating_point_that_holds_them(tmp_path, number, kept):
+    coordinates = np.arange(12).reshape(4, 3).astype(number)
+    write_cloud(tmp_path / "a.npz", Cloud(coordinates))
+    found = read_cloud(tmp_path / "a.npz").coordinates
+    assert found.dtype == kept
+    assert found.dtype.isnative
+    np.testing.assert_array_equal(found, coordinates)
+
+
+@pytest.mark.parametrize("number", ["c8", "bool", "U3", "M8[s]"])
+def test_other_types_of_coordinates_are_refused(tmp_path, number):
+    np.savez(tmp_path / "a.npz", points=np.zeros((4, 3), number))
+    with pytest.raises(FormatError, match=r"a\.npz: expected real numbers as coordinates, got"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_truth_values_and_wide_integers_are_kept_by_value(tmp_path, make_cloud):
+    fields = {
+        "sharp": np.array([True, False, True]),
+        "wide": np.array([0, 2**40, -(2**40)]),
+        "unsigned": np.array([0, 2**32 - 1, 1], np.uint64),
+        "half": np.array([0.5, 1.5, -2.0], np.float16),
+    }
+    for kind in (".ply", ".pcd", ".npy", ".npz"):
+        write_cloud(tmp_path / f"a{kind}", Cloud(np.zeros((3, 3)), fields))
+        found = read_cloud(tmp_path / f"a{kind}").fields
+        for name, values in fields.items():
+            np.testing.assert_array_equal(found[name].astype(values.dtype), values)
+
+
+# Archives hold any field that is no Python object.
+@pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != ".npz"])
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("tag", np.array(["a", "b"]), "expected field tag to be real numbers"),
+        ("wave", np.zeros(2, complex), "expected field wave to be real numbers"),
+        ("long", np.zeros(2, np.longdouble), "expected field long to be real numbers"),
+        ("short", np.zeros(1), r"expected field short of shape \(2, \.\.\.\), got \(1,\)"),
+        ("cube", np.zeros((2, 2, 2)), r"expected field cube of shape \(N,\) or \(N, C\)"),
+        ("none", np.zeros((2, 0)), r"expected field none of shape \(N,\) or \(N, C\)"),
+        ("x", np.zeros(2), "expected fields of different names, got 'x' twice"),
+        ("color", np.zeros((2, 3)), "expected field color of uint8 or uint16, got float64"),
+    ],
+)
+def test_fields_that_a_file_cannot_hold_are_refused(tmp_path, kind, name, values, message):
+    needs(kind)
+    with pytest.raises(FormatError, match=message):
+        write_cloud(tmp_path / f"a{kind}", Cloud(np.zeros((2, 3)), {name: values}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_archives_hold_text_but_no_objects(tmp_path):
+    cloud = Cloud(np.zeros((2, 3)), {"tag": np.array(["a", "b"])})
+    write_cloud(tmp_path / "a.npz", cloud)
+    assert read_cloud(tmp_path / "a.npz").fields["tag"].tolist() == ["a", "b"]
+    cloud = Cloud(np.zeros((2, 3)), {"tag": np.array([{}, []], dtype=object)})
+    with pytest.raises(FormatError, match="expected numbers or text in tag, got Python objects"):
+        write_cloud(tmp_path / "b.npz", cloud)
+    cloud = Cloud(np.zeros((2, 3)), {"short": np.zeros(1)})
+    with pytest.raises(
+        FormatError, match=r"expected field short of shape \(2, \.\.\.\), got \(1,\)"
+    ):
+        write_cloud(tmp_path / "b.npz", cloud)
+    with pytest.raises(FormatError, match="expected fields beside points, got 'coord'"):
+        write_cloud(tmp_path / "b.npz", Cloud(np.zeros((2, 3)), {"coord": np.zeros((2, 3))}))
+
+
+def test_ply_refuses_integers_that_no_type_of_it_holds(tmp_path):
+    cloud = Cloud(np.zeros((1, 3)), {"id": np.array([2**60])})
+    with pytest.raises(FormatError, match=r"expected field id within 2\^53"):
+        write_cloud(tmp_path / "a.ply", cloud)
+
+
+def test_no_points_are_refused(tmp_path, suffix):
+    with pytest.raises(FormatError, match="expected at least one point, got none"):
+        write_cloud(tmp_path / f"a{suffix}", Cloud(np.zeros((0, 3))))
+
+
+def test_suffix_in_capitals_is_the_same(tmp_path, make_cloud, assert_same):
+    cloud = make_cloud()
+    write_cloud(tmp_path / "a.PLY", cloud)
+    assert_same(read_cloud(str(tmp_path / "a.PLY")), cloud)
+
+
+@pytest.mark.parametrize("call", [read_cloud, check_output])
+def test_unknown_suffix_lists_the_known_ones(tmp_path, call):
+    (tmp_path / "a.stl").write_bytes(b"solid")
+    known = r"\.npz \.npy \.ply \.pcd \.las \.laz \.e57 \.xyz \.txt, got '\.stl'"
+    with pytest.raises(FormatError, match=rf"a\.stl: expected a file that ends in one of {known}"):
+        call(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("kind", [*FORMATS, ".stl"])
+def test_missing_files_directories_and_empty_files_are_refused(tmp_path, kind):
+    path = tmp_path / f"a{kind}"
+    with pytest.raises(FormatError, match=r"a\.\w+: no such file"):
+        read_cloud(path)
+    path.touch()
+    with pytest.raises(FormatError, match=r"a\.\w+: byte 0: the file is empty"):
+        read_cloud(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(FormatError, match=r"a\.\w+: expected a file, got a directory"):
+        read_cloud(path)
+
+
+def test_unreadable_files_are_one_line(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    (tmp_path / "a.ply").write_bytes(b"ply")
+    monkeypatch.setitem(torchrg.io.FORMATS, ".ply", FORMATS[".ply"]._replace(read=refuse))
+    with pytest.raises(FormatError, match=r"a\.ply: cannot be read: Permission denied\."):
+        read_cloud(tmp_path / "a.ply")
+
+
+def test_outputs_are_checked_before_the_work(tmp_path):
+    check_output(tmp_path / "a.ply")
+    with pytest.raises(FormatError, match="there is no folder"):
+        check_output(tmp_path / "missing" / "a.ply")
+    (tmp_path / "b.ply").mkdir()
+    with pytest.raises(FormatError, match=r"b\.ply: expected a file to write, got a directory"):
+        check_output(tmp_path / "b.ply")
+
+
+def test_files_pass_between_formats(tmp_path, make_cloud):
+    kinds = [".npz", ".pcd", ".ply", ".npy", ".xyz", ".npz"]
+    cloud = make_cloud(dtype="f8", origin=UTM)
+    previous = cloud
+    for number, kind in enumerate(kinds):
+        write_cloud(tmp_path / f"{number}{kind}", previous)
+        previous = read_cloud(tmp_path / f"{number}{kind}")
+    np.testing.assert_array_equal(previous.coordinates, cloud.coordinates)
+    for name, values in cloud.fields.items():
+        np.testing.assert_array_equal(previous.fields[name].astype(values.dtype), values)
+
+
+def test_clouds_that_were_read_can_be_changed_and_written(tmp_path, make_cloud):
+    write_cloud(tmp_path / "a.pcd", make_cloud())
+    cloud = read_cloud(tmp_path / "a.pcd")
+    changed = replace(cloud, fields={"labels": np.arange(60)})
+    write_cloud(tmp_path / "b.pcd", changed)
+    assert read_cloud(tmp_path / "b.pcd").fields["labels"].tolist() == list(range(60))
