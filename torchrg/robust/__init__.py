@@ -3,6 +3,7 @@
 from torchrg.robust.fastmcd import fit_fastmcd
 from torchrg.robust.mcd import fit_detmcd
 from torchrg.robust.mm import fit_detmm, fit_dets
+from torchrg.robust.mve import fit_mve
 from torchrg.robust.result import RobustFit
 from torchrg.robust.scale import mad, median, qn, qn_exceeds
 
@@ -12,6 +13,7 @@ __all__ = [
     "fit_detmm",
     "fit_dets",
     "fit_fastmcd",
+    "fit_mve",
     "mad",
     "median",
     "qn",

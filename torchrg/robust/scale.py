@@ -208,7 +208,7 @@ def _per_count(
     counts = counted.sum(dim=1)
     out = rows.new_full((len(rows),), torch.nan)
     results: Tensor | None = None
-    for count in sorted(set(counts.tolist())):
+    for count in sorted(set(counts.tolist())) or [n]:
         chosen = (counts == count) & ~broken
         found = of_sorted(ascending[chosen][:, :count].contiguous())
         results = out.to(found.dtype) if results is None else results

@@ -1,0 +1,133 @@
+"""Minimum volume ellipsoid."""
+
+from math import comb
+
+import torch
+from torch import Tensor
+
+from torchrg.errors import ConfigError
+from torchrg.robust.elemental import draw_seed, elemental_sets
+from torchrg.robust.estimate import Estimate, reweight
+from torchrg.robust.lanes import join_columns, smallest_points, sorted_points
+from torchrg.robust.patchwise import fit_patchwise
+from torchrg.robust.result import RobustFit
+from torchrg.robust.scatter import covariance_entries, determinant, fit_ellipsoid, sq_distances
+from torchrg.robust.weights import chi2_quantile
+
+_LANES_AT_ONCE = 1024
+
+
+def fit_mve(
+    patches: Tensor,
+    mask: Tensor | None = None,
+    *,
+    support_fraction: float = 0.5,
+    quantile: float = 0.975,
+    num_starts: int = 500,
+    exhaustive: bool = False,
+    generator: torch.Generator | None = None,
+    chunk_size: int = 64,
+) -> RobustFit:
+    r"""Fit to each patch the ellipsoid of least volume that covers h points.
+
+    Each set of P + 1 points gives an ellipsoid by its mean and covariance; it is blown up until
+    it covers h points, and the smallest wins [1].
+
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, P)``, floating point.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all. Points with a non-finite
+            coordinate never count.
+        support_fraction: Share of the points to cover, from 0.5 to 1.
+        quantile: Points within this quantile of the chi-square distribution are inliers.
+        num_starts: Random sets; all sets are taken where there are no more than five times as
+            many. Random sets nearly always miss the least volume by a little.
+        exhaustive: Take all sets: 230,300 of 50 points, a tenth of a second for each patch.
+        generator: Source of the random sets. Default: always the same sets. Every patch gets the
+            same ones.
+        chunk_size: Patches worked on together; bounds the memory, never changes the result.
+
+    Returns:
+        The fits; ``log_det`` is that of the ellipsoid that just covers h points, and
+        ``raw_support`` are these. The raw covariance is scaled to be consistent at the normal.
+
+    Raises:
+        ShapeError: If a shape, dtype or device is not as above.
+        ConfigError: If a setting is out of range.
+
+    References:
+        [1] P. J. Rousseeuw, A. M. Leroy. Robust Regression and Outlier Detection, chapter 7.
+        Wiley, 1987.
+
+    Example:
+        >>> points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+        >>> points[:, 2] *= 0.01
+        >>> points[:20, 2] += 1.0
+        >>> fit_mve(points).support[:20].any().item()
+        False
+    """
+    if num_starts < 1:
+        raise ConfigError(f"fit_mve: expected num_starts of at least 1, got {num_starts!r}.")
+    seed = draw_seed(generator)
+
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+        num_points, num_coordinates = len(columns[0]), len(columns)
+        corners = num_coordinates + 1
+        number = comb(num_points, corners) if exhaustive else num_starts
+        sets = elemental_sets(num_points, corners, number, seed).to(floor.device)
+        best, chosen = _smallest_ellipsoid(columns, sets, floor, size)
+        weights = torch.zeros_like(columns[0]).scatter_(0, sets[chosen].t(), 1.0)
+        ellipsoid = fit_ellipsoid(columns, weights, corners, floor)
+        distances = sq_distances(ellipsoid, num_coordinates)
+        covered = smallest_points(distances, size)
+        reach = sorted_points(distances)[:, size - 1]
+        if size < num_points:
+            factor = reach / chi2_quantile(size / num_points, num_coordinates)
+        else:
+            factor = reach / chi2_quantile(quantile, num_coordinates)
+        distances = distances / factor
+        final = reweight(columns, distances, quantile)
+        covariance = covariance_entries(columns, ellipsoid.means, weights, num_coordinates)
+        return Estimate(
+            location=final.location,
+            covariance=final.covariance,
+            support=final.support,
+            sq_distances=distances,
+            raw_location=join_columns(ellipsoid.means),
+            raw_covariance=covariance * factor[:, None, None],
+            raw_support=covered > 0,
+            objective=best,
+            singular=ellipsoid.singular,
+        )
+
+    return fit_patchwise("fit_mve", patches, mask, support_fraction, chunk_size, estimator)
+
+
+def _smallest_ellipsoid(
+    columns: list[Tensor], sets: Tensor, floor: Tensor, size: int
+) -> tuple[Tensor, Tensor]:
+    """Determinant of the smallest ellipsoid of each lane, float64, and the set it comes from."""
+    num_points, num_lanes = columns[0].shape
+    num_coordinates = len(columns)
+    best = torch.full_like(floor, torch.inf, dtype=torch.float64)
+    chosen = torch.zeros_like(best, dtype=torch.int64)
+    step = max(1, _LANES_AT_ONCE // num_lanes)
+    wide = [column.repeat(1, step) for column in columns]
+    floors = floor.repeat(step)
+    for first in range(0, len(sets), step):
+        some = sets[first : first + step]
+        marks = columns[0].new_zeros(len(some), num_points).scatter_(1, some, 1.0)
+        weights = marks.t()[:, :, None].expand(-1, -1, num_lanes).reshape(num_points, -1)
+        lanes = len(some) * num_lanes
+        points = [column[:, :lanes] for column in wide]
+        ellipsoid = fit_ellipsoid(points, weights, num_coordinates + 1, floors[:lanes])
+        value = determinant(ellipsoid, num_coordinates)
+        reach = sorted_points(sq_distances(ellipsoid, num_coordinates))[:, size - 1].double()
+        for _ in range(num_coordinates):
+            value = value * reach
+        value = value.reshape(len(some), num_lanes)
+        index = value.argmin(dim=0)
+        least = value.gather(0, index[None]).squeeze(0)
+        better = least < best
+        best = torch.where(better, least, best)
+        chosen = torch.where(better, first + index, chosen)
+    return best, chosen
