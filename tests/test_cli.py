@@ -119,6 +119,7 @@ def mistakes(tmp_path, room):
     np.savez(tmp_path / "pickled.npz", points=np.array([{"a": 1}], dtype=object))
     np.save(tmp_path / "nan.npy", np.full((100, 3), np.nan, dtype=np.float32))
     (tmp_path / "wrong.yaml").write_text("growing: {max_angle: 3}\n")
+    (tmp_path / "short.xlsx").write_text("x")
     (tmp_path / "folder.pcd").mkdir()
     return tmp_path
 
@@ -128,12 +129,12 @@ def mistakes(tmp_path, room):
     [
         ("none.pcd", [], "none.pcd"),
         ("folder.pcd", [], "directory"),
-        ("room.xlsx", [], "suffix"),
+        ("short.xlsx", [], "ends in one of"),
         ("short.pcd", [], "short.pcd"),
         ("short.ply", [], "short.ply"),
         ("huge.pcd", [], "huge.pcd"),
         ("fields.pcd", [], "x, y"),
-        ("empty.pcd", [], "no points"),
+        ("empty.pcd", [], "expected at least one point"),
         ("pickled.npz", [], "pickle"),
         ("nan.npy", [], "finite"),
         ("ROOM", ["--preset", "clasic"], "classic, consensus"),
@@ -159,7 +160,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(
 
 @pytest.mark.parametrize(
     ("out", "message"),
-    [("seg.docx", "suffix"), ("no/such/seg.npz", "does not exist"), ("folder.pcd/x.npz", None)],
+    [("seg.docx", "ends in one of"), ("no/such/seg.npz", "does not exist"), ("folder.pcd/x.npz", None)],
 )
 def test_the_output_is_checked_before_the_work(mistakes, room, monkeypatch, capsys, out, message):
     monkeypatch.chdir(mistakes)

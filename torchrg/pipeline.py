@@ -57,7 +57,7 @@ def segment_planes(
     rows = finite_rows(tensor)
     cloud = tensor[rows]
     if len(cloud) == 0:
-        neighbors = Neighbors(torch.empty(0, 0, dtype=torch.int32, device=cloud.device))
+        neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=cloud.device))
     else:
         neighbors = search_knn(cloud, min(config.normals.k, len(cloud)), canonical=True)
 

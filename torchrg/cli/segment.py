@@ -13,7 +13,7 @@ from tqdm import tqdm
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
 from torchrg.cli.provenance import describe_run
 from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
-from torchrg.errors import ConfigError, TorchrgError
+from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud, Segmentation
@@ -105,8 +105,14 @@ def _segment_file(source: Path, target: Path, settings: PipelineConfig) -> None:
 
 
 def _check_points(cloud: Cloud) -> None:
-    """Warn of points that cannot be used."""
+    """Warn of points that cannot be used.
+
+    Raises:
+        FormatError: If no point can be used.
+    """
     num_bad = len(cloud) - int(cloud.finite.sum())
+    if num_bad == len(cloud):
+        raise FormatError(f"{cloud.source}: expected finite points, got none in {num_bad:,} points.")
     if num_bad:
         warn(
             f"{cloud.source}: {num_bad:,} of {len(cloud):,} points are not finite; they stay in "
