@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.robust.lanes import smallest_points, sum_points
+from torchrg.robust.lanes import smallest_points, sum_points, take_lanes
 from torchrg.robust.scatter import determinant, fit_ellipsoid, sq_distances
 
 MAX_STEPS = 100
@@ -58,31 +58,28 @@ def concentrate(
     members = initial.reshape(num_points, -1)
     ellipsoid = fit_ellipsoid(points, members, initial_size, floors)
     members = smallest_points(sq_distances(ellipsoid, initial_size - 1), size)
-    final, best = members, torch.full_like(floors, torch.inf, dtype=torch.float64)
-    places = torch.arange(num_starts * num_lanes, device=floor.device)
-    previous = best
+    final = torch.empty_like(members)
+    best = torch.full_like(floors, torch.inf, dtype=torch.float64)
+    places, previous = torch.arange(len(floors), device=floor.device), best
     for step in range(max_steps + 1):
         ellipsoid = fit_ellipsoid(points, members, size, floors)
         value = determinant(ellipsoid, size - 1)
-        # Rounding may let the determinant grow, or two sets of tied points follow each other.
-        better = value < previous
         candidate = smallest_points(sq_distances(ellipsoid, size - 1), size)
-        moving = better & (sum_points(candidate * members) < size)
+        # Rounding may let the determinant grow, or two sets of tied points follow each other.
+        settled = (sum_points(candidate * members) >= size) | ~(value < previous)
         if step == 0:
-            final = members.clone()
-            fresh = ~_repeats(ellipsoid.means, value, num_starts, num_lanes)
-            value = torch.where(fresh, value, torch.inf)
-            moving &= fresh
-            best = value.clone()
-        else:
-            final[:, places[better]] = members[:, better]
-            best[places[better]] = value[better]
-        chosen = torch.nonzero(moving).squeeze(1)
-        if len(chosen) == 0 or step == max_steps:
+            repeats = _repeats(ellipsoid.means, value, num_starts, num_lanes)
+            value = torch.where(repeats, torch.inf, value)
+            settled |= repeats
+        if step == max_steps:
+            settled |= True
+        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+        final.index_copy_(1, places[done], members.index_select(1, done))
+        best[places[done]] = value[done]
+        if len(moving) == 0:
             break
-        points = [column[:, chosen] for column in points]
-        floors, places, previous = floors[chosen], places[chosen], value[chosen]
-        members = candidate[:, chosen]
+        points, members = take_lanes(points, moving), candidate.index_select(1, moving)
+        floors, places, previous = floors[moving], places[moving], value[moving]
     shape = (num_starts, num_lanes)
     return Concentrated(final.reshape(num_points, *shape), best.reshape(shape), size)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.robust.lanes import eigenvectors, sum_points, sum_squares
+from torchrg.robust.lanes import eigenvectors, sum_points, sum_squares, take_lanes
 from torchrg.robust.scatter import covariance_entries
 
 NUM_SIMPLICES = 128
@@ -79,7 +79,7 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
         found = _majorities(columns, origins, axes, candidates, reach, size)
         if len(found.lanes):
-            lanes = [column[:, found.lanes] for column in columns]
+            lanes = take_lanes(columns, found.lanes)
             on_flat = refine_flat(lanes, found.members, tolerance[found.lanes], len(axes))
             kept = on_flat.sum(dim=0) >= size
             dimension[found.lanes[kept]] = len(axes)
@@ -116,8 +116,8 @@ def _majorities(
     simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
     lane = open_lanes[place]
     offsets = [
-        column[:, lane] - origin[simplex, lane]
-        for column, origin in zip(columns, origins, strict=True)
+        points - origin[simplex, lane]
+        for points, origin in zip(take_lanes(columns, lane), origins, strict=True)
     ]
     across = _reject(offsets, [[part[simplex, lane] for part in axis] for axis in axes])
     near = sum_squares(across) <= reach[simplex, lane] ** 2

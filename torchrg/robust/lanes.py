@@ -23,6 +23,11 @@ def join_columns(columns: list[Tensor]) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
+def take_lanes(columns: list[Tensor], lanes: Tensor) -> list[Tensor]:
+    """Take the given lanes of each ``(K, M)``; much faster than ``column[:, lanes]``."""
+    return [column.index_select(1, lanes) for column in columns]
+
+
 def sum_points(values: Tensor) -> Tensor:
     """Sum each lane of ``(K, *)`` over its points, in the same order for every lane."""
     if values.device.type == "cpu":
@@ -77,7 +82,7 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
     tied = torch.nonzero(rows[:, size] == bound).squeeze(1)
     if len(tied):
         # A threshold alone would mark too many, and C-steps on such subsets can cycle.
-        lanes, limit = distances[:, tied], bound[tied]
+        (lanes,), limit = take_lanes([distances], tied), bound[tied]
         below, level = (lanes < limit).to(lanes.dtype), (lanes == limit).to(lanes.dtype)
         room = size - sum_points(below)
         marked[:, tied] = below + level * (level.cumsum(dim=0) <= room)

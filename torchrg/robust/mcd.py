@@ -125,7 +125,7 @@ def finish_mcd(
     """Take the best set of each lane as raw fit, and reweight by the distances to it."""
     best = sets.determinants.argmin(dim=0)
     lanes = torch.arange(len(best), device=best.device)
-    members = sets.members[:, best, lanes]
+    members = sets.members.gather(1, best.expand(len(sets.members), 1, -1)).squeeze(1)
     num_points, num_coordinates = len(members), len(columns)
     size = sets.size
     raw_factor = consistency_factor(size / num_points, num_coordinates)

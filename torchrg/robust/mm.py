@@ -17,7 +17,14 @@ from torchrg.robust.bisquare import (
 )
 from torchrg.robust.differences import half_size
 from torchrg.robust.estimate import Estimate
-from torchrg.robust.lanes import indicator, join_columns, median_points, smallest_points, sum_points
+from torchrg.robust.lanes import (
+    indicator,
+    join_columns,
+    median_points,
+    smallest_points,
+    sum_points,
+    take_lanes,
+)
 from torchrg.robust.mcd import Starts, check_starts, initial_sets
 from torchrg.robust.patchwise import fit_patchwise
 from torchrg.robust.result import RobustFit
@@ -48,7 +55,7 @@ def fit_dets(
     *,
     quantile: float = 0.975,
     starts: Starts = "robustbase",
-    chunk_size: int = 256,
+    chunk_size: int = 512,
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic S-estimator.
 
@@ -100,7 +107,7 @@ def fit_detmm(
     quantile: float = 0.975,
     tuned_for: Target = "shape",
     starts: Starts = "robustbase",
-    chunk_size: int = 256,
+    chunk_size: int = 512,
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic MM-estimator.
 
@@ -181,7 +188,9 @@ def _best_s_estimate(
     weights = torch.cat(
         [shape.weights.reshape(num_points, -1, num_lanes) for shape in shapes], dim=1
     )
-    return _shape_of(columns, weights[:, best, lane], floor), scale[best, lane]
+    return _shape_of(
+        columns, weights.gather(1, best.expand(num_points, 1, -1)).squeeze(1), floor
+    ), scale[best, lane]
 
 
 def _iterate(
@@ -214,16 +223,17 @@ def _iterate(
             continue
         change = sum_points((current - previous).abs())
         settled = change <= enough * sum_points(current)
-        done = settled | (step == MAX_STEPS)
-        weights[:, places[done]] = current[:, done]
-        scales[places[done]] = scale[done]
-        moving = torch.nonzero(~done).squeeze(1)
-        if len(moving) == 0:
-            break
-        if len(moving) < len(places):
-            points = [column[:, moving] for column in points]
+        if step == MAX_STEPS:
+            settled |= True
+        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+        if len(done):
+            weights.index_copy_(1, places[done], current.index_select(1, done))
+            scales[places[done]] = scale[done]
+            if len(moving) == 0:
+                break
+            points = take_lanes(points, moving)
             places, scale, floors = places[moving], scale[moving], floors[moving]
-            distances, current = distances[:, moving], current[:, moving]
+            distances, current = take_lanes([distances, current], moving)
         previous = current
     return _shape_of(columns, weights, floor), scales
 

@@ -12,7 +12,7 @@ from torchrg.errors import ConfigError
 from torchrg.robust.chunks import chunks_of, run_chunks
 from torchrg.robust.estimate import Estimate
 from torchrg.robust.flats import find_flats, flatness_tolerance, refine_flat
-from torchrg.robust.lanes import join_columns, median_points, split_columns, sum_points
+from torchrg.robust.lanes import join_columns, median_points, split_columns, sum_points, take_lanes
 from torchrg.robust.result import RobustFit, no_fit
 from torchrg.robust.scatter import covariance_entries
 from torchrg.robust.weights import subset_size
@@ -143,7 +143,7 @@ def _fit_chunk(
     out = no_fit(torch.Size([num_patches]), num_points, size, patches)
 
     def lanes_of(rows: Tensor) -> list[Tensor]:
-        return columns if len(rows) == num_patches else [column[:, rows] for column in columns]
+        return columns if len(rows) == num_patches else take_lanes(columns, rows)
 
     regular = torch.nonzero(flats.dimension == size).squeeze(1)
     if len(regular):

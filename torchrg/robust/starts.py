@@ -88,7 +88,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
         [
             _correlation([_tanh(column) for column in columns]),
             _correlation([rank.to(norms.dtype) for rank in ranks]),
-            _correlation([scores[rank] for rank in ranks]),
+            _correlation([torch.take(scores, rank) for rank in ranks]),
             covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
             covariance_entries(columns, inner, half, 1.0),
             _pairwise_qn(columns),
