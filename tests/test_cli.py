@@ -47,7 +47,7 @@ def test_result_holds_what_the_contract_says(room, tmp_path):
         num_planes = len(result["plane_count"])
         assert result["labels"].max() == num_planes - 1
         on_plane = np.einsum("ij,ij->i", result["plane_normal"], result["plane_centroid"])
-        assert np.allclose(on_plane, result["plane_offset"], atol=1e-6)
+        assert (np.abs(on_plane - result["plane_offset"]) <= 2 * result["plane_rms"]).all()
     assert provenance["config"]["normals"]["method"] == "pca"
     assert set(provenance["versions"]) >= {"torchrg", "torch"}
 
@@ -160,7 +160,11 @@ def test_a_mistake_is_one_line_and_exit_code_2(
 
 @pytest.mark.parametrize(
     ("out", "message"),
-    [("seg.docx", "ends in one of"), ("no/such/seg.npz", "does not exist"), ("folder.pcd/x.npz", None)],
+    [
+        ("seg.docx", "ends in one of"),
+        ("no/such/seg.npz", "there is no folder"),
+        ("folder.pcd/x.npz", None),
+    ],
 )
 def test_the_output_is_checked_before_the_work(mistakes, room, monkeypatch, capsys, out, message):
     monkeypatch.chdir(mistakes)

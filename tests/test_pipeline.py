@@ -71,12 +71,13 @@ def test_order_changes_nothing(room, config):
 
 
 def test_chunks_and_threads_change_nothing(room, config):
-    plain = segment_planes(room.points, config)
+    points = room.points[:3000]
+    plain = segment_planes(points, config)
     threads = torch.get_num_threads()
     try:
-        for chunk_size, num_threads in ((97, 1), (1024, 2), (100_000, 2)):
+        for chunk_size, num_threads in ((397, 1), (100_000, 2)):
             torch.set_num_threads(num_threads)
-            other = segment_planes(room.points, dataclasses.replace(config, chunk_size=chunk_size))
+            other = segment_planes(points, dataclasses.replace(config, chunk_size=chunk_size))
             assert torch.equal(other.labels, plain.labels)
             assert torch.equal(other.normals, plain.normals)
             assert torch.equal(other.curvature, plain.curvature)
