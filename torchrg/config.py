@@ -79,6 +79,21 @@ class GrowingConfig:
     does not join. None: not tested."""
     min_size: int = 50
     """Smaller regions are not labelled."""
+    max_plane_residual: float | None = None
+    """After growth, points farther from the plane of their region than this many times its
+    thickness lose their label. None: they keep it."""
+    absorb: bool = False
+    """Whether points without a region, those of regions that are too small included, then join a
+    flat region that they touch and whose plane they are on."""
+    absorb_reach: float = 3.0
+    """They are on it when they are within this many times its thickness."""
+    absorb_angle_deg: float = 30.0
+    """And when their normal is within this angle of the plane's."""
+    merge_coplanar: bool = False
+    """Whether flat regions that touch and lie on one plane then become one."""
+    merge_tolerance: float = 1.2
+    """They lie on one plane when neither is thicker about it than this many times what it is about
+    its own."""
 
     def __post_init__(self) -> None:
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
@@ -90,6 +105,11 @@ class GrowingConfig:
             value = getattr(self, name)
             _require(self, name, ">= 0 or none", value is None or value >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
+        residual = self.max_plane_residual
+        _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
+        _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
+        _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
+        _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
     @property
     def is_order_free(self) -> bool:

@@ -25,6 +25,7 @@ class FittedPlanes(NamedTuple):
         normal: Unit normals, shape ``(M, 3)``.
         center: A point of each plane, the weighted mean, shape ``(M, 3)``.
         along: Unit direction of largest variance in the plane, shape ``(M, 3)``.
+        covariance: Weighted covariance, shape ``(M, 3, 3)``.
         thickness: Robust standard deviation of the points from the plane, shape ``(M,)``.
         residuals: Signed distance of each point, in the order of :meth:`Segments.take`.
     """
@@ -32,6 +33,7 @@ class FittedPlanes(NamedTuple):
     normal: Tensor
     center: Tensor
     along: Tensor
+    covariance: Tensor
     thickness: Tensor
     residuals: Tensor
 
@@ -70,7 +72,8 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         mean = _means(segments, local, weights)
         middle = segments.spread_columns(mean)
         centered = [x - m for x, m in zip(local, middle, strict=True)]
-        variances, axes = eigh3(_covariances(segments, centered, weights))
+        covariance = _covariances(segments, centered, weights)
+        variances, axes = eigh3(covariance)
         normal = _with_sign(_plane_normals(variances, axes, usual))
         residuals = sum_of_products(centered, segments.spread_columns(normal))
         thickness = MAD_FACTOR * segments.median(residuals.abs())
@@ -80,7 +83,8 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         # A region of one place at the origin has cut 0: its residuals are 0 too.
         ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
-    return FittedPlanes(normal, origin + mean, axes[:, :, 2], thickness, residuals)
+    along = axes[:, :, 2]
+    return FittedPlanes(normal, origin + mean, along, covariance, thickness, residuals)
 
 
 def sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:

@@ -13,6 +13,7 @@ from torchrg.regions.components import claim_leftovers, first_to_reach
 from torchrg.regions.edges import EdgeFinder, GrowingCloud
 from torchrg.regions.frontier import grow_in_turn
 from torchrg.regions.graph import pack_edges
+from torchrg.regions.refine import refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 
@@ -86,9 +87,16 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    heads = _grow(cloud, config, chunk_size)
-    labels = torch.from_numpy(number_by_size(heads, config.min_size)).to(device)
+    labels = _labels(_grow(cloud, config, chunk_size), config.min_size, device)
+    refined = refine_regions(cloud, labels, config)
+    if refined is not labels:
+        labels = _labels(refined.cpu().numpy(), config.min_size, device)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+
+
+def _labels(heads: NDArray[np.integer], min_size: int, device: torch.device) -> Tensor:
+    """Return the numbers of regions as a tensor."""
+    return torch.from_numpy(number_by_size(heads, min_size)).to(device)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
@@ -110,7 +118,7 @@ def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
 
 
-def number_by_size(heads: NDArray[np.int32], min_size: int) -> NDArray[np.int64]:
+def number_by_size(heads: NDArray[np.integer], min_size: int) -> NDArray[np.int64]:
     """Number regions by descending size, those of equal size by their first point.
 
     Args:
@@ -133,7 +141,8 @@ def number_by_size(heads: NDArray[np.int32], min_size: int) -> NDArray[np.int64]
     # The last entry is what a head of -1 finds.
     numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int64)
     numbers[kept] = np.arange(len(kept))
-    return numbers[heads]
+    labels: NDArray[np.int64] = numbers[heads]
+    return labels
 
 
 def _checked_cloud(

@@ -72,8 +72,25 @@ def summarize_planes(
         extent=own(boxes.sides),
         axes=own(axes),
         center=own(fit.center + (boxes.center[:, None] @ axes).squeeze(1)),
-        curved=normal_spread_deg(segments, normals) > _CURVED_SPREAD_DEG,
+        curved=are_curved(segments, normals),
     )
+
+
+def are_curved(segments: Segments, normals: Tensor) -> Tensor:
+    """Tell regions whose normals turn from flat ones.
+
+    Args:
+        segments: The regions.
+        normals: Unit normals, shape ``(N, 3)``.
+
+    Returns:
+        Shape ``(M,)``, bool.
+
+    Example:
+        >>> are_curved(Segments(torch.tensor([0, 0, 1])), torch.eye(3))
+        tensor([ True, False])
+    """
+    return normal_spread_deg(segments, normals) > _CURVED_SPREAD_DEG
 
 
 def normal_spread_deg(segments: Segments, normals: Tensor) -> Tensor:
