@@ -1,0 +1,196 @@
+"""Pinhole cameras that show a whole cloud; kornia holds them and projects."""
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
+_MARGIN = 0.03  # of the picture on each side
+
+
+def make_camera(
+    world_to_camera: Tensor, focal: float, center: tuple[float, float], width: int, height: int
+) -> "PinholeCamera":
+    """Return a camera of square pixels.
+
+    Args:
+        world_to_camera: Rigid transform to x right, y down, z forward, shape ``(4, 4)``.
+        focal: Focal length in pixels.
+        center: Column and row of the principal point; whole numbers are pixel centres.
+        width: Of the picture.
+        height: Of the picture.
+
+    Returns:
+        A batch of one camera, float64.
+
+    Example:
+        >>> camera = make_camera(torch.eye(4), 500.0, (319.5, 239.5), 640, 480)
+        >>> camera.project(torch.tensor([[[0.5, 0.0, 1.0]]]).double()).tolist()
+        [[[569.5, 239.5]]]
+    """
+    from kornia.geometry.camera import PinholeCamera
+
+    intrinsics = torch.eye(4, dtype=torch.float64)
+    intrinsics[0, 0] = intrinsics[1, 1] = focal
+    intrinsics[0, 2], intrinsics[1, 2] = center
+    size = torch.tensor([height]), torch.tensor([width])
+    return PinholeCamera(intrinsics[None], world_to_camera.double()[None], *size)
+
+
+def view_axes(toward: Tensor, up: Tensor) -> Tensor:
+    """Return the axes right, down, forward of a camera.
+
+    Args:
+        toward: Direction from the scene to the camera, shape ``(3,)``.
+        up: Direction that is up in the picture, not parallel to ``toward``, shape ``(3,)``.
+
+    Returns:
+        Unit vectors as rows, shape ``(3, 3)``, float64.
+
+    Example:
+        >>> view_axes(torch.tensor([0.0, -1, 0]), torch.tensor([0.0, 0, 1])).abs().tolist()
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    """
+    forward = -torch.nn.functional.normalize(toward.double(), dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
+def fit_camera(
+    points: Tensor,
+    axes: Tensor,
+    *,
+    width: int,
+    height: int | None = None,
+    field_of_view_deg: float = 30.0,
+) -> "PinholeCamera":
+    """Return the nearest camera of given axes that has all points in its picture.
+
+    A point at ``(x, y, z)`` along the axes is in the picture of a camera at ``(a, b, -d)`` if
+    ``|x - a| <= t (d + z)`` with t the tangent of half the angle of view: the largest ``x - t z``
+    and ``-x - t z`` give a and d in closed form.
+
+    Args:
+        points: What to show, shape ``(N, 3)``, finite.
+        axes: Right, down and forward, shape ``(3, 3)``.
+        width: Of the picture, in pixels.
+        height: Of the picture. Default: what the points need, from a quarter of the width to all
+            of it.
+        field_of_view_deg: Angle over the width; or over the height, if that is larger.
+
+    Returns:
+        The camera. If all points are in one place, it looks at it from a distance of 1.
+    """
+    wide = math.tan(math.radians(field_of_view_deg) / 2) * (1 - 2 * _MARGIN)
+    tangents = [wide, wide]
+    if height is not None:
+        tangents = [wide * width / max(width, height), wide * height / max(width, height)]
+    across = points.double() @ axes.to(points.device).T
+    reach = [_reach(across[:, axis], across[:, 2], tangents[axis]) for axis in (0, 1)]
+    spans = [sum(pair) for pair in reach]
+    if height is None:
+        part = spans[1] / spans[0] if spans[0] > 0 else 1.0
+        rows = round(width * min(max(part, 0.25), 1.0))
+        return fit_camera(
+            points, axes, width=width, height=rows, field_of_view_deg=field_of_view_deg
+        )
+    low, high = _bounds(across[:, 2])
+    distance = max(
+        *(span / (2 * t) for span, t in zip(spans, tangents, strict=True)), high - 2 * low
+    )
+    middle = [(pair[0] - pair[1]) / 2 for pair in reach]
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = axes
+    matrix[:3, 3] = torch.tensor([-middle[0], -middle[1], distance if distance > 0 else 1.0])
+    focal = max(width, height) / 2 / math.tan(math.radians(field_of_view_deg) / 2)
+    return make_camera(matrix, focal, ((width - 1) / 2, (height - 1) / 2), width, height)
+
+
+def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "PinholeCamera":
+    """Return a camera in the origin that looks along z, x to the right and y down.
+
+    Args:
+        points: What to show, shape ``(N, 3)``, finite; points behind the camera do not count.
+        width: Of the picture, in pixels.
+        height: Of the picture. Default: what the points need, from a quarter of the width to all
+            of it.
+
+    Returns:
+        The camera.
+    """
+    ahead = points[points[:, 2] > 0].double()
+    bounds = [_bounds(ahead[:, axis] / ahead[:, 2]) for axis in (0, 1)]
+    spans = [high - low for low, high in bounds]
+    if height is None:
+        part = spans[1] / spans[0] if spans[0] > 0 else 1.0
+        height = round(width * min(max(part, 0.25), 1.0))
+    scales = [size / span for size, span in zip((width, height), spans, strict=True) if span > 0]
+    focal = min(scales) * (1 - 2 * _MARGIN) if scales else float(width)
+    center = [
+        (size - 1) / 2 - focal * (low + high) / 2
+        for size, (low, high) in zip((width, height), bounds, strict=True)
+    ]
+    return make_camera(torch.eye(4), focal, (center[0], center[1]), width, height)
+
+
+class Projection(NamedTuple):
+    """How a camera maps points about an origin to pixels.
+
+    Attributes:
+        local_to_camera: Shape ``(1, 4, 4)``.
+        intrinsics: Shape ``(3, 3)``.
+    """
+
+    local_to_camera: Tensor
+    intrinsics: Tensor
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return float(self.intrinsics[0, 0])
+
+    def __call__(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions ``(N, 3)`` in the camera's axes, and pixels ``(N, 2)``."""
+        from kornia.geometry.camera import project_points
+        from kornia.geometry.linalg import transform_points
+
+        positions = transform_points(self.local_to_camera, points[None])[0]
+        return positions, project_points(positions, self.intrinsics)
+
+
+def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Projection:
+    """Return the projection of a camera onto a picture of ``finer`` times as many pixels a side.
+
+    Args:
+        camera: A batch of one.
+        origin: Of the points that will be projected, shape ``(3,)``; taken in float64, so that
+            clouds far from zero keep their precision.
+        finer: Pixels along the side of each pixel of the camera.
+
+    Returns:
+        The projection, float32.
+    """
+    intrinsics = camera.intrinsics[0, :3, :3].double().clone()
+    intrinsics[:2] *= finer
+    intrinsics[:2, 2] += (finer - 1) / 2
+    matrix = camera.extrinsics[:1].double().clone()
+    matrix[0, :3, 3] += matrix[0, :3, :3] @ origin.to(matrix)
+    return Projection(matrix.to(origin.device).float(), intrinsics.to(origin.device).float())
+
+
+def _reach(across: Tensor, forward: Tensor, tangent: float) -> tuple[float, float]:
+    """Return the largest ``x - t z`` and ``-x - t z``."""
+    spread = forward * tangent
+    return _bounds(across - spread)[1], _bounds(-across - spread)[1]
+
+
+def _bounds(values: Tensor) -> tuple[float, float]:
+    """Return the smallest and the largest value, or zeros if there are none."""
+    if len(values) == 0:
+        return 0.0, 0.0
+    low, high = values.aminmax()
+    return float(low), float(high)
