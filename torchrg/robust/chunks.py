@@ -1,9 +1,13 @@
 """Work on many rows in chunks that fit the cache, on as many threads as torch may use."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from threading import Lock
 
 import torch
+
+_KEPT_BYTES = 31 * 2**20
 
 
 def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
@@ -19,25 +23,49 @@ def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
 
 
 def run_chunks(
-    work: Callable[[slice], None], chunks: Sequence[slice], device: torch.device
+    work: Callable[[Iterator[slice]], None], chunks: Sequence[slice], device: torch.device
 ) -> None:
-    """Call ``work`` on each chunk, on a CPU on ``torch.get_num_threads()`` threads.
+    """Call ``work`` on the chunks, on a CPU on ``torch.get_num_threads()`` threads.
 
-    Threads that each take whole chunks need no synchronisation between operations, which costs
-    more than the operations themselves on tensors that fit the cache. Every chunk writes its own
-    rows, so the result does not depend on the number of threads.
+    ``work`` takes chunks from the iterator it is given until there are none left; it may keep
+    buffers from one to the next. Threads that each take whole chunks need no synchronisation
+    between operations, which costs more than the operations themselves on tensors that fit the
+    cache. Every chunk writes its own rows, so the result does not depend on the number of threads.
     """
-    num_threads = torch.get_num_threads()
-    if device.type != "cpu" or num_threads < 2 or len(chunks) < 2:
-        for chunk in chunks:
-            work(chunk)
+    _keep_freed_memory()
+    num_threads = min(torch.get_num_threads(), len(chunks))
+    if device.type != "cpu" or num_threads < 2:
+        work(iter(chunks))
         return
+    shared, setting = _Shared(chunks), torch.get_num_threads()
     try:
         with ThreadPoolExecutor(
-            min(num_threads, len(chunks)), initializer=torch.set_num_threads, initargs=(1,)
+            num_threads, initializer=torch.set_num_threads, initargs=(1,)
         ) as pool:
-            for _ in pool.map(work, chunks):
+            for _ in pool.map(work, [shared] * num_threads):
                 pass
     finally:
         # The initializer changed the default that later threads start with.
-        torch.set_num_threads(num_threads)
+        torch.set_num_threads(setting)
+
+
+class _Shared(Iterator[slice]):
+    """One iterator over chunks for several threads."""
+
+    def __init__(self, chunks: Sequence[slice]) -> None:
+        self._chunks, self._lock = iter(chunks), Lock()
+
+    def __next__(self) -> slice:
+        with self._lock:
+            return next(self._chunks)
+
+
+@lru_cache(maxsize=1)
+def _keep_freed_memory() -> None:
+    """Free one large block, once: glibc then keeps what is freed instead of returning it.
+
+    Otherwise every temporary tensor of some hundred kilobytes is fetched from the system page by
+    page again, which costs a fifth of the time.
+    """
+    block = torch.empty(_KEPT_BYTES, dtype=torch.uint8)
+    del block

@@ -1,16 +1,15 @@
 """Order statistics of the pairwise differences of many short rows."""
 
+from collections.abc import Iterator
 from math import comb
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.robust.chunks import chunks_of, run_chunks
 
-_CHUNK_BYTES = 2**21
-"""Differences of one chunk; they are written once and read twice, so they should stay near."""
+_CHUNK_BYTES = 2**20
 _NETWORK = 512
 """Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions."""
 
@@ -33,19 +32,15 @@ def majority_difference(sorted_rows: Tensor) -> Tensor:
         The order statistic, shape ``(B,)``, exact; NaN where a row has one.
     """
     num_rows, n = sorted_rows.shape
-    rank, width = comb(half_size(n), 2), _num_lagged(n)
+    rank = comb(half_size(n), 2)
     out = sorted_rows.new_empty(num_rows)
-    pieces = -(-width // _NETWORK) if sorted_rows.element_size() == 4 else 0
-    padded = _NETWORK * pieces if pieces in (1, 2) and width > _NETWORK // 2 else width
 
-    def work(chunk: slice) -> None:
-        differences = _lagged_differences(sorted_rows[chunk], padded)
-        if differences.device.type == "cpu":
-            out.numpy()[chunk] = _select_row_wise(differences.numpy(), rank)
-        else:
-            out[chunk] = differences.kthvalue(rank, dim=1).values
+    def work(chunks: Iterator[slice]) -> None:
+        lagged = _Lagged(sorted_rows, paired=True)
+        for chunk in chunks:
+            out[chunk] = lagged.select(sorted_rows[chunk], rank)
 
-    run_chunks(work, _chunks(sorted_rows, padded), sorted_rows.device)
+    run_chunks(work, _chunks(sorted_rows), sorted_rows.device)
     out[sorted_rows[:, -1].isnan()] = torch.nan
     return out
 
@@ -60,62 +55,103 @@ def count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
     Returns:
         Counts, shape ``(B,)``, int32.
     """
-    num_rows, n = sorted_rows.shape
-    width = -(-_num_lagged(n) // 8) * 8
-    out = torch.empty(num_rows, dtype=torch.int32, device=sorted_rows.device)
+    out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
 
-    def work(chunk: slice) -> None:
-        differences = _lagged_differences(sorted_rows[chunk], width)
-        if differences.device.type == "cpu":
-            # Eight flags at a time: each byte of a sum counts up to 255 of them.
-            flags = np.less_equal(differences.numpy(), bound).view(np.uint64)
-            bytes_ = [flags[:, part].sum(axis=1).view(np.uint8) for part in _parts(width // 8)]
-            counts = np.concatenate([b.reshape(-1, 8) for b in bytes_], axis=1).sum(axis=1)
-            out.numpy()[chunk] = counts
-        else:
-            out[chunk] = (differences <= bound).sum(dim=1, dtype=torch.int32)
+    def work(chunks: Iterator[slice]) -> None:
+        lagged = _Lagged(sorted_rows, paired=False)
+        for chunk in chunks:
+            out[chunk] = lagged.count(sorted_rows[chunk], bound)
 
-    run_chunks(work, _chunks(sorted_rows, width), sorted_rows.device)
+    run_chunks(work, _chunks(sorted_rows), sorted_rows.device)
     return out
 
 
-def _select_row_wise(differences: NDArray[np.floating], rank: int) -> NDArray[np.floating]:
-    """The ``rank``-th smallest of each row; a row of one or two networks is overwritten."""
-    width = differences.shape[1]
-    if width not in (_NETWORK, 2 * _NETWORK) or rank > _NETWORK:
-        differences.partition(rank - 1, axis=1)
-        return differences[:, rank - 1]
-    for part in (slice(0, _NETWORK), slice(_NETWORK, width)):
-        differences[:, part].sort(axis=1)
-    if width == _NETWORK:
-        return differences[:, rank - 1]
-    # Of two sorted rows, min(a_i, b_(r-1-i)) are the r smallest values together.
-    low, high = differences[:, :rank], differences[:, _NETWORK : _NETWORK + rank]
-    selected: NDArray[np.floating] = np.minimum(low, high[:, ::-1]).max(axis=1)
-    return selected
+class _Lagged:
+    """A buffer for the differences at lags 1 to h - 1 of the rows of a chunk, side by side.
+
+    With ``paired``, differences that fill two sorting networks go to one each, those of the second
+    with their sign reversed.
+    """
+
+    def __init__(self, rows: Tensor, *, paired: bool) -> None:
+        n = rows.shape[1]
+        size = _chunk_size(rows)
+        lags = range(1, half_size(n))
+        width = sum(n - lag for lag in lags)
+        first = _fitting(n, _NETWORK)
+        self.on_cpu = rows.device.type == "cpu"
+        self.paired = (
+            paired
+            and self.on_cpu
+            and rows.element_size() == 4
+            and _NETWORK < width <= _NETWORK + sum(n - lag for lag in range(1, first + 1))
+            and sum(n - lag for lag in lags[first:]) <= _NETWORK
+        )
+        self.rows = rows.new_empty(size, n)
+        self.differences = rows.new_empty(size, 2 * _NETWORK if self.paired else -(-width // 8) * 8)
+        self._steps: list[tuple[Tensor, Tensor, Tensor]] = []
+        self._pads: list[tuple[Tensor, float]] = []
+        start = 0
+        for lag in lags:
+            if self.paired and lag == first + 1:
+                self._pads.append((self.differences[:, start:_NETWORK], torch.inf))
+                start = _NETWORK
+            near, far = self.rows[:, :-lag], self.rows[:, lag:]
+            out = self.differences[:, start : start + n - lag]
+            reverse = self.paired and lag > first
+            self._steps.append((near, far, out) if reverse else (far, near, out))
+            start += n - lag
+        self._pads.append((self.differences[:, start:], -torch.inf if self.paired else torch.inf))
+
+    def _fill(self, rows: Tensor) -> Tensor:
+        """Write the differences of up to a chunk of sorted rows."""
+        self.rows[: len(rows)] = rows
+        for minuend, subtrahend, out in self._steps:
+            torch.sub(minuend, subtrahend, out=out)
+        for pad, value in self._pads:
+            pad.fill_(value)
+        return self.differences[: len(rows)]
+
+    def select(self, rows: Tensor, rank: int) -> Tensor:
+        """The ``rank``-th smallest difference of each row."""
+        differences = self._fill(rows)
+        if self.paired:
+            differences.view(-1, _NETWORK).numpy().sort(axis=1)
+            # Of two ascending rows, min(a_i, b_(r-1-i)) are the r smallest values together.
+            mirrored = -differences[:, 2 * _NETWORK - rank :]
+            return torch.minimum(differences[:, :rank], mirrored).amax(dim=1)
+        if self.on_cpu:
+            differences.numpy().partition(rank - 1, axis=1)
+            return differences[:, rank - 1]
+        return differences.kthvalue(rank, dim=1).values
+
+    def count(self, rows: Tensor, bound: float) -> Tensor:
+        """The number of differences at or below ``bound`` of each row."""
+        differences = self._fill(rows)
+        if not self.on_cpu:
+            return (differences <= bound).sum(dim=1, dtype=torch.int32)
+        flags = np.less_equal(differences.numpy(), bound).view(np.uint64)
+        # Eight flags at a time: each byte of a sum counts up to 255 of them.
+        parts = [flags[:, part].sum(axis=1) for part in chunks_of(flags.shape[1], 255)]
+        counts = np.stack(parts, axis=1).view(np.uint8).sum(axis=1, dtype=np.int32)
+        return torch.from_numpy(counts)
 
 
-def _lagged_differences(rows: Tensor, width: int) -> Tensor:
-    """Differences of sorted ``rows`` at lags 1 to h - 1 side by side, then +inf up to ``width``."""
-    num_rows, n = rows.shape
-    differences = rows.new_empty(num_rows, width)
-    start = 0
-    for lag in range(1, half_size(n)):
-        stop = start + n - lag
-        torch.sub(rows[:, lag:], rows[:, :-lag], out=differences[:, start:stop])
-        start = stop
-    differences[:, start:] = torch.inf
-    return differences
+def _fitting(n: int, room: int) -> int:
+    """How many lags from 1 on have together no more differences than there is room for."""
+    lag = 0
+    while lag < half_size(n) - 1 and room >= n - lag - 1:
+        lag += 1
+        room -= n - lag
+    return lag
 
 
-def _num_lagged(n: int) -> int:
-    return sum(n - lag for lag in range(1, half_size(n)))
-
-
-def _chunks(rows: Tensor, width: int) -> list[slice]:
+def _chunk_size(rows: Tensor) -> int:
+    n = rows.shape[1]
+    width = max(2 * _NETWORK, sum(n - lag for lag in range(1, half_size(n))))
     scale = 1 if rows.device.type == "cpu" else 256
-    return chunks_of(len(rows), max(1, scale * _CHUNK_BYTES // (width * rows.element_size())))
+    return min(len(rows), max(1, scale * _CHUNK_BYTES // (width * rows.element_size()))) or 1
 
 
-def _parts(num_words: int) -> list[slice]:
-    return chunks_of(num_words, 255)
+def _chunks(rows: Tensor) -> list[slice]:
+    return chunks_of(len(rows), _chunk_size(rows))
