@@ -23,14 +23,28 @@ def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
 
 
 def run_chunks(
+    work: Callable[[slice], None], chunks: Sequence[slice], device: torch.device
+) -> None:
+    """Call ``work`` on each chunk, on a CPU on ``torch.get_num_threads()`` threads.
+
+    Threads that each take whole chunks need no synchronisation between operations, which costs
+    more than the operations themselves on tensors that fit the cache. Every chunk writes its own
+    rows, so the result does not depend on the number of threads.
+    """
+
+    def work_on_all(some: Iterator[slice]) -> None:
+        for chunk in some:
+            work(chunk)
+
+    share_chunks(work_on_all, chunks, device)
+
+
+def share_chunks(
     work: Callable[[Iterator[slice]], None], chunks: Sequence[slice], device: torch.device
 ) -> None:
-    """Call ``work`` on the chunks, on a CPU on ``torch.get_num_threads()`` threads.
+    """Call ``work`` once on each thread, with an iterator that hands out the chunks.
 
-    ``work`` takes chunks from the iterator it is given until there are none left; it may keep
-    buffers from one to the next. Threads that each take whole chunks need no synchronisation
-    between operations, which costs more than the operations themselves on tensors that fit the
-    cache. Every chunk writes its own rows, so the result does not depend on the number of threads.
+    As :func:`run_chunks`, for work that keeps buffers from one chunk to the next.
     """
     _keep_freed_memory()
     num_threads = min(torch.get_num_threads(), len(chunks))

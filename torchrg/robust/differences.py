@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.robust.chunks import chunks_of, run_chunks
+from torchrg.robust.chunks import chunks_of, share_chunks
 
 _CHUNK_BYTES = 2**20
 _NETWORK = 512
@@ -40,7 +40,7 @@ def majority_difference(sorted_rows: Tensor) -> Tensor:
         for chunk in chunks:
             out[chunk] = lagged.select(sorted_rows[chunk], rank)
 
-    run_chunks(work, _chunks(sorted_rows), sorted_rows.device)
+    share_chunks(work, _chunks(sorted_rows), sorted_rows.device)
     out[sorted_rows[:, -1].isnan()] = torch.nan
     return out
 
@@ -62,7 +62,7 @@ def count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
         for chunk in chunks:
             out[chunk] = lagged.count(sorted_rows[chunk], bound)
 
-    run_chunks(work, _chunks(sorted_rows), sorted_rows.device)
+    share_chunks(work, _chunks(sorted_rows), sorted_rows.device)
     return out
 
 

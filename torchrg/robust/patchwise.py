@@ -1,6 +1,6 @@
 """From patches of any shape to lanes and back: masks, units, exact planes, chunks, threads."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -73,22 +73,18 @@ def _fit_groups(
         rows = torch.nonzero(counts == count).squeeze(1)
 
         def work(
-            chunks: Iterator[slice],
-            rows: Tensor = rows,
-            whole: bool = count == num_points,
-            count: int = count,
+            chunk: slice, rows: Tensor = rows, whole: bool = count == num_points, count: int = count
         ) -> None:
-            for chunk in chunks:
-                chosen = rows[chunk]
-                block = patches[chosen]
-                if whole:
-                    _store(out, chosen, fit(block))
-                    continue
-                # The points that count move to the front, in their order.
-                order = torch.argsort((~counted[chosen]).to(torch.uint8), dim=1, stable=True)
-                order = order[:, :count]
-                block = block.gather(1, order[..., None].expand(-1, -1, size))
-                _store(out, chosen, _spread(fit(block), order, num_points))
+            chosen = rows[chunk]
+            block = patches[chosen]
+            if whole:
+                _store(out, chosen, fit(block))
+                return
+            # The points that count move to the front, in their order.
+            order = torch.argsort((~counted[chosen]).to(torch.uint8), dim=1, stable=True)
+            order = order[:, :count]
+            block = block.gather(1, order[..., None].expand(-1, -1, size))
+            _store(out, chosen, _spread(fit(block), order, num_points))
 
         run_chunks(work, chunks_of(len(rows), chunk_size), patches.device)
     return out
