@@ -34,9 +34,14 @@ class NormalsConfig:
     """Share of the neighbours that the MCD fits, in [0.5, 1]; 0.5 resists most outliers."""
     inlier_quantile: float = 0.975
     """Neighbours within this chi-square quantile of the robust fit are inliers."""
+    adaptive_k: int | None = None
+    """Largest number of neighbours that consensus may use in noisy clouds, where k are too few to
+    tell faces apart. None: always k."""
 
     def __post_init__(self) -> None:
         _require(self, "k", ">= 3", self.k >= 3)
+        most = self.adaptive_k
+        _require(self, "adaptive_k", ">= k or none", most is None or most >= self.k)
         _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
         _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from torchrg.linalg import covariance
 from torchrg.neighbors import gather_patches
+from torchrg.normals.blocks import each_block
 from torchrg.normals.chunks import coordinate_resolution
 from torchrg.normals.columns import fit_planes, residuals, split_columns, sq_lengths
-from torchrg.robust.chunks import chunks_of, run_chunks
 from torchrg.structures import Neighbors, NormalFit
 
+_BLOCK = 8192
 _QUANTILE = 0.35
 _NARROW = 0.03
 
@@ -24,7 +25,7 @@ class _Size(NamedTuple):
     Attributes:
         num_points: Number of neighbours.
         factor: Noise by the 35th percentile of the deviations, on a plane with little noise.
-        limit: What that tends to, by the radius of the whole neighbourhood, as noise grows.
+        limit: What that tends to as noise grows, by the radius that so many points of a plane have.
     """
 
     num_points: int
@@ -32,7 +33,7 @@ class _Size(NamedTuple):
     limit: float
 
 
-_SMALL_SIZES = (_Size(8, 1.22, 0.137), _Size(16, 1.1, 0.225))
+_SMALL_SIZES = (_Size(8, 1.22, 0.3425), _Size(16, 1.1, 0.398))
 _WHOLE_FACTOR = 1.04
 
 
@@ -61,10 +62,11 @@ def survey_noise(
     The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
     points lie on one smooth face, and more elsewhere. Small neighbourhoods do so more often, so the
     estimate is the least of three, for m = 8, 16 and all neighbours, of
-    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R))^2)``, where ``q`` is the 35th percentile
+    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``, where ``q`` is the 35th percentile
     over the neighbours, ``c_m`` the factor that makes it unbiased for a plane, and the root undoes
-    that a plane of few points turns with their noise (``R``: radius of the neighbourhood, ``a_m``:
-    measured on noisy planes). Neighbourhoods almost on one line, as on scan lines, do not count.
+    that a plane of few points turns with their noise (``R_m = R (m / K)^(1/2)``: their radius, from
+    that of all; ``a_m``: measured on noisy planes). Neighbourhoods almost on one line, as on scan
+    lines, do not count.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -86,17 +88,23 @@ def survey_noise(
         >>> bool((survey.noise.median() - 0.01).abs() < 0.001)
         True
     """
-    parts = [
-        _deviations(points, neighbors, fit, block) for block in chunks_of(len(points), chunk_size)
-    ]
-    offsets, radius, whole, *small = (torch.cat(rows) for rows in zip(*parts, strict=True))
+    offsets, radius, whole = (torch.empty_like(points[:, 0]) for _ in range(3))
+    small = [torch.empty_like(whole) for _ in _SMALL_SIZES]
+
+    def work(block: slice) -> None:
+        found = _deviations(points, neighbors, fit, block)
+        for values, part in zip((offsets, radius, whole, *small), found, strict=True):
+            values[block] = part
+
+    each_block(work, len(points), chunk_size, points.device)
     floor = torch.maximum(
         coordinate_resolution(points), radius * (4 * torch.finfo(points.dtype).eps)
     )
     noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors)
     for size, values in zip(_SMALL_SIZES, small, strict=True):
         found = size.factor * _neighbor_quantiles(values, neighbors)
-        share = found / torch.where(radius > 0, size.limit * radius, 1.0)
+        near = radius * (size.num_points / neighbors.indices.shape[1]) ** 0.5
+        share = found / torch.where(radius > 0, size.limit * near, 1.0)
         below = (1 - share * share).clamp_(min=0)
         scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
@@ -148,5 +156,5 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors) -> Tensor:
         near.partition(rank - 1, axis=1)
         found.numpy()[block] = near[:, rank - 1]
 
-    run_chunks(work, chunks_of(len(values), 8192), values.device)
+    each_block(work, len(values), _BLOCK, values.device)
     return found

@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from torchrg.neighbors import gather_patches
+from torchrg.normals.blocks import each_block
 from torchrg.normals.columns import residuals, split_columns, sq_lengths
 from torchrg.normals.votes import support_scores
-from torchrg.robust.chunks import chunks_of
 from torchrg.structures import Neighbors
 
 _REACH = 2.5
+_AGREEMENT = 4.2
 _MAX_TILT = 0.95
 _RIDGE = 0.01
 _VOTE_TOLERANCE = 2.0
@@ -37,7 +38,7 @@ def average_planes(
     neighbors: Neighbors,
     planes: TangentPlanes,
     noise: Tensor,
-    angles: Tensor,
+    errors: Tensor,
     rows: Tensor,
     *,
     chunk_size: int = 16384,
@@ -45,10 +46,10 @@ def average_planes(
     r"""Give points the average of the planes of those neighbours that agree with theirs.
 
     Neighbour j agrees with point i as far as its plane passes through i, within 2.5 times the
-    noise, and its normal is within an angle ``a_i`` (as a chord): a bilateral filter of planes,
-    with weights
-    ``w_j = (1 - (c_ij / a_i)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 - d_ij^2 / (2 d_max^2))``, each
-    factor at least 0. On a curved surface a mere average would lean towards the denser side;
+    noise, and the chord ``c_ij`` between the normals is within 4.2 times its standard error
+    ``a_ij = (a_i^2 + a_j^2)^(1/2)``: a bilateral filter of planes, with weights ``w_j`` of
+    ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 - d_ij^2 / (2 d_max^2)) / a_j^2``,
+    each factor at least 0. On a curved surface a mere average would lean towards the denser side;
     the weights are therefore tilted by a linear function of the position, such that the weighted
     mean of the positions is the point (local linear regression).
 
@@ -57,7 +58,7 @@ def average_planes(
         neighbors: Neighbours of all points.
         planes: Plane of each point.
         noise: Standard deviation of the noise, shape ``(N,)``.
-        angles: Largest chord between normals that agree, shape ``(N,)``.
+        errors: Standard error of the normals, radians, shape ``(N,)``, positive.
         rows: Points to treat, shape ``(n,)``.
         chunk_size: Points handled at a time.
 
@@ -66,7 +67,8 @@ def average_planes(
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
-    for block in chunks_of(len(rows), chunk_size):
+
+    def work(block: slice) -> None:
         chosen = rows[block]
         indices = neighbors.indices[chosen]
         flat = indices.reshape(-1)
@@ -78,10 +80,12 @@ def average_planes(
         offset = planes.offsets.index_select(0, flat).view(indices.shape)
         rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
         sq_chords = 2 * (1 - cosines.abs())
-        angle, reach = angles[chosen][:, None], _REACH * noise[chosen][:, None]
+        sq_error = (errors * errors).index_select(0, flat).view(indices.shape)
+        sq_angle = _AGREEMENT**2 * (sq_error + sq_error[:, :1])
+        reach = _REACH * noise[chosen][:, None]
         sq_distances = sq_lengths(columns)
         farthest = sq_distances.amax(dim=1, keepdim=True)
-        weights = (1 - sq_chords / (angle * angle)).clamp_(min=0).square_()
+        weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
         weights *= (1 - (rests / reach).square_()).clamp_(min=0)
         weights *= 1 - 0.5 * sq_distances / torch.where(farthest > 0, farthest, 1.0)
         if neighbors.valid is not None:
@@ -94,6 +98,8 @@ def average_planes(
         normals[chosen] = torch.where(found[:, None], mean / safe[:, None], normals[chosen])
         moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
         offsets[chosen] = torch.where(found, moved, offsets[chosen])
+
+    each_block(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
 
 
@@ -124,7 +130,8 @@ def choose_planes(
         The planes of all points.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
-    for block in chunks_of(len(rows), chunk_size):
+
+    def work(block: slice) -> None:
         chosen = rows[block]
         indices = neighbors.indices[chosen]
         columns = split_columns(gather_patches(points, indices))
@@ -148,6 +155,8 @@ def choose_planes(
             best = torch.where(better, score, best)
             normals[chosen] = torch.where(better[:, None], normal, normals[chosen])
             offsets[chosen] = torch.where(better, offset, offsets[chosen])
+
+    each_block(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
 
 

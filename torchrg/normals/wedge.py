@@ -1,5 +1,6 @@
-"""Two planes that meet: what an edge looks like from one of its points."""
+"""Planes that meet: what an edge or a corner looks like from one of its points."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -8,24 +9,30 @@ from torch import Tensor
 from torchrg.normals.columns import Columns, fit_planes, residuals
 
 _NUM_ROUNDS = 4
-_FIRST_GAP = 2.0
+_GAP = 2.0
 _LEAST_POINTS = 5
-_NUM_PARAMETERS = 6
+_PLANE_PARAMETERS = 3
 
 
 class Wedge(NamedTuple):
-    """The plane of each point, one of the two of its neighbourhood.
+    """The plane of each point, one of several that explain its neighbourhood.
 
     Attributes:
         normals: Unit normals, shape ``(n, 3)``.
         offsets: Of the planes ``normal . q = offset`` about the point, shape ``(n,)``.
-        deviations: Standard deviation of all neighbours from the two planes, shape ``(n,)``;
-            infinite where there is no second plane.
+        deviations: Standard deviation of all neighbours from the planes, three degrees of freedom
+            less for each, shape ``(n,)``; infinite where a plane has fewer than five points.
+        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``.
+        second: Points of the second plane, likewise.
+        outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
     """
 
     normals: Tensor
     offsets: Tensor
     deviations: Tensor
+    first: Tensor
+    second: Tensor
+    outer: Tensor
 
 
 def fit_wedges(
@@ -63,33 +70,93 @@ def fit_wedges(
         (tensor([[0., 0., 1.]]), True)
     """
     rests = residuals(columns, normals, offsets)
-    gap = _FIRST_GAP * noise[:, None]
-    above, below = (rests > gap) * counted, (rests < -gap) * counted
-    on_second = torch.where((above.sum(dim=1) >= below.sum(dim=1))[:, None], above, below)
-    on_first = counted - on_second
+    second = _beyond(rests, noise, counted)
+    first = (rests.abs() <= (_GAP * noise)[:, None]) * counted
     present = torch.ones_like(noise, dtype=torch.bool)
-    inside = [rests, rests]
-    planes = [(normals, offsets), (normals, offsets)]
     for _ in range(_NUM_ROUNDS):
-        present &= (on_first.sum(dim=1) >= _LEAST_POINTS) & (on_second.sum(dim=1) >= _LEAST_POINTS)
-        planes = [fit_planes(columns, on)[:2] for on in (on_first, on_second)]
-        inside = [
-            _inside(residuals(columns, *plane), other)
-            for plane, other in zip(planes, (on_second, on_first), strict=True)
-        ]
-        on_first = (inside[0] < inside[1]) * counted
-        on_second = counted - on_first
-    outer = torch.minimum(*inside)
-    freedom = (counted.sum(dim=1) - _NUM_PARAMETERS).clamp_(min=1)
+        present &= _all_present((first, second))
+        planes = [fit_planes(columns, group)[:2] for group in (first, second)]
+        inside = (
+            _inside(residuals(columns, *planes[0]), second),
+            _inside(residuals(columns, *planes[1]), first),
+        )
+        outer, on_first = torch.minimum(*inside), inside[0] < inside[1]
+        first, second = counted * on_first, counted * ~on_first
+    return _summary(planes, (first, second), outer, present, counted)
+
+
+def fit_corners(columns: Columns, wedges: Wedge, noise: Tensor, counted: Tensor) -> Wedge:
+    r"""Fit three half-spaces, from two and the points that these leave unexplained.
+
+    Corners where three faces meet; rims of plates, where both faces of the plate are among the
+    neighbours; steps and reveals. The third group is, of the points off the wedge by more than
+    twice the noise, those inside or those outside of it, whichever are more. If inside, the third
+    half-space cuts the wedge, ``min(e_1, e_2, e_3)``; if outside, it is added to it,
+    ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of the first two groups.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        wedges: Fit of two half-spaces.
+        noise: Standard deviation of the noise, shape ``(n,)``.
+        counted: Weights 0 or 1, shape ``(n, K)``.
+
+    Returns:
+        The plane of each point, and how well the three explain all points.
+    """
+    third = _beyond(wedges.outer, noise, counted)
+    cut = ((wedges.outer * third).sum(dim=1) >= 0)[:, None]
+    first, second = wedges.first, wedges.second
+    present = torch.ones_like(noise, dtype=torch.bool)
+    for _ in range(_NUM_ROUNDS):
+        groups = (first, second, third)
+        present &= _all_present(groups)
+        planes = [fit_planes(columns, group)[:2] for group in groups]
+        rests = [residuals(columns, *plane) for plane in planes]
+        inside = _inside(rests[0], second), _inside(rests[1], first)
+        wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
+        added = torch.where(cut, added, -added)
+        on_third = torch.where(cut, added < wedge, added > wedge)
+        outer = torch.where(on_third, added, wedge)
+        on_first = inside[0] < inside[1]
+        third = counted * on_third
+        first, second = (counted - third) * on_first, (counted - third) * ~on_first
+    return _summary(planes, (first, second, third), outer, present, counted)
+
+
+def _beyond(rests: Tensor, noise: Tensor, counted: Tensor) -> Tensor:
+    """Return the points off a surface by more than twice the noise, on the side with more."""
+    gap = _GAP * noise[:, None]
+    above, below = (rests > gap) * counted, (rests < -gap) * counted
+    return torch.where((above.sum(dim=1) >= below.sum(dim=1))[:, None], above, below)
+
+
+def _inside(rests: Tensor, others: Tensor) -> Tensor:
+    """Return distances from a plane, positive on the side where other points are."""
+    return torch.where(((rests * others).sum(dim=1) >= 0)[:, None], rests, -rests)
+
+
+def _all_present(groups: Sequence[Tensor]) -> Tensor:
+    """Return where every group has enough points for a plane of its own."""
+    present = groups[0].sum(dim=1) >= _LEAST_POINTS
+    for group in groups[1:]:
+        present &= group.sum(dim=1) >= _LEAST_POINTS
+    return present
+
+
+def _summary(
+    planes: Sequence[tuple[Tensor, Tensor]],
+    groups: Sequence[Tensor],
+    outer: Tensor,
+    present: Tensor,
+    counted: Tensor,
+) -> Wedge:
+    """Return the plane whose group each point is in, and the deviation from all planes."""
+    normals, offsets = planes[0]
+    for (normal, offset), group in zip(planes[1:], groups[1:], strict=True):
+        own = group[:, 0] > 0
+        normals = torch.where(own[:, None], normal, normals)
+        offsets = torch.where(own, offset, offsets)
+    freedom = (counted.sum(dim=1) - _PLANE_PARAMETERS * len(planes)).clamp_(min=1)
     deviations = ((outer * outer * counted).sum(dim=1) / freedom).sqrt_()
-    first = inside[0][:, 0] < inside[1][:, 0]
-    return Wedge(
-        torch.where(first[:, None], planes[0][0], planes[1][0]),
-        torch.where(first, planes[0][1], planes[1][1]),
-        torch.where(present, deviations, torch.inf),
-    )
-
-
-def _inside(rests: Tensor, other: Tensor) -> Tensor:
-    """Return distances from a plane, positive on the side where the other plane's points are."""
-    return torch.where(((rests * other).sum(dim=1) >= 0)[:, None], rests, -rests)
+    deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
+    return Wedge(normals, offsets, deviations, groups[0], groups[1], outer)

@@ -1,0 +1,153 @@
+"""What surface explains each neighbourhood: a plane, a paraboloid, or planes that meet."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg.neighbors import gather_patches
+from torchrg.normals.blocks import each_block, each_block_of
+from torchrg.normals.columns import Columns, split_columns
+from torchrg.normals.noise import Survey
+from torchrg.normals.paraboloid import fit_paraboloids
+from torchrg.normals.rounds import TangentPlanes
+from torchrg.normals.votes import vote_planes
+from torchrg.normals.wedge import Wedge, fit_corners, fit_wedges
+from torchrg.structures import Neighbors, NormalFit
+
+_UNEXPLAINED = 1.05
+_CURVED_SHARE = 0.15
+_EXPLAINED = 1.3
+_WELL_EXPLAINED = 1.15
+_CORNER_SHARE = 0.9
+_FAR_OFF = 2.0
+_LEAST_GAIN = 8.0
+_LEAST_POOLED_GAIN = 20.0
+_MOST_GAIN = 40.0
+_NUM_POOLED = 16
+_NUM_PARAMETERS = 6
+
+
+class PieceFit(NamedTuple):
+    """Planes of all points, and how they were found.
+
+    Attributes:
+        planes: A plane at each point.
+        sharp: Points whose neighbourhood is broken, shape ``(N,)``, bool.
+        voted: Sharp points that follow votes alone, shape ``(N,)``, bool.
+    """
+
+    planes: TangentPlanes
+    sharp: Tensor
+    voted: Tensor
+
+
+def fit_pieces(
+    points: Tensor,
+    neighbors: Neighbors,
+    fit: NormalFit,
+    survey: Survey,
+    *,
+    chunk_size: int = 2048,
+) -> PieceFit:
+    r"""Give each point the plane, the paraboloid or the piece of broken planes that explains most.
+
+    With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. The others get a
+    paraboloid, of deviation ``J``; it stands where ``J`` is at most 1.05 s, or at most 0.15 of the
+    plane's deviation. Otherwise two planes that meet are fitted, and where these deviate by more
+    than 1.15 s, three, which replace the two if their deviation is below 0.9 of theirs. The point
+    takes its plane of these, of deviation ``W``, where ``W <= 1.3 s`` and the gain over the
+    paraboloid, a difference of chi-square with as many parameters in both models,
+
+    .. math:: (K - 6) (J^2 - W^2) / \max(s, W)^2,
+
+    is above 8, and above 20 on average over the point's 16 nearest (0 where nothing is broken):
+    noise makes single points look broken, an edge all of them. Points left over with ``J > 2 s`` take the plane of the votes.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        neighbors: Neighbours of all points.
+        fit: Planes of PCA.
+        survey: Deviations from these, and the noise.
+        chunk_size: Points handled at a time.
+
+    Returns:
+        Planes, and which points are sharp.
+    """
+    noise = survey.noise
+    normals, offsets = fit.normals.clone(), survey.offsets.clone()
+    bent = survey.deviations.clone()
+    unexplained = fit.valid & (survey.deviations > _UNEXPLAINED * noise)
+
+    def bend(rows: Tensor) -> None:
+        columns, counted = _gather(points, neighbors, rows)
+        normals[rows], offsets[rows], bent[rows] = fit_paraboloids(
+            columns, fit.normals[rows], counted
+        )
+
+    each_block_of(bend, unexplained, chunk_size)
+    broken = unexplained & (bent > _UNEXPLAINED * noise)
+    broken &= bent > _CURVED_SHARE * survey.deviations
+    gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
+    votes, pieces = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
+
+    def split(rows: Tensor) -> None:
+        columns, counted = _gather(points, neighbors, rows)
+        scale = noise[rows]
+        voted = vote_planes(columns, scale, fit.normals[rows], counted)
+        found = _fit_broken(columns, *voted, scale, counted)
+        votes.normals[rows], votes.offsets[rows] = voted
+        pieces.normals[rows], pieces.offsets[rows] = found.normals, found.offsets
+        explained[rows] = found.deviations <= _EXPLAINED * scale
+        known = found.deviations.isfinite()
+        rest = torch.where(known, found.deviations, scale)
+        unit = torch.maximum(scale, rest)
+        drop = ((bent[rows] / unit).square() - (rest / unit).square()) * (
+            counted.sum(dim=1) - _NUM_PARAMETERS
+        )
+        gain[rows] = torch.where(known, drop, -_MOST_GAIN).clamp_(-_MOST_GAIN, _MOST_GAIN)
+
+    each_block_of(split, broken, chunk_size)
+    pooled = _mean_of_nearest(gain, neighbors, chunk_size)
+    meeting = broken & explained & (gain > _LEAST_GAIN) & (pooled > _LEAST_POOLED_GAIN)
+    voting = broken & ~meeting & (bent > _FAR_OFF * noise)
+    for chosen, planes in ((voting, votes), (meeting, pieces)):
+        normals = torch.where(chosen[:, None], planes.normals, normals)
+        offsets = torch.where(chosen, planes.offsets, offsets)
+    return PieceFit(TangentPlanes(normals, offsets), voting | meeting, voting)
+
+
+def _fit_broken(
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
+) -> Wedge:
+    """Return two planes that meet, or three where two do not explain the neighbours."""
+    wedge = fit_wedges(columns, normals, offsets, noise, counted)
+    rows = (wedge.deviations > _WELL_EXPLAINED * noise).nonzero().squeeze(-1)
+    some = (columns[0][rows], columns[1][rows], columns[2][rows])
+    start = Wedge(*(part[rows] for part in wedge))
+    corner = fit_corners(some, start, noise[rows], counted[rows])
+    better = corner.deviations < _CORNER_SHARE * start.deviations
+    rows = rows[better]
+    merged = [old.index_copy(0, rows, new[better]) for old, new in zip(wedge, corner, strict=True)]
+    return Wedge(*merged)
+
+
+def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns, Tensor]:
+    """Return columns of the neighbours and which count, as 0 or 1."""
+    columns = split_columns(gather_patches(points, neighbors.indices[rows]))
+    if neighbors.valid is None:
+        return columns, torch.ones_like(columns[0])
+    return columns, neighbors.valid[rows].to(points.dtype)
+
+
+def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
+    """Return the mean of values over the nearest neighbours."""
+    means = torch.empty_like(values)
+
+    def work(part: slice) -> None:
+        indices = neighbors.indices[part, :_NUM_POOLED]
+        near = values.index_select(0, indices.reshape(-1)).view(indices.shape)
+        means[part] = near.mean(dim=1)
+
+    each_block(work, len(values), chunk_size, values.device)
+    return means
