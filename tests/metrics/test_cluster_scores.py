@@ -77,10 +77,10 @@ def test_exact_parallel_walls_give_the_limits():
 
 
 def test_rounding_does_not_tell_parallel_walls_apart():
-    # Exact walls of one direction whose normals were rounded differently.
-    wall = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    normals = torch.stack([wall, wall * 3, wall / 7, wall.roll(1), wall.roll(1)]).repeat(50, 1)
-    score = score_clusters(normals, torch.tensor([0, 1, 1, 2, 2]).repeat(50))
+    # Exact walls of one direction whose normals were rounded differently, and another direction.
+    wall = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
+    normals = torch.cat([wall, wall + 1e-15 * torch.eye(3)[:1], wall.roll(1)]).repeat(50, 1)
+    score = score_clusters(normals, torch.arange(3).repeat(50))
     assert score.dvi == 0
     assert score.dbi == math.inf
 

@@ -66,10 +66,11 @@ def test_equal_normals_have_no_error_in_float32(truth):
     assert score_normals(truth.float(), truth.float()).msae == 0
 
 
-def test_bounds_are_not_included():
-    truth = torch.tensor([[0.0, 0, 1]])
-    assert score_normals(torch.tensor([[1.0, 0, 0]]), truth).under_20_deg == 0
-    assert score_normals(truth, truth).under_5_deg == 1
+def test_bounds_are_not_included(monkeypatch):
+    errors = torch.tensor([4.9, 5.0, 10.0, 19.9, 20.0], dtype=torch.float64)
+    monkeypatch.setattr("torchrg.metrics.normals.unsigned_angle_deg", lambda *_: errors)
+    score = score_normals(torch.ones(5, 3), torch.ones(5, 3))
+    assert (score.under_5_deg, score.under_10_deg, score.under_20_deg) == (0.2, 0.4, 0.8)
 
 
 def test_the_split_scores_each_part_alone(rng, truth):

@@ -54,6 +54,17 @@ def test_repeated_directions_do_not_hide_the_closest_pair(rng, monkeypatch, max_
     assert repeated == pytest.approx(expected, rel=1e-12)
 
 
+def test_repeated_directions_are_searched_once(rng, monkeypatch):
+    searched = []
+    monkeypatch.setattr(
+        "torchrg.metrics.separation._closest_chord",
+        lambda points, *_: searched.append(len(points)) or 1.0,
+    )
+    directions, clusters = scattered(rng, [5, 5], 0.01, axes=torch.eye(3)[:2])
+    closest_between(directions.repeat(50, 1), clusters.repeat(50))
+    assert searched == [10]
+
+
 def test_a_shared_direction_is_no_distance(rng):
     directions, clusters = scattered(rng, [20, 20], 0.01, axes=torch.eye(3)[:2])
     directions[30] = -directions[3]
