@@ -200,6 +200,15 @@ def test_every_command_has_help(name, capsys):
     assert f"torchrg {name}" in capsys.readouterr().out
 
 
+def test_view_draws_a_picture(room, tmp_path, capsys):
+    out = tmp_path / "room.png"
+    assert main(["view", str(room), "--out", str(out), "--width", "200"]) == 0
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert main(["view", str(room), "--out", str(out), "--color", "curvature"]) == 2
+    assert "expected curvature for --color curvature" in error_line(capsys)
+    assert main(["view", str(room), "--out", "room.jpg"]) == 2
+
+
 def test_info_says_what_a_file_holds(room, capsys):
     assert main(["info", str(room)]) == 0
     shown = capsys.readouterr().out

@@ -9,6 +9,7 @@ COMMANDS = {
     "segment": "label the planes of scans",
     "score": "compare labels and normals with a truth",
     "sample": "make a synthetic room with its truth",
+    "view": "draw a cloud or a result",
     "info": "say what a file holds",
 }
 """Commands by name, each with a module of the same name, and what they do."""

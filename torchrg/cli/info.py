@@ -6,10 +6,11 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from torchrg.cli.console import parse
 from torchrg.io import read_cloud
-from torchrg.neighbors import finite_rows, search_knn
+from torchrg.neighbors import search_knn
 from torchrg.structures import Cloud
 
 
@@ -41,19 +42,19 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         facts["lowest"] = " ".join(f"{value:.6g}" for value in low)
         facts["highest"] = " ".join(f"{value:.6g}" for value in high)
         facts["extent"] = " ".join(f"{value:.6g}" for value in high - low)
-        num_places = len(np.unique(kept, axis=0))
-        facts["duplicates"] = f"{len(kept) - num_places:,}"
-        facts["spacing"] = _median_spacing(cloud)
+        places = np.unique(kept - cloud.origin, axis=0)
+        facts["duplicates"] = f"{len(kept) - len(places):,}"
+        facts["spacing"] = _median_spacing(places)
     for name, values in cloud.fields.items():
         shape = " x ".join(map(str, values.shape[1:])) or "1"
         facts[name] = f"{shape} {values.dtype}"
     return facts
 
 
-def _median_spacing(cloud: Cloud) -> str:
+def _median_spacing(places: NDArray[np.floating]) -> str:
     """Return the median distance to the nearest other place, in the unit of the cloud."""
-    points = cloud.points[finite_rows(cloud.points)].unique(dim=0)
-    if len(points) < 2:
+    if len(places) < 2:
         return "none"
-    nearest = points[search_knn(points, 2).indices[:, 1].long()]
-    return f"{float((points - nearest).norm(dim=1).median()):.4g} (median to the nearest point)"
+    nearest = places[search_knn(places, 2).indices[:, 1].numpy()]
+    spacing = np.median(np.linalg.norm(places - nearest, axis=1))
+    return f"{spacing:.4g} (median to the nearest point)"

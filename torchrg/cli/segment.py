@@ -112,7 +112,9 @@ def _check_points(cloud: Cloud) -> None:
     """
     num_bad = len(cloud) - int(cloud.finite.sum())
     if num_bad == len(cloud):
-        raise FormatError(f"{cloud.source}: expected finite points, got none in {num_bad:,} points.")
+        raise FormatError(
+            f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
+        )
     if num_bad:
         warn(
             f"{cloud.source}: {num_bad:,} of {len(cloud):,} points are not finite; they stay in "
