@@ -16,6 +16,7 @@ _FACING = math.cos(math.radians(30))  # of the cells of an outer surface
 _MIN_CEILING_DEPTH, _MIN_WALL_DEPTH = 0.4, 0.2  # of the extent: table tops are no ceilings
 _MIN_CEILING_COVER, _MIN_WALL_COVER = 0.15, 0.35  # of what is seen from a side
 _AROUND = 9  # pixels of the square that votes
+_MIN_WIDTH = 0.27  # share of that square at about the same height
 
 
 class OuterSurface(NamedTuple):
@@ -50,7 +51,7 @@ def find_outer_surface(cells: Cells, direction: Tensor, *, is_ceiling: bool) -> 
 
     A cell is outer if its plane faces that side, nothing is in front of it, and far behind it
     there is something: the floor below a ceiling, the opposite wall behind a wall. The cells around
-    it vote, so that windows and recesses are no exceptions.
+    it at about its height vote, so that windows and recesses are no exceptions.
 
     Args:
         cells: Pieces of surface, at least one.
@@ -69,16 +70,15 @@ def find_outer_surface(cells: Cells, direction: Tensor, *, is_ceiling: bool) -> 
     first = ((cells.normals @ direction).abs() > _FACING) & (height >= top[pixels] - thickness)
     outer = first & (depth_below >= share * (high - low))[pixels]
 
-    votes, voters, heights = (
-        view.mean_around(view.count(pixels, values), _AROUND)
-        for values in (outer, first, outer * height)
+    if not bool(first.any()):
+        return None
+    pixels, height, outer = pixels[first], height[first], outer[first]
+    votes, voters = (
+        view.share_at_height(pixels, height, of, size=_AROUND, step=thickness)
+        for of in (outer, torch.ones_like(outer))
     )
-    elected = 2 * votes > voters
-    usual = heights / torch.where(votes > 0, votes, 1.0)
-    first &= elected[pixels] & ((height - usual[pixels]).abs() <= 2 * thickness)
-    covered = (view.count(pixels, first) > 0).float()
-    first &= (view.mean_around(covered, _AROUND) > 0.25)[pixels]
-    pixels, height = pixels[first], height[first]
+    elected = (voters > _MIN_WIDTH) & (2 * votes > voters)
+    pixels, height = pixels[elected], height[elected]
     min_cover = _MIN_CEILING_COVER if is_ceiling else _MIN_WALL_COVER
     if len(torch.unique(pixels)) < max(1, min_cover * int(top.isfinite().sum())):
         return None

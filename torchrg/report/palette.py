@@ -11,11 +11,11 @@ from torchrg.report.oklab import oklab_to_rgb, rgb_to_oklab, to_bytes
 UNLABELED_GRAY = 176
 """Red, green and blue of points that belong to no plane."""
 
-_CALM = ((0.80, 0.87), (0.055, 0.075), 24)  # lightness, chroma, number of hues
+_CALM = ((0.78, 0.88), (0.07, 0.095), 24)  # lightness, chroma, number of hues
 _VIVID = ((0.62, 0.70, 0.78), (0.13, 0.165), 36)
 _LARGE = 0.03  # share of all: planes that get a calm colour
 _ALIKE = 0.0005  # squared OKLab distance of colours that look about the same
-_ELSEWHERE = 0.02  # how much a plane that is not next to another one counts for it
+_ELSEWHERE = 0.005  # how much a plane that is not next to another one counts for it
 
 
 def make_palette() -> tuple[Tensor, int]:

@@ -159,7 +159,7 @@ def _check_cloud(
     if paint.dtype != torch.uint8:
         dtype = str(paint.dtype).removeprefix("torch.")
         raise ShapeError(f"{caller}: expected colors of uint8, got {dtype}; scale them to 0..255.")
-    return cloud, paint, slant
+    return cloud, paint, None if slant is None else slant.detach()
 
 
 def _check_at_least_one(caller: str, **settings: int | None) -> None:

@@ -12,7 +12,7 @@ from torchrg._optional import require
 from torchrg.errors import ConfigError
 
 _GAP = 0.02  # between pictures, in widths
-_TITLE = 0.045  # size of the letters, in widths
+_TITLE = 0.035  # size of the letters, in widths
 
 
 def tile_pictures(
