@@ -1,6 +1,7 @@
 """``torchrg score``: labels and normals against a truth."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -54,10 +55,19 @@ def score_files(predicted: Path, truth: Path) -> dict[str, dict[str, Any]]:
     scores: dict[str, dict[str, Any]] = {}
     if "labels" in ours.fields and "labels" in theirs.fields:
         labels = score_labels(ours.fields["labels"], theirs.fields["labels"])
-        scores["labels"] = dict(labels._asdict())
+        scores["labels"] = _defined(labels._asdict())
     if "normals" in ours.fields and "normals" in theirs.fields:
         normals = score_normals(ours.fields["normals"], theirs.fields["normals"])
-        scores["normals"] = dict(normals._asdict())
+        scores["normals"] = _defined(normals._asdict())
     if not scores:
         raise FormatError(f"{predicted}: shares neither labels nor normals with {truth}.")
     return scores
+
+
+def _defined(values: dict[str, Any]) -> dict[str, Any]:
+    """Return scores without those that were not asked for; JSON knows null, but no NaN."""
+    return {
+        name: None if isinstance(value, float) and math.isnan(value) else value
+        for name, value in values.items()
+        if value is not None
+    }
