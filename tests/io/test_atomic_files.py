@@ -38,6 +38,16 @@ def test_file_is_moved_into_place_at_the_end(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="open files cannot be replaced there")
+def test_who_reads_the_older_file_keeps_it_whole(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with path.open() as reader:
+        with atomic_path(path) as beside:
+            beside.write_text("new")
+        assert reader.read() == "old"
+
+
 def test_failing_disk_is_a_line_that_names_the_file(tmp_path, monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")

@@ -129,6 +129,12 @@ def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, mak
     np.testing.assert_array_equal(arrays["plane_count"], [30, 20, 10])
 
 
+def test_order_of_provenance_does_not_change_the_file(tmp_path, make_cloud):
+    write_cloud(tmp_path / "a.npz", make_cloud(), provenance={"a": 1, "b": {"c": 2, "d": 3}})
+    write_cloud(tmp_path / "b.npz", make_cloud(), provenance={"b": {"d": 3, "c": 2}, "a": 1})
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
 def test_planes_are_written_in_the_coordinates_of_the_input(
     tmp_path, make_cloud, make_segmentation
 ):

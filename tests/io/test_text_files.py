@@ -28,7 +28,7 @@ def save(path, text):
         "x y z\n0 1.5 -2\n3 4 1e3\n",
         '"X","Y","Z"\n0,1.5,-2\n3,4,1e3\n',
         "//X Y Z\n0 1.5 -2\n3 4 1e3\n",
-        "# scanned by hand\n# x y z\n\n0 1.5 -2\n# between\n3 4 1e3 # last\n",
+        "# scanned by hand\n# x y z\n\n0 1.5 -2 # first\n# between\n3 4 1e3 # last\n",
         "\ufeffx y z\n0 1.5 -2\n3 4 1e3\n",
         "2\n0 1.5 -2\n3 4 1e3\n",
         "// X Y Z\n2\n0 1.5 -2\n3 4 1e3\n",

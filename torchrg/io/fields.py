@@ -172,7 +172,7 @@ def _renamed(path: Path, columns: Columns) -> dict[str, NDArray[Any]]:
 
 def _grouped(columns: Columns) -> dict[str, NDArray[Any]]:
     """Join triples and numbered columns, and rename; the first of two equal names wins it."""
-    plain = {_plain(name): name for name in reversed(list(columns)) if columns[name].ndim == 1}
+    plain = {_plain(name): name for name in columns if columns[name].ndim == 1}
     rest, fields = dict(columns), {}
     for parts, target in TRIPLES.items():
         if target not in fields and all(part in plain for part in parts):
