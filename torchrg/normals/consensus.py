@@ -20,7 +20,7 @@ _NUM_ROUNDS = 2
 _INLIER_REACH = 3.0
 _LEAST_ERROR = 0.003
 _MOST_ERROR = 0.1
-_QUIET = 0.06
+_QUIET = 0.15
 
 
 @torch.no_grad()
@@ -47,7 +47,7 @@ def estimate_consensus(
        planes of their neighbours (:func:`torchrg.normals.rounds.choose_planes`).
 
     With ``config.adaptive_k``, neighbourhoods grow with the noise first: with ``u`` the median of
-    noise by radius, by the factor ``(u / 0.06)^2``, up to that many neighbours.
+    noise by radius, by the factor ``(u / 0.15)^2``, up to that many neighbours.
 
     Args:
         points: Points, shape ``(N, 3)``.

@@ -16,6 +16,8 @@ from torchrg.structures import Neighbors, NormalFit
 
 _BLOCK = 8192
 _QUANTILE = 0.35
+_COMMON_QUANTILE = 0.15
+_MOST_ABOVE = 3.0
 _NARROW = 0.03
 
 
@@ -66,7 +68,8 @@ def survey_noise(
     over the neighbours, ``c_m`` the factor that makes it unbiased for a plane, and the root undoes
     that a plane of few points turns with their noise (``R_m = R (m / K)^(1/2)``: their radius, from
     that of all; ``a_m``: measured on noisy planes). Neighbourhoods almost on one line, as on scan
-    lines, do not count.
+    lines, do not count. At corners, where none of the three finds a face, the noise is at most 3
+    times the 15th percentile of that of the neighbours.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -100,14 +103,16 @@ def survey_noise(
     floor = torch.maximum(
         coordinate_resolution(points), radius * (4 * torch.finfo(points.dtype).eps)
     )
-    noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors)
+    noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors, _QUANTILE)
     for size, values in zip(_SMALL_SIZES, small, strict=True):
-        found = size.factor * _neighbor_quantiles(values, neighbors)
+        found = size.factor * _neighbor_quantiles(values, neighbors, _QUANTILE)
         near = radius * (size.num_points / neighbors.indices.shape[1]) ** 0.5
         share = found / torch.where(radius > 0, size.limit * near, 1.0)
         below = (1 - share * share).clamp_(min=0)
         scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
+    common = _neighbor_quantiles(noise, neighbors, _COMMON_QUANTILE)
+    noise = torch.minimum(noise, _MOST_ABOVE * common)
     return Survey(offsets, whole, torch.maximum(noise, floor), radius)
 
 
@@ -143,10 +148,10 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     return torch.where(broad, spread.sqrt_(), torch.inf)
 
 
-def _neighbor_quantiles(values: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return the 35th percentile of values over the neighbours of each point."""
+def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
+    """Return a quantile of values over the neighbours of each point."""
     indices = neighbors.indices
-    rank = max(math.ceil(_QUANTILE * indices.shape[1]), 1)
+    rank = max(math.ceil(quantile * indices.shape[1]), 1)
     if values.device.type != "cpu":
         return values[indices.long()].kthvalue(rank, dim=1).values
     found, columns, rows = torch.empty_like(values), values.numpy(), indices.numpy()

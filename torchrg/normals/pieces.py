@@ -12,7 +12,7 @@ from torchrg.normals.noise import Survey
 from torchrg.normals.paraboloid import fit_paraboloids
 from torchrg.normals.rounds import TangentPlanes
 from torchrg.normals.votes import vote_planes
-from torchrg.normals.wedge import Wedge, fit_corners, fit_wedges
+from torchrg.normals.wedge import Wedge, fit_corners, fit_wedges, split_by_votes, split_off
 from torchrg.structures import Neighbors, NormalFit
 
 _UNEXPLAINED = 1.05
@@ -62,7 +62,8 @@ def fit_pieces(
     .. math:: (K - 6) (J^2 - W^2) / \max(s, W)^2,
 
     is above 8, and above 20 on average over the point's 16 nearest (0 where nothing is broken):
-    noise makes single points look broken, an edge all of them. Points left over with ``J > 2 s`` take the plane of the votes.
+    noise makes single points look broken, an edge all of them. Points left over with ``J > 2 s``
+    take the plane of the votes.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -125,11 +126,29 @@ def _fit_broken(
     rows = (wedge.deviations > _WELL_EXPLAINED * noise).nonzero().squeeze(-1)
     some = (columns[0][rows], columns[1][rows], columns[2][rows])
     start = Wedge(*(part[rows] for part in wedge))
-    corner = fit_corners(some, start, noise[rows], counted[rows])
-    better = corner.deviations < _CORNER_SHARE * start.deviations
-    rows = rows[better]
-    merged = [old.index_copy(0, rows, new[better]) for old, new in zip(wedge, corner, strict=True)]
+    scale, count = noise[rows], counted[rows]
+    guesses = (
+        split_off(start, scale, count),
+        split_by_votes(some, normals[rows], offsets[rows], scale, count),
+    )
+    best = start._replace(deviations=_CORNER_SHARE * start.deviations)
+    for groups in guesses:
+        best = _better(best, fit_corners(some, groups, count))
+    improved = best.deviations < _CORNER_SHARE * start.deviations
+    rows = rows[improved]
+    merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(wedge, best, strict=True)]
     return Wedge(*merged)
+
+
+def _better(one: Wedge, other: Wedge) -> Wedge:
+    """Return, for each point, the fit that deviates less."""
+    less = other.deviations < one.deviations
+    return Wedge(
+        *(
+            torch.where(less.view(-1, *[1] * (a.dim() - 1)), b, a)
+            for a, b in zip(one, other, strict=True)
+        )
+    )
 
 
 def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns, Tensor]:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg.normals.columns import Columns, fit_planes, residuals
+from torchrg.normals.votes import vote_planes
 
 _NUM_ROUNDS = 4
 _GAP = 2.0
@@ -71,7 +72,7 @@ def fit_wedges(
     """
     rests = residuals(columns, normals, offsets)
     second = _beyond(rests, noise, counted)
-    first = (rests.abs() <= (_GAP * noise)[:, None]) * counted
+    first = _near(rests, noise) * counted
     present = torch.ones_like(noise, dtype=torch.bool)
     for _ in range(_NUM_ROUNDS):
         present &= _all_present((first, second))
@@ -85,35 +86,34 @@ def fit_wedges(
     return _summary(planes, (first, second), outer, present, counted)
 
 
-def fit_corners(columns: Columns, wedges: Wedge, noise: Tensor, counted: Tensor) -> Wedge:
-    r"""Fit three half-spaces, from two and the points that these leave unexplained.
+def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> Wedge:
+    r"""Fit three half-spaces, from a first guess which points lie on which.
 
     Corners where three faces meet; rims of plates, where both faces of the plate are among the
-    neighbours; steps and reveals. The third group is, of the points off the wedge by more than
-    twice the noise, those inside or those outside of it, whichever are more. If inside, the third
-    half-space cuts the wedge, ``min(e_1, e_2, e_3)``; if outside, it is added to it,
-    ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of the first two groups.
+    neighbours; steps and reveals. The first two planes are a wedge, as in :func:`fit_wedges`. If
+    the third group begins inside of it, its half-space cuts the wedge, ``min(e_1, e_2, e_3)``;
+    otherwise it is added, ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of
+    the first two groups.
 
     Args:
         columns: Coordinates of the neighbours about each point.
-        wedges: Fit of two half-spaces.
-        noise: Standard deviation of the noise, shape ``(n,)``.
+        groups: Points of three planes, weights 0 or 1, each of shape ``(n, K)``.
         counted: Weights 0 or 1, shape ``(n, K)``.
 
     Returns:
         The plane of each point, and how well the three explain all points.
     """
-    third = _beyond(wedges.outer, noise, counted)
-    cut = ((wedges.outer * third).sum(dim=1) >= 0)[:, None]
-    first, second = wedges.first, wedges.second
-    present = torch.ones_like(noise, dtype=torch.bool)
+    first, second, third = groups
+    present = torch.ones_like(counted[:, 0], dtype=torch.bool)
+    cut: Tensor | None = None
     for _ in range(_NUM_ROUNDS):
-        groups = (first, second, third)
-        present &= _all_present(groups)
-        planes = [fit_planes(columns, group)[:2] for group in groups]
+        present &= _all_present((first, second, third))
+        planes = [fit_planes(columns, group)[:2] for group in (first, second, third)]
         rests = [residuals(columns, *plane) for plane in planes]
         inside = _inside(rests[0], second), _inside(rests[1], first)
         wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
+        if cut is None:
+            cut = ((wedge * third).sum(dim=1) >= 0)[:, None]
         added = torch.where(cut, added, -added)
         on_third = torch.where(cut, added < wedge, added > wedge)
         outer = torch.where(on_third, added, wedge)
@@ -121,6 +121,34 @@ def fit_corners(columns: Columns, wedges: Wedge, noise: Tensor, counted: Tensor)
         third = counted * on_third
         first, second = (counted - third) * on_first, (counted - third) * ~on_first
     return _summary(planes, (first, second, third), outer, present, counted)
+
+
+def split_off(wedge: Wedge, noise: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the two groups of a wedge, and as a third the points off it on its fuller side."""
+    third = _beyond(wedge.outer, noise, counted)
+    return wedge.first * (1 - third), wedge.second * (1 - third), third
+
+
+def split_by_votes(
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the points near a plane, those near the most voted plane of the rest, and the others.
+
+    The plane of the rest passes through the nearest of its points.
+    """
+    first = _near(residuals(columns, normals, offsets), noise) * counted
+    rest = counted - first
+    anchor = rest.argmax(dim=1, keepdim=True)
+    moved = tuple(column - column.gather(1, anchor) for column in columns)
+    about: Columns = (moved[0], moved[1], moved[2])
+    plane = vote_planes(about, noise, fit_planes(about, rest)[0], rest)
+    second = _near(residuals(about, *plane), noise) * rest
+    return first, second, rest - second
+
+
+def _near(rests: Tensor, noise: Tensor) -> Tensor:
+    """Return which points are within twice the noise of a plane."""
+    return rests.abs() <= (_GAP * noise)[:, None]
 
 
 def _beyond(rests: Tensor, noise: Tensor, counted: Tensor) -> Tensor:

@@ -1,0 +1,177 @@
+"""Consensus normals: right at edges, smooth on curved surfaces, the same whatever the order."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchrg.config import NormalsConfig
+from torchrg.errors import ConfigError
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.neighbors import canonical_order, search_knn
+from torchrg.normals.chunks import fit_points
+from torchrg.normals.consensus import estimate_consensus
+from torchrg.normals.jet import fit_normals_jet
+from torchrg.normals.pca import fit_normals_pca
+from torchrg.scenes import make_shape
+from torchrg.structures import Neighbors
+
+
+def in_order(points, truth):
+    order = canonical_order(points)
+    return points[order].contiguous(), truth[order]
+
+
+def shape(name, num_points, noise=0.0):
+    scene = make_shape(name, num_points, noise, seed=1)
+    return in_order(scene.points, scene.normals)
+
+
+def consensus(points, k=50, chunk_size=16384, **settings):
+    config = NormalsConfig(k=k, **settings)
+    return estimate_consensus(points, search_knn(points, k), config, chunk_size)
+
+
+def errors(fit, truth):
+    angles = unsigned_angle_deg(fit.normals.double(), truth.double())
+    return float(angles.mean()), float(angles.square().mean().sqrt())
+
+
+def fit_all(points, estimate, k=50):
+    def fit(patches, mask, size):
+        return estimate(patches, mask, resolution=size)
+
+    return fit_points(points, search_knn(points, k), fit)
+
+
+@pytest.mark.slow
+def test_an_exact_cube_has_exact_normals_but_for_a_few_points_on_its_edges():
+    points, truth = shape("cube", 100_000)
+    mean, rms = errors(consensus(points), truth)
+    assert mean <= 0.06
+    assert rms <= 0.6
+
+
+@pytest.mark.parametrize("name", ["cube", "octahedron", "stairs", "cylinder"])
+@pytest.mark.parametrize("noise", [0.0, 0.0025])
+def test_edges_are_sharper_than_those_of_pca_and_jet(name, noise):
+    points, truth = shape(name, 5000, noise)
+    mean, rms = errors(consensus(points), truth)
+    for estimate in (fit_normals_pca, fit_normals_jet):
+        other_mean, other_rms = errors(fit_all(points, estimate), truth)
+        assert mean < 0.7 * other_mean
+        assert rms < other_rms
+
+
+@pytest.mark.parametrize("name", ["sphere", "torus", "rounded_box"])
+@pytest.mark.parametrize("noise", [0.0, 0.0025])
+def test_smooth_surfaces_are_as_smooth_as_the_better_of_pca_and_jet(name, noise):
+    points, truth = shape(name, 5000, noise)
+    _, rms = errors(consensus(points), truth)
+    best = min(errors(fit_all(points, fit), truth)[1] for fit in (fit_normals_pca, fit_normals_jet))
+    assert rms <= 1.1 * best + 0.001
+
+
+@pytest.mark.parametrize("noise", [0.006, 0.012])
+def test_no_worse_than_pca_in_noise_and_better_with_more_neighbors(noise):
+    points, truth = shape("dodecahedron", 5000, noise)
+    mean, rms = errors(consensus(points), truth)
+    pca_mean, pca_rms = errors(fit_all(points, fit_normals_pca), truth)
+    assert mean <= 1.05 * pca_mean
+    assert rms**2 <= 1.05 * pca_rms**2
+    assert errors(consensus(points, adaptive_k=300), truth)[0] < pca_mean
+
+
+def test_both_faces_and_the_rim_of_a_plate_are_told_apart():
+    points, truth = shape("thin_plate", 35_000)
+    radius = (points[search_knn(points, 50).indices[:, -1].long()] - points).norm(dim=1)
+    assert radius.median() > 0.02, "both faces lie in one neighbourhood"
+    assert errors(consensus(points), truth)[0] < 0.5
+
+
+@pytest.fixture(scope="module")
+def noisy_bracket():
+    points, _ = shape("bracket", 3000, 0.002)
+    return points, consensus(points)
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_chunk_size_and_threads_change_nothing(noisy_bracket):
+    points, fit = noisy_bracket
+    assert same(fit, consensus(points, chunk_size=97))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3 - min(threads, 2))
+    try:
+        assert same(fit, consensus(points))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_order_changes_nothing(noisy_bracket, rng):
+    points, fit = noisy_bracket
+    shuffled = torch.randperm(len(points), generator=rng)
+    other = consensus(points[shuffled])
+    assert torch.equal(fit.sharp[shuffled], other.sharp)
+    assert torch.equal(fit.normals[shuffled], other.normals)
+
+
+@pytest.mark.parametrize("scale", [2.0**-13, 2.0**10])
+def test_the_unit_changes_nothing(noisy_bracket, scale):
+    points, fit = noisy_bracket
+    other = consensus(points * scale)
+    assert torch.equal(fit.sharp, other.sharp)
+    assert float(unsigned_angle_deg(fit.normals, other.normals).max()) < 0.01
+
+
+def test_the_origin_changes_rounding_only(noisy_bracket):
+    points, _ = noisy_bracket
+    # Coordinates that stay exact when moved, so that distances tie in the same way.
+    near = (points.double() * 2**14).round() / 2**14
+    a, b = consensus(near), consensus(near + 2.0**22)
+    assert float((a.sharp == b.sharp).double().mean()) > 0.999
+    angles = unsigned_angle_deg(a.normals, b.normals)
+    assert float((angles < 0.01).double().mean()) > 0.995
+
+
+def test_masked_neighbors_do_not_count(noisy_bracket):
+    points, fit = noisy_bracket
+    known = search_knn(points, 50).indices
+    own = torch.arange(len(points), dtype=torch.int32)[:, None].expand(-1, 10)
+    valid = torch.cat([torch.ones_like(known), torch.zeros_like(own)], dim=1).bool()
+    neighbors = Neighbors(torch.cat([known, own], dim=1), valid)
+    other = estimate_consensus(points, neighbors, NormalsConfig(k=60), 16384)
+    angles = unsigned_angle_deg(fit.normals, other.normals)
+    assert float(angles.median()) < 0.1
+    assert float((fit.sharp == other.sharp).float().mean()) > 0.95
+
+
+def test_degenerate_clouds_have_documented_answers():
+    line = torch.zeros(60, 3)
+    line[:, 0] = torch.arange(60.0)
+    for cloud in (line, torch.ones(60, 3)):
+        fit = consensus(cloud)
+        assert not fit.valid.any()
+        assert not fit.sharp.any()
+        assert float(fit.normals.abs().max()) == 0
+    grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.zeros(1))
+    for cloud in (grid, grid.repeat(3, 1)):
+        fit = consensus(cloud)
+        assert fit.valid.all()
+        assert not fit.sharp.any()
+        assert torch.equal(fit.normals.abs(), torch.tensor([[0.0, 0, 1]]).expand(len(cloud), 3))
+        assert float(fit.curvature.max()) < 1e-12
+
+
+def test_few_neighbors_give_pca():
+    points, _ = shape("cube", 300)
+    fit, pca = consensus(points, k=8), fit_all(points, fit_normals_pca, k=8)
+    assert torch.equal(fit.normals, pca.normals)
+    assert not fit.sharp.any()
+
+
+def test_adaptive_k_must_not_be_below_k():
+    with pytest.raises(ConfigError, match="adaptive_k"):
+        dataclasses.replace(NormalsConfig(), adaptive_k=20)

@@ -1,0 +1,37 @@
+"""The noise of a cloud is found without knowing the surface."""
+
+import pytest
+import torch
+
+from torchrg.neighbors import search_knn
+from torchrg.normals.chunks import fit_points
+from torchrg.normals.noise import survey_noise
+from torchrg.normals.pca import fit_normals_pca
+from torchrg.scenes import make_shape
+
+
+def survey(points, k=50):
+    neighbors = search_knn(points, k)
+    fit = fit_points(points, neighbors, lambda q, mask, s: fit_normals_pca(q, mask, resolution=s))
+    return survey_noise(points, neighbors, fit)
+
+
+@pytest.mark.parametrize("name", ["cube", "sphere", "bracket", "cylinder"])
+@pytest.mark.parametrize("noise", [0.002, 0.006])
+def test_noise_is_right_on_flat_curved_and_broken_surfaces(name, noise):
+    clean = make_shape(name, 6000, 0.0, seed=2).points
+    points = make_shape(name, 6000, noise, seed=2).points
+    truth = float((points - clean).std())
+    found = float(survey(points).noise.median())
+    assert 0.85 * truth < found < 1.2 * truth
+
+
+def test_an_exact_face_has_only_rounding_as_noise():
+    noise = survey(make_shape("cube", 5000, 0.0, seed=2).points).noise
+    assert 0 < float(noise.quantile(0.5)) < 1e-6
+
+
+def test_noise_is_as_long_as_the_unit():
+    points = make_shape("cube", 2000, 0.004, seed=2).points
+    scale = 2.0**-13
+    assert torch.allclose(survey(points * scale).noise, survey(points).noise * scale, rtol=1e-4)
