@@ -9,6 +9,7 @@ from torchrg.linalg import rank_tolerance
 from torchrg.normals.frame import PrincipalFrame, root
 from torchrg.normals.least_squares import least_squares
 from torchrg.normals.pca import check_patches, fit_plane, patch_resolution
+from torchrg.normals.query import about_query
 from torchrg.normals.shape_operator import principal_curvatures, shape_operator
 from torchrg.structures import NormalFit
 
@@ -113,7 +114,7 @@ def fit_jet(
     """
     check_patches("fit_jet", patches, mask, resolution)
     plane, frame = fit_plane(patches, mask, resolution=resolution)
-    query, offsets = _about_query(patches, mask)
+    query, offsets = about_query(patches, mask)
     axes = _tangent_axes(frame)
     u, v, w = (offsets @ axes).unbind(dim=-1)
     rounding = patch_resolution(patches, mask) if resolution is None else resolution
@@ -133,16 +134,6 @@ def fit_jet(
         valid,
         torch.where(valid, root((residual * residual).sum(dim=-1) / count), 0.0),
     )
-
-
-def _about_query(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the first point of each patch that counts, and all points about it, 0 if masked."""
-    if mask is None:
-        return patches[..., 0, :], patches - patches[..., :1, :]
-    first = mask.to(torch.uint8).argmax(dim=-1)[..., None, None]
-    query = patches.gather(-2, first.expand(*first.shape[:-1], 3))
-    query = torch.where(mask.any(dim=-1)[..., None, None], query, 0.0)
-    return query.squeeze(-2), torch.where(mask[..., None], patches - query, 0.0)
 
 
 def _tangent_axes(frame: PrincipalFrame) -> Tensor:
