@@ -5,7 +5,7 @@ from torchrg.robust.mcd import fit_detmcd
 from torchrg.robust.mm import fit_detmm, fit_dets
 from torchrg.robust.mve import fit_mve
 from torchrg.robust.result import RobustFit
-from torchrg.robust.scale import mad, median, qn, qn_exceeds
+from torchrg.robust.scale import mad, median, qn, qn_exceeds, tau
 
 __all__ = [
     "RobustFit",
@@ -18,4 +18,5 @@ __all__ = [
     "median",
     "qn",
     "qn_exceeds",
+    "tau",
 ]

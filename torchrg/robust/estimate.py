@@ -69,5 +69,5 @@ def reweight(
     covariance = covariance_entries(columns, means, weights, (count - 1).clamp(min=1))
     factor = consistency_factor(quantile, size) * small_sample
     whole = count == len(distances)
-    covariance = covariance * torch.where(whole, 1.0, factor)[:, None, None]
+    covariance = torch.where(whole[:, None, None], covariance, covariance * factor)
     return Reweighting(join_columns(means), covariance, weights > 0)

@@ -79,7 +79,9 @@ def fit_fastmcd(
             columns, final, floor, quantile, support_fraction, small_sample=small_sample
         )
 
-    return fit_patchwise("fit_fastmcd", patches, mask, support_fraction, chunk_size, estimator)
+    return fit_patchwise(
+        "fit_fastmcd", patches, mask, support_fraction, quantile, chunk_size, estimator
+    )
 
 
 def _distinct_best(sets: Concentrated, number: int) -> Tensor:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchrg.linalg import eigh3
-from torchrg.robust.scale import sort_rows
 
 
 def split_columns(patches: Tensor) -> list[Tensor]:
@@ -111,3 +110,10 @@ def eigenvectors(matrices: Tensor) -> Tensor:
         return eigh3(matrices)[1]
     vectors: Tensor = torch.linalg.eigh(matrices)[1]
     return vectors
+
+
+def sort_rows(rows: Tensor) -> Tensor:
+    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
+    if rows.device.type == "cpu":
+        return torch.from_numpy(np.sort(rows.numpy(), axis=1))
+    return rows.sort(dim=1).values

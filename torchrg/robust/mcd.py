@@ -75,7 +75,9 @@ def fit_detmcd(
             columns, sets, floor, quantile, support_fraction, small_sample=small_sample
         )
 
-    return fit_patchwise("fit_detmcd", patches, mask, support_fraction, chunk_size, estimator)
+    return fit_patchwise(
+        "fit_detmcd", patches, mask, support_fraction, quantile, chunk_size, estimator
+    )
 
 
 def check_starts(caller: str, starts: str) -> None:

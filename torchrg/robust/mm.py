@@ -97,7 +97,9 @@ def fit_dets(
         shape, scale = _best_s_estimate(columns, floor, size, starts)
         return _estimate(columns, shape, shape, scale, quantile)
 
-    return fit_patchwise("fit_dets", patches, mask, 0.5, chunk_size, estimator, majority=half_size)
+    return fit_patchwise(
+        "fit_dets", patches, mask, 0.5, quantile, chunk_size, estimator, majority=half_size
+    )
 
 
 def fit_detmm(
@@ -160,7 +162,9 @@ def fit_detmm(
         final = _choose(after <= before, final, first)
         return _estimate(columns, first, final, scale, quantile)
 
-    return fit_patchwise("fit_detmm", patches, mask, 0.5, chunk_size, estimator, majority=half_size)
+    return fit_patchwise(
+        "fit_detmm", patches, mask, 0.5, quantile, chunk_size, estimator, majority=half_size
+    )
 
 
 def _best_s_estimate(

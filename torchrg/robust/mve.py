@@ -99,7 +99,9 @@ def fit_mve(
             singular=ellipsoid.singular,
         )
 
-    return fit_patchwise("fit_mve", patches, mask, support_fraction, chunk_size, estimator)
+    return fit_patchwise(
+        "fit_mve", patches, mask, support_fraction, quantile, chunk_size, estimator
+    )
 
 
 def _smallest_ellipsoid(

@@ -29,6 +29,7 @@ def fit_patchwise(
     patches: Tensor,
     mask: Tensor | None,
     support_fraction: float,
+    quantile: float,
     chunk_size: int,
     estimator: Estimator,
     majority: Callable[[int], int] | None = None,
@@ -45,6 +46,8 @@ def fit_patchwise(
         raise ConfigError(
             f"{caller}: expected support_fraction from 0.5 to 1, got {support_fraction!r}."
         )
+    if not 0 < quantile < 1:
+        raise ConfigError(f"{caller}: expected quantile above 0 and below 1, got {quantile!r}.")
     if chunk_size < 1:
         raise ConfigError(f"{caller}: expected chunk_size of at least 1, got {chunk_size!r}.")
     batch, (num_points, size) = patches.shape[:-2], patches.shape[-2:]

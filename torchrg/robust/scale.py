@@ -1,10 +1,11 @@
-"""Robust scales of many short rows: median absolute deviation, Qn.
+"""Robust scales of many short rows: median absolute deviation, Qn, tau.
 
 The constants make the scales consistent for the standard deviation of normal data.
 """
 
 from collections.abc import Callable
 from math import comb
+from statistics import NormalDist
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
 from torchrg.robust.differences import count_differences, half_size, majority_difference
+from torchrg.robust.lanes import median_of_sorted, sort_rows, sum_points
 
 MAD_FACTOR = 1.4826
 """1 / Phi^-1(3/4), to the digits of the literature."""
@@ -25,6 +27,9 @@ The exact value 1 / (sqrt(2) Phi^-1(5/8)) is 2.219144.
 
 QN_REVISED_FACTOR = 2.21914
 """Factor that goes with the finite-sample factors of :func:`qn_sample_factor`."""
+
+_TAU_WEIGHT_CUT = 4.5
+_TAU_SCALE_CUT = 3.0
 
 _QN_SMALL: tuple[float, ...] = (0.399356, 0.99365, 0.51321, 0.84401, 0.6122, 0.85877)
 _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
@@ -151,6 +156,60 @@ def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | Non
     return _per_count("qn_exceeds", x, dim, mask, of_sorted)
 
 
+def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    r"""Return the tau scale of Maronna and Zamar: a truncated standard deviation.
+
+    With :math:`s_0` the median of the deviations from the median: the centre is the mean with
+    bisquare weights that vanish at :math:`4.5 s_0`, and the scale the root of the mean square
+    about it, each deviation cut at :math:`3 s_0` [1]. Cheaper than Qn for long rows, linear but
+    for a sort.
+
+    Args:
+        x: Values, floating point, any shape.
+        dim: Axis to reduce.
+        mask: Which values count, same shape as ``x``, bool. Default: all.
+
+    Returns:
+        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
+        NaN where no value counts or one that counts is NaN.
+
+    Raises:
+        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
+
+    References:
+        [1] R. A. Maronna, R. H. Zamar. Robust estimates of location and dispersion for
+        high-dimensional datasets. Technometrics 44, 2002.
+
+    Example:
+        >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
+        tensor(1.7441)
+    """
+    return _per_count("tau", x, dim, mask, tau_of_sorted)
+
+
+def tau_of_sorted(rows: Tensor) -> Tensor:
+    """Tau scale of each sorted row of ``(B, n)``, shape ``(B,)``."""
+    if rows.shape[1] == 0:
+        return rows.new_full((len(rows),), torch.nan)
+    lanes = rows.t().contiguous()
+    spread = _sorted_median(sort_rows((rows - _sorted_median(rows)[:, None]).abs()))
+    unit = torch.where(spread > 0, spread, 1.0)
+    standard = (lanes - _sorted_median(rows)) / unit
+    weights = (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
+    center = sum_points(weights * standard) / sum_points(weights)
+    squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
+    variance = sum_points(squares) / (len(lanes) * _tau_consistency())
+    return torch.where(spread > 0, unit * variance.sqrt(), spread)
+
+
+def _tau_consistency() -> float:
+    """Mean of the truncated squares where the values are standard normal."""
+    normal = NormalDist()
+    cut = _TAU_SCALE_CUT * normal.inv_cdf(0.75)
+    inside = (1 - cut * cut) * normal.cdf(cut) - cut * normal.pdf(cut) + cut * cut
+    return 2 * inside - 1
+
+
 def qn_sample_factor(n: int) -> float:
     """Return the factor that makes Qn of ``n`` normal values unbiased (robustbase's revision).
 
@@ -167,21 +226,11 @@ def qn_sample_factor(n: int) -> float:
     return 1 / (1 + (3.67561 + (1.9654 + (6.987 - 77 / n) / n) / n) / n)
 
 
-def sort_rows(rows: Tensor) -> Tensor:
-    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
-    if rows.device.type == "cpu":
-        return torch.from_numpy(np.sort(rows.numpy(), axis=1))
-    return rows.sort(dim=1).values
-
-
 def _sorted_median(rows: Tensor) -> Tensor:
     """Median of each sorted row; NaN where the row is empty or has a NaN, which sorts last."""
-    n = rows.shape[1]
-    if n == 0:
+    if rows.shape[1] == 0:
         return rows.new_full((len(rows),), torch.nan)
-    low, high = rows[:, (n - 1) // 2], rows[:, n // 2]
-    middle = low if n % 2 else low + (high - low) / 2
-    return torch.where(rows[:, -1].isnan(), torch.nan, middle)
+    return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
 
 
 def _per_count(

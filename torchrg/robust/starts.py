@@ -13,15 +13,18 @@ from torchrg.robust.lanes import (
     median_of_sorted,
     median_points,
     smallest_points,
+    sort_rows,
     sorted_points,
     sum_points,
     sum_squares,
 )
-from torchrg.robust.scale import QN_REVISED_FACTOR, qn_sample_factor, sort_rows
+from torchrg.robust.scale import QN_REVISED_FACTOR, qn_sample_factor, tau_of_sorted
 from torchrg.robust.scatter import covariance_entries
 
 NUM_STARTS = 6
 """Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order."""
+
+_LONG = 1000
 
 
 def deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
@@ -46,18 +49,24 @@ def _standardize(column: Tensor) -> Tensor:
     """Subtract the median of each lane and divide by its Qn."""
     rows = sorted_points(column)
     center = median_of_sorted(rows)
-    # Only the tangent start sees the factor; robustbase uses this one.
-    factor = QN_REVISED_FACTOR * qn_sample_factor(len(column))
-    return (column - center) / _positive_scale(rows, center, factor)
+    return (column - center) / _positive_scale(rows, center)
 
 
-def _positive_scale(rows: Tensor, center: Tensor, factor: float = 1.0) -> Tensor:
-    """Qn of sorted rows; where that is zero, the first positive quantile of the deviations.
+def _scale(rows: Tensor) -> Tensor:
+    """Qn of sorted rows with its finite-sample factor; tau of long ones, as robustbase has it."""
+    count = rows.shape[1]
+    if count >= _LONG:
+        return tau_of_sorted(rows)
+    return QN_REVISED_FACTOR * qn_sample_factor(count) * majority_difference(rows)
 
-    Qn is zero where most values are equal. The quantiles, at levels 0.5, 0.55, ..., 0.95, 0.9875,
+
+def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
+    """Scale of sorted rows; where that is zero, the first positive quantile of the deviations.
+
+    It is zero where most values are equal. The quantiles, at levels 0.5, 0.55, ..., 0.95, 0.9875,
     are divided by those of a normal distribution; a constant row has scale 1.
     """
-    scale = factor * majority_difference(rows)
+    scale = _scale(rows)
     zero = torch.nonzero(~(scale > 0)).squeeze(1)
     if len(zero) == 0:
         return scale
@@ -140,11 +149,10 @@ def _pairwise_qn(columns: list[Tensor]) -> Tensor:
     size = len(columns)
     matrix = columns[0].new_zeros(columns[0].shape[1], size, size)
     matrix.diagonal(dim1=-2, dim2=-1).fill_(1.0)
-    factor = QN_REVISED_FACTOR * qn_sample_factor(len(columns[0]))
     for i in range(size):
         for j in range(i + 1, size):
-            total = factor * majority_difference(sorted_points(columns[i] + columns[j]))
-            rest = factor * majority_difference(sorted_points(columns[i] - columns[j]))
+            total = _scale(sorted_points(columns[i] + columns[j]))
+            rest = _scale(sorted_points(columns[i] - columns[j]))
             matrix[:, i, j] = matrix[:, j, i] = (total * total - rest * rest) / 4
     return matrix
 

@@ -1,0 +1,196 @@
+import numpy as np
+import pytest
+import torch
+
+from tests.robust.oracle_cases import (
+    FLAT_IN_FLOAT32,
+    FRACTIONS,
+    angle_deg,
+    fit_all,
+    load_oracles,
+    local_float32,
+    normal_of,
+    points_of,
+)
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.robust import fit_detmcd
+from torchrg.robust.weights import consistency_factor, small_sample_factor, subset_size
+
+
+def regular_fits(patches, cases, answers, key, **settings):
+    """Fits of the cases in general position that the reference has an answer for."""
+    for level, fraction in FRACTIONS.items():
+        known = {}
+        for name, points in patches.items():
+            answer = answers[name].get(key.format(level), {})
+            if "best" in answer and not cases[name][f"exact_fit_{level}"]:
+                known[name] = points
+        fits = fit_all(
+            known, lambda batch, a=fraction: fit_detmcd(batch, support_fraction=a, **settings)
+        )
+        for name, fit in fits.items():
+            yield name, fraction, fit, answers[name][key.format(level)]
+
+
+def assert_close(found, expected, tolerance, name):
+    expected = np.reshape(expected, (3, 3))
+    assert np.abs(found - expected).max() < tolerance * np.abs(expected).max(), name
+
+
+@pytest.mark.parametrize("starts", ["robustbase", "paper"])
+def test_subset_weights_and_scatter_are_those_of_the_reference(oracles_folder, starts):
+    patches, cases, ours = load_oracles(oracles_folder, "ref_numpy")
+    seen = 0
+    key = f"detmcd_{starts}_{{}}"
+    for name, _, fit, answer in regular_fits(patches, cases, ours, key, starts=starts):
+        assert points_of(fit.raw_support) == set(answer["best"]), name
+        tolerance = 1e-6 if name.endswith("utm") else 1e-8
+        assert abs(fit.log_det.item() - answer["logdet"]) < tolerance, name
+        assert points_of(fit.support) == set(np.flatnonzero(answer["weights"])), name
+        raw = fit.raw_covariance.numpy() / answer["raw_consistency"]
+        factor = 1 if fit.support.all() else consistency_factor(0.975, 3)
+        assert_close(raw, answer["raw_cov_uncorrected"], 1e-8, name)
+        assert_close(fit.covariance.numpy() / factor, answer["cov_uncorrected"], 1e-8, name)
+        seen += 1
+    assert seen > 115
+
+
+def test_robustbase_variant_agrees_with_robustbase(oracles_folder):
+    patches, cases, robustbase = load_oracles(oracles_folder, "r_robustbase")
+    seen = 0
+    settings = {"starts": "robustbase", "small_sample": True}
+    for name, fraction, fit, answer in regular_fits(
+        patches, cases, robustbase, "detmcd_{}", **settings
+    ):
+        assert points_of(fit.raw_support) == set(answer["best"]), name
+        tolerance = 1e-6 if name.endswith("utm") else 1e-8
+        assert abs(fit.log_det.item() - answer["crit"]) < tolerance, name
+        if len(fit.support) <= 6:
+            continue  # its factor for few points is negative or above a hundred
+        assert_close(
+            fit.raw_covariance.numpy() / np.prod(answer["raw_cnp2"]),
+            np.asarray(answer["raw_cov"]) / np.prod(answer["raw_cnp2"]),
+            1e-6,  # the published factor has six digits
+            name,
+        )
+        assert points_of(fit.support) == set(np.flatnonzero(answer["raw_weights"])), name
+        factor = 1
+        if not fit.support.all():
+            factor = consistency_factor(0.975, 3)
+            factor *= small_sample_factor(len(fit.support), 3, fraction, reweighted=True)
+        expected = np.asarray(answer["cov"]) / np.prod(answer["cnp2"])
+        assert_close(fit.covariance.numpy() / factor, expected, 1e-8, name)
+        seen += 1
+    assert seen > 110
+
+
+@pytest.mark.parametrize("starts", ["robustbase", "paper"])
+def test_float32_finds_the_same_subset(oracles_folder, starts):
+    patches, cases, ours = load_oracles(oracles_folder, "ref_numpy")
+    local = {
+        name: local_float32(points)
+        for name, points in patches.items()
+        if name not in FLAT_IN_FLOAT32
+    }
+    key = f"detmcd_{starts}_{{}}"
+    for name, _, fit, answer in regular_fits(local, cases, ours, key, starts=starts):
+        assert points_of(fit.raw_support) == set(answer["best"]), name
+        if name in ("planar_very_fine", "line_noisy"):
+            continue  # thinner than a matrix of float32 can hold
+        assert abs(fit.log_det.item() - answer["logdet"]) < 1e-3, name
+        assert angle_deg(normal_of(fit.covariance), normal_of(answer["cov"])) < 0.01, name
+
+
+def test_size_of_the_subset_is_that_of_robustbase(oracles_folder):
+    _, _, robustbase = load_oracles(oracles_folder, "r_robustbase")
+    for answers in robustbase.values():
+        for level, fraction in FRACTIONS.items():
+            answer = answers[f"detmcd_{level}"]
+            if "h" in answer:
+                assert subset_size(answers["n"], 3, fraction) == answer["h"]
+                assert answer["raw_cnp2"][0] == pytest.approx(
+                    consistency_factor(answer["h"] / answers["n"], 3), rel=1e-12
+                )
+    assert subset_size(50, 3, 1.0) == 50
+
+
+def test_plane_starts_do_not_depend_on_rotation(rng):
+    patches = torch.randn(60, 50, 3, generator=rng, dtype=torch.float64)
+    patches[..., 2] *= 0.05
+    patches[:, :18, 2] += 0.4
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=rng, dtype=torch.float64)).Q
+    for starts in ("planes", "more"):
+        fit = fit_detmcd(patches, starts=starts)
+        turned = fit_detmcd(patches @ turn.T, starts=starts)
+        assert torch.equal(fit.raw_support, turned.raw_support)
+        assert torch.equal(fit.support, turned.support)
+        torch.testing.assert_close(turned.location, fit.location @ turn.T)
+        torch.testing.assert_close(turned.covariance, turn @ fit.covariance @ turn.T)
+
+
+def test_more_starts_lower_the_objective(rng):
+    patches = torch.randn(60, 50, 3, generator=rng)
+    patches[..., 2] *= 0.02
+    patches[:, :20, 2] += patches[:, :20, 0].abs()
+    paper, more = fit_detmcd(patches), fit_detmcd(patches, starts="more")
+    planes = fit_detmcd(patches, starts="planes")
+    assert (more.log_det <= planes.log_det + 1e-4).all()
+    assert more.log_det.mean() < paper.log_det.mean() - 0.1
+
+
+@pytest.mark.parametrize("num_coordinates", [1, 2, 4, 5])
+@pytest.mark.parametrize("starts", ["paper", "robustbase", "planes", "more"])
+def test_any_number_of_coordinates(num_coordinates, starts, rng):
+    patches = torch.randn(20, 60, num_coordinates, generator=rng, dtype=torch.float64)
+    patches[..., -1] *= 0.05
+    patches[:, :15, -1] += 3
+    fit = fit_detmcd(patches, starts=starts)
+    assert fit.valid.all()
+    assert not fit.exact_fit.any()
+    assert not fit.support[:, :15].any()
+    assert fit.support[:, 15:].double().mean() > 0.8
+    assert fit.covariance.shape == (20, num_coordinates, num_coordinates)
+
+
+def test_long_patches_use_tau(rng):
+    patch = torch.randn(1100, 3, generator=rng, dtype=torch.float64)
+    patch[:400, 2] += 20
+    fit = fit_detmcd(patch)
+    assert not fit.support[:400].any()
+    assert fit.support[400:].double().mean() > 0.95
+
+
+def test_distances_decide_the_support(rng):
+    patches = torch.randn(30, 50, 3, generator=rng, dtype=torch.float64)
+    fit = fit_detmcd(patches)
+    assert torch.equal(fit.support, fit.sq_distances <= 9.348403604496148)
+    offset = patches - fit.raw_location[:, None]
+    expected = (offset @ torch.linalg.inv(fit.raw_covariance) * offset).sum(-1)
+    torch.testing.assert_close(fit.sq_distances, expected)
+    inliers = patches[0][fit.support[0]]
+    torch.testing.assert_close(fit.location[0], inliers.mean(0))
+
+
+def test_numpy_arrays_are_accepted(rng):
+    patch = torch.randn(30, 3, generator=rng)
+    assert torch.equal(fit_detmcd(patch.numpy()).location, fit_detmcd(patch).location)
+
+
+def test_refusals():
+    patch = torch.zeros(50, 3)
+    with pytest.raises(ShapeError, match=r"fit_detmcd: expected patches of shape \(\*, K, P\)"):
+        fit_detmcd(torch.zeros(3))
+    with pytest.raises(ShapeError, match="fit_detmcd: expected mask of shape"):
+        fit_detmcd(patch, torch.ones(49, dtype=torch.bool))
+    with pytest.raises(ShapeError, match="fit_detmcd: expected patches of float32 or float64"):
+        fit_detmcd(patch.long())
+    with pytest.raises(ConfigError, match=r"expected support_fraction from 0.5 to 1, got 0.4"):
+        fit_detmcd(patch, support_fraction=0.4)
+    with pytest.raises(ConfigError, match="expected chunk_size of at least 1, got 0"):
+        fit_detmcd(patch, chunk_size=0)
+    with pytest.raises(ConfigError, match="expected starts to be one of paper, robustbase"):
+        fit_detmcd(patch, starts="six")
+    with pytest.raises(ConfigError, match=r"expected quantile above 0 and below 1, got 1"):
+        fit_detmcd(patch, quantile=1)
+    with pytest.raises(ConfigError, match="expected points of 3 coordinates"):
+        fit_detmcd(torch.randn(50, 2), small_sample=True)

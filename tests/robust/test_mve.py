@@ -1,0 +1,64 @@
+from math import log
+
+import pytest
+import torch
+
+from tests.robust.oracle_cases import FRACTIONS, load_oracles, points_of
+from torchrg.errors import ConfigError
+from torchrg.robust import fit_mve
+
+# The h-th and the next point lie at the same distance: which of them is covered is open.
+TIED = {("corner_34", "75")}
+
+
+def compare(folder, names):
+    patches, cases, ours, mass = load_oracles(folder, "ref_numpy", "r_mass")
+    for name in patches if names is None else names:
+        for level, fraction in FRACTIONS.items():
+            answer = ours[name].get(f"mve_exhaustive_{level}")
+            if cases[name][f"exact_fit_{level}"] or not answer:
+                continue
+            fit = fit_mve(
+                torch.from_numpy(patches[name]), support_fraction=fraction, exhaustive=True
+            )
+            assert abs(fit.log_det.item() - answer["log_objective"]) < 1e-7, name
+            if (name, level) not in TIED:
+                assert points_of(fit.raw_support) == set(answer["covered"]), name
+            if level == "50" and mass[name]["mve_exact"]:
+                expected = mass[name]["mve"]["crit"] - 3 * log(3)
+                assert abs(fit.log_det.item() - expected) < 1e-7, name
+
+
+def test_exhaustive_search_finds_the_least_volume(oracles_folder):
+    compare(oracles_folder, [f"small_n{n:02d}" for n in (7, 8, 9, 10, 11, 12, 13, 15)])
+
+
+@pytest.mark.slow
+def test_exhaustive_search_finds_the_least_volume_of_all_cases(oracles_folder):
+    compare(oracles_folder, None)
+
+
+def test_random_search_comes_near(oracles_folder):
+    patches, cases, ours = load_oracles(oracles_folder, "ref_numpy")
+    for name, patch in patches.items():
+        answer = ours[name].get("mve_exhaustive_50")
+        if cases[name]["group"] not in ("planar", "edge", "curved") or not answer:
+            continue
+        fit = fit_mve(torch.from_numpy(patch), num_starts=3000)
+        assert -1e-7 < fit.log_det.item() - answer["log_objective"] < 1.0, name
+
+
+def test_covers_h_points_and_leaves_out_a_cluster(dtype, rng):
+    patches = torch.randn(8, 50, 3, generator=rng, dtype=dtype)
+    patches[:, :12] += 9
+    fit = fit_mve(patches, generator=torch.Generator().manual_seed(3))
+    assert (fit.raw_support.sum(dim=1) == 27).all()
+    assert not fit.support[:, :12].any()
+    whole = fit_mve(patches, support_fraction=1.0)
+    assert whole.raw_support.all()
+    assert whole.support.all()
+
+
+def test_refusals():
+    with pytest.raises(ConfigError, match="fit_mve: expected num_starts of at least 1, got -1"):
+        fit_mve(torch.zeros(5, 3), num_starts=-1)

@@ -1,0 +1,170 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.robust.oracle_cases import load_oracles, local_float32
+from torchrg.errors import ShapeError
+from torchrg.robust import mad, median, qn, qn_exceeds, tau
+from torchrg.robust.scale import qn_sample_factor
+
+
+def literal_qn(values):
+    """The definition: every pair, sorted, the C(h, 2)-th."""
+    n = len(values)
+    h = n // 2 + 1
+    pairs = sorted(abs(a - b) for a, b in itertools.combinations(values, 2))
+    return 2.2219 * pairs[math.comb(h, 2) - 1]
+
+
+def assert_close(found, expected, tolerance):
+    expected = np.asarray(expected, dtype=np.float64)
+    np.testing.assert_allclose(np.asarray(found, np.float64), expected, rtol=tolerance, atol=0)
+
+
+def test_qn_agrees_with_other_implementations(oracles_folder):
+    patches, _, ours, robustbase = load_oracles(oracles_folder, "ref_numpy", "r_robustbase")
+    for name, patch in patches.items():
+        columns = torch.from_numpy(patch)
+        raw = qn(columns, dim=0) / 2.2219
+        theirs = robustbase[name]["Qn"]
+        assert_close(raw, ours[name]["qn"]["raw_order_stat"], 1e-12)
+        assert_close(qn(columns, dim=0), theirs["const22219_nofinite"], 1e-6)
+        assert_close(qn(columns, dim=0, finite_sample=True), theirs["default"], 1e-6)
+        assert_close(mad(columns, dim=0), theirs["mad"], 1e-12)
+        assert_close(median(columns, dim=0), theirs["median"], 1e-12)
+
+
+def test_qn_of_float32_agrees_after_centering(oracles_folder):
+    patches, _, ours = load_oracles(oracles_folder, "ref_numpy")
+    for name, patch in patches.items():
+        if name.endswith(("utm", "off1e4")):
+            continue
+        expected = np.asarray(ours[name]["qn"]["raw_order_stat"])
+        found = qn(local_float32(patch), dim=0).double().numpy() / 2.2219
+        rounding = 2e-7 * np.abs(patch - patch[0]).max(axis=0)
+        assert (np.abs(found - expected) <= 1e-6 * expected + rounding).all(), name
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 9, 12, 13, 36, 37, 49, 50, 51, 52, 53, 64])
+def test_qn_is_its_definition(n, dtype, rng):
+    rows = torch.randn(7, n, generator=rng, dtype=dtype)
+    rows[1] = rows[1].round()
+    rows[2, : n // 2 + 1] = 3.0
+    rows[3] *= 10.0 ** torch.arange(n, dtype=dtype).clamp(max=12)
+    expected = [literal_qn(row.tolist()) for row in rows]
+    assert_close(qn(rows), expected, 4 * torch.finfo(dtype).eps)
+
+
+@given(
+    st.lists(
+        st.one_of(st.sampled_from([0.0, 1.0, 1.5, -2.0]), st.floats(-1e6, 1e6, width=32)),
+        min_size=2,
+        max_size=53,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_qn_is_its_definition_with_ties_and_mixed_magnitudes(values):
+    row = torch.tensor(values, dtype=torch.float64)
+    assert_close(qn(row), literal_qn(values), 1e-12)
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 0.25, 1.0, 1.5, 7.0]), min_size=1, max_size=52),
+    st.sampled_from([0.0, 0.5, 2.2219 * 0.25, 2.2219, 5.0, math.inf]),
+    st.sampled_from([torch.float32, torch.float64]),
+)
+@settings(max_examples=80, deadline=None)
+def test_qn_exceeds_is_qn_greater_than_the_threshold(values, threshold, dtype):
+    row = torch.tensor(values, dtype=dtype)
+    assert qn_exceeds(row, threshold).item() == (qn(row) > threshold).item()
+
+
+def test_qn_exceeds_at_the_value_of_qn_itself(dtype, rng):
+    rows = torch.randn(60, 50, generator=rng, dtype=dtype)
+    for row, value in zip(rows, qn(rows).tolist(), strict=True):
+        assert not qn_exceeds(row, value)
+
+
+def test_masked_values_do_not_count(dtype, rng):
+    rows = torch.randn(12, 50, generator=rng, dtype=dtype)
+    mask = torch.rand(12, 50, generator=rng) < torch.linspace(0, 1, 12)[:, None]
+    spoiled = torch.where(mask, rows, torch.nan)
+    for function in (median, mad, tau, qn, lambda x, **k: qn(x, finite_sample=True, **k)):
+        found = function(spoiled, mask=mask)
+        singles = torch.stack([function(r[m]) for r, m in zip(rows, mask, strict=True)])
+        torch.testing.assert_close(found, singles, rtol=0, atol=0, equal_nan=True)
+    assert torch.equal(qn_exceeds(spoiled, 1.0, mask=mask), qn(spoiled, mask=mask) > 1.0)
+
+
+def test_scales_of_few_values():
+    empty, one = torch.zeros(3, 0), torch.tensor([[4.0]])
+    assert qn(empty).isnan().all()
+    assert median(empty).isnan().all()
+    assert not qn_exceeds(empty, 1.0).any()
+    assert qn(one).item() == 0
+    assert mad(one).item() == 0
+    assert tau(one).item() == 0
+    assert tau(empty).isnan().all()
+
+
+def test_nan_stays_in_its_row():
+    rows = torch.arange(100.0).reshape(2, 50)
+    rows[1, 3] = torch.nan
+    for function in (median, mad, tau, qn):
+        result = function(rows)
+        assert result[0].isfinite()
+        assert result[1].isnan()
+    assert not qn_exceeds(rows, 0.0)[1]
+
+
+def test_qn_of_a_row_does_not_depend_on_its_batch(dtype, rng):
+    rows = torch.randn(300, 50, generator=rng, dtype=dtype)
+    assert torch.equal(qn(rows), torch.stack([qn(row) for row in rows]))
+    assert torch.equal(qn(rows.t(), dim=0), qn(rows))
+    assert torch.equal(qn(rows.reshape(2, 150, 50)), qn(rows).reshape(2, 150))
+
+
+def test_qn_does_not_depend_on_order_shift_and_sign(rng):
+    rows = torch.randint(-1000, 1000, (50, 50), generator=rng).double()
+    shuffled = rows[:, torch.randperm(50, generator=rng)]
+    assert torch.equal(qn(shuffled), qn(rows))
+    assert torch.equal(qn(rows + 4e6), qn(rows))
+    assert torch.equal(qn(-rows), qn(rows))
+    assert torch.equal(qn(rows * 2.0**-20), qn(rows) * 2.0**-20)
+
+
+def test_tau_agrees_with_statsmodels():
+    # statsmodels.robust.scale.scale_tau(np.array(row))[1]
+    rows = {
+        1.744097372590729: [1.0, 2.0, 3.0, 4.0, 1000.0],
+        1.3164607533630004: [0.3, -1.2, 5.0, 2.2, 0.1, 0.9, -0.4],
+    }
+    for expected, row in rows.items():
+        assert_close(tau(torch.tensor(row, dtype=torch.float64)), expected, 1e-14)
+
+
+def test_finite_sample_factor_tends_to_one():
+    assert qn_sample_factor(1) == 1
+    assert qn_sample_factor(2) == 0.399356
+    assert 0.999 < qn_sample_factor(10_001) < qn_sample_factor(100_001) < 1
+
+
+def test_scales_are_consistent_at_the_normal_distribution(rng):
+    row = torch.randn(4000, generator=rng, dtype=torch.float64)
+    assert abs(qn(row[:1500]) - 1) < 0.05
+    assert abs(mad(row) - 1) < 0.05
+    assert abs(tau(row) - 1) < 0.05
+
+
+def test_refusals():
+    with pytest.raises(ShapeError, match="qn: expected x of float32 or float64, got int64"):
+        qn(torch.zeros(3, dtype=torch.int64))
+    with pytest.raises(ShapeError, match=r"median: expected x with an axis 2, got shape \(3,\)"):
+        median(torch.zeros(3), dim=2)
+    with pytest.raises(ShapeError, match=r"mad: expected mask of shape \(\*\) with \*=\(3,\)"):
+        mad(torch.zeros(3), mask=torch.ones(4, dtype=torch.bool))
