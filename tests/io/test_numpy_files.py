@@ -110,8 +110,9 @@ def array_bytes(shape, descr="'<f8'", data=b""):
     [
         (array_bytes((10**12, 3)), r"byte \d+: expected 24,000,000,000,000 bytes for the array of"),
         (array_bytes((4, 3), data=b"0" * 95), r"byte \d+: expected 96 bytes .*, got 95; the file"),
-        (array_bytes((-4, 3)), r"byte 0: expected a shape in the array, got \(-4, 3\)"),
-        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: expected a shape in the array"),
+        (array_bytes((-4, 3)), r"byte 0: expected a shape and a type in the array, got \(-4, 3\)"),
+        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: expected a shape and a type in the array"),
+        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: expected a shape and a type in the array"),
         (array_bytes((4, 2), data=b"0" * 64), r"expected an array of shape \(N, 3\) or wider, got"),
         (array_bytes((), data=b"0" * 8), r"expected an array of shape \(N, 3\) or wider, got \(\)"),
         (array_bytes((0, 3)), "expected at least one point, got none"),
@@ -182,6 +183,20 @@ def test_damaged_member_is_refused(tmp_path):
     data[data.index(POINTS[2:].tobytes())] ^= 1
     (tmp_path / "a.npz").write_bytes(data)
     with pytest.raises(FormatError, match=r"a\.npz: 'points\.npy': Bad CRC-32"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_names_that_are_no_text_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", points=POINTS, extra=POINTS)
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    place = data.rindex(b"extra.npy")
+    data[place] = 0x93
+    # The flag that names are UTF-8, in the directory.
+    data[place - 46 + 9] |= 0x08
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(
+        FormatError, match=r"a\.npz: expected an archive of NumPy arrays, got: 'utf-8"
+    ):
         read_cloud(tmp_path / "a.npz")
 
 

@@ -92,7 +92,9 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     try:
         check_file(source)
         found = _format_of(source)
-        return found.read(source)
+        # Files may hold any bits as numbers: values that overflow or signal are kept, not reported.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return found.read(source)
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
 

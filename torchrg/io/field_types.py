@@ -24,8 +24,7 @@ def _reach(values: NDArray[Any]) -> float:
 
 def are_unit(rows: NDArray[Any]) -> bool:
     """Whether rows are unit vectors up to 1e-3, or zero or not numbers where there is none."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        squares = np.square(rows.astype(np.float64)).sum(axis=1)
+    squares = np.square(rows.astype(np.float64)).sum(axis=1)
     rest = squares[np.isfinite(squares) & (squares != 0)]
     return len(rest) > 0 and bool((np.abs(rest - 1) < 2e-3).all())
 

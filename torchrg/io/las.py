@@ -51,11 +51,8 @@ def read_las(path: Path) -> Cloud:
     size = check_file(path)
     check_header(path, size)
     try:
-        with (
-            np.errstate(over="ignore", invalid="ignore"),
-            # The parallel backend takes what memory a damaged table of chunks asks for.
-            laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
-        ):
+        # The parallel backend takes what memory a damaged table of chunks asks for.
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             header = reader.header
             start = header.offset_to_point_data
             least = 0 if header.are_points_compressed else header.point_format.size

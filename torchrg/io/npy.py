@@ -8,7 +8,6 @@ a structured array with named fields ``x``, ``y``, ``z``.
 """
 
 import math
-import struct
 import tokenize
 import zipfile
 import zlib
@@ -100,7 +99,9 @@ def read_npz(path: Path) -> Cloud:
                 for member in archive.infolist()
                 if member.filename.endswith(".npy")
             }
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, struct.error) as error:
+    except FormatError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, *DAMAGES) as error:
         raise FormatError(
             f"{path}: expected an archive of NumPy arrays, got: {first_line(error)}; "
             "fetch or write it again."
@@ -196,7 +197,9 @@ def _read_member(
     try:
         with archive.open(member) as stream:
             return _read_array(path, stream, member.file_size, content=repr(member.filename))
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except FormatError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, *DAMAGES) as error:
         raise FormatError(
             f"{path}: {member.filename!r}: {first_line(error)}; fetch the file again."
         ) from error
@@ -221,9 +224,10 @@ def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> ND
             f"{path}: expected numbers or text in {content}, got pickled Python objects, which are "
             "never loaded; convert them with numpy.asarray(..., dtype=float) and save again."
         )
-    if min(shape, default=0) < 0:
+    if min(shape, default=0) < 0 or dtype.itemsize == 0:
         raise FormatError(
-            f"{path}: byte 0: expected a shape in {content}, got {shape}; write it again."
+            f"{path}: byte 0: expected a shape and a type in {content}, got {shape} of {dtype}; "
+            "write it again."
         )
     start = stream.tell()
     check_promise(
