@@ -1,7 +1,6 @@
 """Normals and curvature of clouds: one call for every estimator."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -12,41 +11,50 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
-from torchrg.normals.chunks import fit_points
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.detmcd import fit_normals_detmcd
+from torchrg.normals.irls import fit_normals_irls
+from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.robust_fits import (
+    fit_normals_detmm,
+    fit_normals_fastmcd,
+    fit_normals_mve,
+)
 from torchrg.normals.sharp import find_sharp_points
+from torchrg.normals.single import Estimator, at_all_points, estimate_irls
 from torchrg.normals.staged import estimate_paper
 from torchrg.structures import Neighbors, NormalFit
 
 __all__ = [
     "ESTIMATORS",
+    "JetFit",
     "estimate_normals",
     "find_sharp_points",
+    "fit_jet",
     "fit_normals_detmcd",
+    "fit_normals_detmm",
+    "fit_normals_fastmcd",
+    "fit_normals_irls",
+    "fit_normals_jet",
+    "fit_normals_mve",
     "fit_normals_pca",
 ]
 
-Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
-
-
-def _at_all_points(fit: Callable[..., NormalFit]) -> Estimator:
-    """Return the estimator that fits every neighbourhood alike."""
-
-    def estimate(
-        points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
-    ) -> NormalFit:
-        def fit_block(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
-            return fit(patches, mask, resolution=resolution)
-
-        return fit_points(points, neighbors, fit_block, chunk_size=chunk_size)
-
-    return estimate
-
-
 ESTIMATORS: dict[str, Estimator] = {
-    "pca": _at_all_points(fit_normals_pca),
+    "pca": at_all_points(fit_normals_pca),
+    "jet": at_all_points(fit_normals_jet),
+    "irls": estimate_irls,
+    "fastmcd": at_all_points(
+        fit_normals_fastmcd, support_fraction="support_fraction", quantile="inlier_quantile"
+    ),
+    "mve": at_all_points(
+        fit_normals_mve, support_fraction="support_fraction", quantile="inlier_quantile"
+    ),
+    "detmcd": at_all_points(
+        fit_normals_detmcd, support_fraction="support_fraction", quantile="inlier_quantile"
+    ),
+    "detmm": at_all_points(fit_normals_detmm, quantile="inlier_quantile"),
     "paper": estimate_paper,
     "consensus": estimate_consensus,
 }

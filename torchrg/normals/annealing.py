@@ -37,7 +37,8 @@ class Surroundings(NamedTuple):
     def distances(self, normals: Tensor) -> Tensor:
         """Return signed distances to planes through the centers, shape ``(n, K)``."""
         x, y, z = (part * n for part, n in zip(self[:3], normals.T[..., None], strict=True))
-        return x + y + z
+        total: Tensor = x + y + z
+        return total
 
 
 class Plane(NamedTuple):

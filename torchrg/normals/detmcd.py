@@ -2,8 +2,9 @@
 
 from torch import Tensor
 
-from torchrg.normals.pca import fit_normals_pca
-from torchrg.robust.mcd import fit_detmcd
+from torchrg.normals.pca import check_patches
+from torchrg.normals.robust_fits import fit_inliers
+from torchrg.robust import fit_detmcd
 from torchrg.structures import NormalFit
 
 
@@ -34,6 +35,7 @@ def fit_normals_detmcd(
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
+        ConfigError: If a setting is out of range.
 
     References:
         [1] M. Hubert, P. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location and
@@ -46,6 +48,8 @@ def fit_normals_detmcd(
         >>> fit_normals_detmcd(floor).normals.abs()
         tensor([0., 0., 1.])
     """
-    robust = fit_detmcd(patches, mask, support_fraction=support_fraction, quantile=quantile)
-    plane = fit_normals_pca(patches, robust.support, resolution=resolution)
-    return plane._replace(valid=plane.valid & robust.valid)
+    check_patches("fit_normals_detmcd", patches, mask, resolution)
+    robust = fit_detmcd(
+        patches.detach(), mask, support_fraction=support_fraction, quantile=quantile
+    )
+    return fit_inliers(patches, robust, resolution)

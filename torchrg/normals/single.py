@@ -1,0 +1,87 @@
+"""Estimators of one kind of fit at every point."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrg.config import NormalsConfig
+from torchrg.neighbors import gather_patches
+from torchrg.normals.chunks import coordinate_resolution, fit_points
+from torchrg.normals.irls import fit_normals_irls
+from torchrg.normals.noise import survey_noise
+from torchrg.normals.pca import fit_normals_pca
+from torchrg.structures import Neighbors, NormalFit
+
+Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
+"""Points, their neighbours, settings, chunk size -> fit."""
+
+
+def at_all_points(fit: Callable[..., NormalFit], **settings: str) -> Estimator:
+    """Return the estimator that fits every neighbourhood alike.
+
+    Args:
+        fit: Fit of patches, as :func:`torchrg.normals.fit_normals_pca`.
+        **settings: Its keywords, and the fields of :class:`torchrg.config.NormalsConfig` for them.
+
+    Returns:
+        The estimator.
+
+    Example:
+        >>> estimate = at_all_points(fit_normals_pca)
+        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
+        >>> estimate(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
+        tensor(True)
+    """
+
+    def estimate(
+        points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
+    ) -> NormalFit:
+        chosen = {keyword: getattr(config, field) for keyword, field in settings.items()}
+
+        def fit_block(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
+            return fit(patches, mask, resolution=resolution, **chosen)
+
+        return fit_points(points, neighbors, fit_block, chunk_size=chunk_size)
+
+    return estimate
+
+
+def estimate_irls(
+    points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
+) -> NormalFit:
+    """Estimate normals by iteratively weighted PCA, with the noise found about each point.
+
+    See :func:`torchrg.normals.fit_normals_irls`. Its authors ask the user for the noise; here it
+    is estimated from the planes of PCA about each point.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        neighbors: Neighbours of all points.
+        config: Settings, none of which matters here.
+        chunk_size: Points handled at a time.
+
+    Returns:
+        The fit.
+
+    Example:
+        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
+        >>> estimate_irls(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
+        tensor(True)
+    """
+    known = points.detach()
+    planes = at_all_points(fit_normals_pca)(known, neighbors, config, chunk_size)
+    noise = survey_noise(known, neighbors, planes, chunk_size=chunk_size).noise
+    blocks = []
+    for start in range(0, max(len(points), 1), chunk_size):
+        block = slice(start, start + chunk_size)
+        blocks.append(
+            fit_normals_irls(
+                gather_patches(points, neighbors.indices[block]),
+                None if neighbors.valid is None else neighbors.valid[block],
+                noise=noise[block],
+                resolution=coordinate_resolution(points[block]),
+            )
+        )
+    parts = (torch.cat(part) for part in list(zip(*blocks, strict=True))[:4])
+    return NormalFit(*parts)
