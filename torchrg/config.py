@@ -92,7 +92,7 @@ class GrowingConfig:
     flat region that they touch and whose plane they are on."""
     absorb_reach: float = 3.0
     """They are on it when they are within this many times its thickness."""
-    absorb_angle_deg: float = 30.0
+    absorb_angle_deg: float = 45.0
     """And when their normal is within this angle of the plane's."""
     merge_coplanar: bool = False
     """Whether flat regions that touch and lie on one plane then become one."""

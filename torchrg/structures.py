@@ -156,7 +156,8 @@ class Planes(NamedTuple):
             column, a bent wall. Its plane is the best there is, no more.
         kind: Class of each plane as a place in :data:`PLANE_KINDS`, shape ``(M,)``, int64; None
             where the up direction was not given.
-        outline: Polygons around each region; None where not asked for.
+        outline: Rings around each region, of shape ``(V, 3)``: outer ones counter-clockwise seen
+            against the normal, holes clockwise; None where not asked for.
         adjacency: Which planes meet; None where the neighbours were not given.
     """
 

@@ -30,8 +30,10 @@ class _Cells(NamedTuple):
     num_open: Tensor
 
 
-def covered_areas(segments: Segments, u: Tensor, v: Tensor, boxes: Rectangles) -> Tensor:
-    """Return the area covered by points, without gaps, holes and dents.
+def covered_areas(
+    segments: Segments, u: Tensor, v: Tensor, boxes: Rectangles
+) -> tuple[Tensor, Tensor]:
+    """Return the area covered by points, without gaps, holes and dents, and the cells' width.
 
     The plane is divided into square cells, at first three times as wide as the mean spacing of the
     points, then wider until the area settles, so that parts of low density are not full of holes.
@@ -45,13 +47,14 @@ def covered_areas(segments: Segments, u: Tensor, v: Tensor, boxes: Rectangles) -
         boxes: Rectangles about the regions.
 
     Returns:
-        Areas, shape ``(M,)``; 0 where the points are on one line.
+        Areas, shape ``(M,)``, 0 where the points are on one line; and the width of cells that
+        leaves no holes between points, shape ``(M,)``.
 
     Example:
         >>> from torchrg.regions.extents import fit_rectangles
         >>> u, v = torch.cartesian_prod(torch.arange(60.0), torch.arange(60.0)).unbind(1)
         >>> segments = Segments(torch.zeros(3600, dtype=torch.int64))
-        >>> area = covered_areas(segments, u, v, fit_rectangles(segments, u, v))
+        >>> area, width = covered_areas(segments, u, v, fit_rectangles(segments, u, v))
         >>> bool((area - 60 * 60).abs() < 150)
         True
     """
@@ -65,15 +68,15 @@ def covered_areas(segments: Segments, u: Tensor, v: Tensor, boxes: Rectangles) -
     row = _numbered(segments, u * c + v * s, size)
     column = _numbered(segments, v * c - u * s, size)
     cells = _occupied(segments.labels, row, column, len(size))
-    area = _corrected(cells, segments.counts, size)
+    area, width = _corrected(cells, segments.counts, size), size
     settled = torch.zeros_like(size, dtype=torch.bool)
     for _ in range(_NUM_DOUBLINGS):
         cells = _occupied(cells.owner, cells.row // 2, cells.column // 2, len(size))
         size = size * 2
         wider = _corrected(cells, segments.counts, size)
         settled |= wider <= _SETTLED * area
-        area = torch.where(settled, area, wider)
-    return torch.minimum(area, box)
+        area, width = torch.where(settled, area, wider), torch.where(settled, width, size)
+    return torch.minimum(area, box), width
 
 
 def _numbered(segments: Segments, x: Tensor, size: Tensor) -> Tensor:

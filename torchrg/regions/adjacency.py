@@ -1,0 +1,154 @@
+"""Which planes meet, along which length, and at which angle."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.regions.contacts import NUM_CONTACTS, contact_neighbors
+from torchrg.structures import Neighbors, PlaneAdjacency
+
+_LEAST_CONTACTS = 3
+_PARALLEL_DEG = 15.0
+_MAX_STEEPNESS = 0.5
+"""An edge with more than this share of its length across the planes leads to a parallel one."""
+
+_CHUNK_SIZE = 65536
+
+
+class _Contacts(NamedTuple):
+    """Edges between regions: numbers of their pairs, ends of the edges, places in the lists."""
+
+    pair: Tensor
+    source: Tensor
+    target: Tensor
+    rank: Tensor
+
+
+def find_adjacency(
+    points: Tensor,
+    labels: Tensor,
+    neighbors: Neighbors,
+    normal: Tensor,
+    curved: Tensor,
+) -> PlaneAdjacency:
+    r"""Find pairs of regions that meet, and measure where they do.
+
+    Flat regions at an angle meet along the line in which their planes cross: the neighbours of one
+    in the other, however narrow the strip without labels between them, are projected onto it. Their
+    extent there, gaps left out, is the length. Of parallel or curved regions only the 8 nearest
+    neighbours count, and the length is that of a curve that so many edges cross: with density
+    :math:`\rho` and n edges from each point a curve of length L meets edges with
+    :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy and Crofton) [1].
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        labels: Region of each point, shape ``(N,)``: 0 to M-1 or negative.
+        neighbors: Neighbours of each point.
+        normal: Unit normals of the planes, shape ``(M, 3)``.
+        curved: Regions that are not flat, shape ``(M,)``, bool.
+
+    Returns:
+        The pairs, in float64. Regions that touch in less than three edges do not meet.
+
+    References:
+        [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
+
+    Example:
+        >>> from torchrg.neighbors import search_knn
+        >>> floor = torch.cartesian_prod(torch.arange(9.0), torch.arange(30.0), torch.zeros(1))
+        >>> cloud = torch.cat([floor, floor[:, [2, 1, 0]] + torch.tensor([0.0, 0.1, 0.5])])
+        >>> labels = torch.arange(2).repeat_interleave(270)
+        >>> normal, curved = torch.eye(3)[[2, 0]].double(), torch.zeros(2, dtype=torch.bool)
+        >>> found = find_adjacency(cloud, labels, search_knn(cloud, 12), normal, curved)
+        >>> found.pairs.tolist(), found.dihedral_deg.round().tolist()
+        ([[0, 1]], [90.0])
+        >>> bool((found.boundary_length - 29).abs() < 2)
+        True
+    """
+    pairs, contacts = _find_contacts(labels, neighbors)
+    first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
+    angle = unsigned_angle_deg(first, second)
+    crossing = (angle > _PARALLEL_DEG) & ~curved[pairs].any(dim=1)
+    edge = points[contacts.target].double() - points[contacts.source].double()
+    across = torch.stack([(edge * side[contacts.pair]).sum(dim=1) for side in (first, second)])
+    flat = across.abs().amax(dim=0) <= _MAX_STEEPNESS * edge.norm(dim=1)
+    used = crossing[contacts.pair] | (flat & (contacts.rank < NUM_CONTACTS))
+    contacts = _Contacts(*(values[used] for values in contacts))
+    num_contacts = torch.bincount(contacts.pair, minlength=len(pairs))
+    along = torch.linalg.cross(first, second)
+    length = torch.where(
+        crossing,
+        _length_on_line(points, contacts, along / along.norm(dim=1, keepdim=True), len(pairs)),
+        _length_by_crossings(points, neighbors, contacts, len(pairs)),
+    )
+    kept = num_contacts >= _LEAST_CONTACTS
+    return PlaneAdjacency(pairs[kept], length[kept], angle[kept])
+
+
+def _find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, _Contacts]:
+    """Return the pairs of regions with an edge between them, ascending, and these edges."""
+    num_regions = int(labels.max()) + 1 if len(labels) else 0
+    keys, sources, targets, ranks = [], [], [], []
+    for start in range(0, max(len(labels), 1), _CHUNK_SIZE):
+        rows = slice(start, start + _CHUNK_SIZE)
+        indices = neighbors.indices[rows]
+        own = labels[rows, None]
+        other = labels.index_select(0, indices.reshape(-1)).view(indices.shape)
+        touches = (other != own) & (other >= 0) & (own >= 0)
+        if neighbors.valid is not None:
+            touches &= neighbors.valid[rows]
+        source, column = touches.nonzero(as_tuple=True)
+        pair = torch.stack([own.squeeze(1)[source], other[source, column]])
+        keys.append(pair.amin(dim=0) * num_regions + pair.amax(dim=0))
+        sources.append(source + start)
+        targets.append(indices[source, column].long())
+        ranks.append(column - 1)
+    found, pair = torch.unique(torch.cat(keys), return_inverse=True)
+    pairs = torch.stack([found // max(num_regions, 1), found % max(num_regions, 1)], dim=1)
+    return pairs, _Contacts(pair, torch.cat(sources), torch.cat(targets), torch.cat(ranks))
+
+
+def _length_on_line(points: Tensor, contacts: _Contacts, along: Tensor, num_pairs: int) -> Tensor:
+    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
+    origin = points[:1].double()
+    start, end = (points[rows].double() - origin for rows in (contacts.source, contacts.target))
+    size = _sum_of(contacts.pair, (end - start).norm(dim=1), num_pairs)
+    size = size / torch.bincount(contacts.pair, minlength=num_pairs)
+    place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / size[contacts.pair]
+    cell = torch.where(place.isfinite(), place, 0.0).floor().long()
+    low = int(cell.min()) if len(cell) else 0
+    width = int(cell.max()) - low + 2 if len(cell) else 1
+    keys = torch.unique(contacts.pair * width + (cell - low))
+    owner = keys // width
+    is_next = torch.zeros(len(keys), dtype=torch.float64, device=points.device)
+    is_next[1:] = (keys[1:] == keys[:-1] + 1).double()
+    # An interval of n cells on average meets n + 1: count the steps from cell to cell.
+    steps = _sum_of(owner, is_next, num_pairs)
+    return steps * torch.where(size.isfinite(), size, 0.0)
+
+
+def _length_by_crossings(
+    points: Tensor, neighbors: Neighbors, contacts: _Contacts, num_pairs: int
+) -> Tensor:
+    """Return the length of the curve that each pair's edges cross, shape ``(E,)``."""
+    nearest, counted = contact_neighbors(neighbors)
+    num_nearest = counted.sum(dim=1)[contacts.source]
+    last = nearest[contacts.source].gather(1, (num_nearest - 1).clamp(min=0)[:, None]).squeeze(1)
+    source = points[contacts.source].double()
+    sq_reach = (points[last].double() - source).square().sum(dim=1)
+    length = (points[contacts.target].double() - source).norm(dim=1)
+    share = math.pi**2 * sq_reach / (2 * num_nearest * num_nearest * length)
+    share = torch.where((contacts.rank < NUM_CONTACTS) & (length > 0), share, 0.0)
+    return _sum_of(contacts.pair, share, num_pairs)
+
+
+def _sum_of(owner: Tensor, values: Tensor, num_owners: int) -> Tensor:
+    """Return the sum of the values of each owner, one after the other."""
+    order = owner.argsort(stable=True)
+    counts = torch.bincount(owner, minlength=num_owners)
+    if num_owners == 0:
+        return values[:0]
+    return torch.segment_reduce(values[order].contiguous(), "sum", lengths=counts)

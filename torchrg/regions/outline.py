@@ -1,0 +1,79 @@
+"""Polygons around regions, with their dents and holes."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrg._optional import require
+
+Ring = NDArray[np.float64]
+
+
+def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
+    """Return the outline of points in a plane: rings through some of them.
+
+    The points near an edge, found with square cells, are triangulated. Triangles over cells without
+    points are left out, and the others united.
+
+    Args:
+        places: Points, shape ``(n, 2)``.
+        width: Width of the cells: holes and dents narrower than this are filled.
+
+    Returns:
+        Rings of shape ``(V, 2)``, the first point not repeated: outer ones counter-clockwise, holes
+        clockwise. None where the points are on one line.
+
+    Raises:
+        MissingDependencyError: If shapely is not installed.
+
+    Example:
+        >>> grid = np.stack(np.mgrid[:30, :30], axis=-1).reshape(-1, 2).astype(float)
+        >>> frame = grid[((grid < 10) | (grid >= 20)).any(axis=1)]
+        >>> outer, hole = trace_outline(frame, 3.0)
+        >>> sorted(map(tuple, outer.tolist()))
+        [(0.0, 0.0), (0.0, 29.0), (29.0, 0.0), (29.0, 29.0)]
+        >>> float(hole.min()), float(hole.max())
+        (9.0, 20.0)
+    """
+    from scipy.spatial import Delaunay, QhullError
+
+    shapely = require("shapely", extra="outline", purpose="trace outlines")
+    if width <= 0:
+        return []
+    cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
+    occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
+    occupied[tuple(cells.T)] = True
+    corners = places[~_is_inside(occupied)[tuple(cells.T)]]
+    try:
+        triangles = corners[Delaunay(corners).simplices]
+    except (QhullError, ValueError):
+        return []
+    ends = np.roll(triangles, 1, axis=1)
+    tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
+    reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
+    covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
+    shape = shapely.union_all(shapely.polygons(triangles[covered]))
+    return _rings(shapely, shapely.simplify(shape, width / 6))
+
+
+def _is_inside(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which cells have eight occupied neighbours; the border has none."""
+    inside = np.zeros_like(occupied)
+    inner = np.ones_like(occupied[1:-1, 1:-1])
+    height, length = occupied.shape
+    for i in range(3):
+        for j in range(3):
+            inner &= occupied[i : height - 2 + i, j : length - 2 + j]
+    inside[1:-1, 1:-1] = inner
+    return inside
+
+
+def _rings(shapely: Any, shape: Any) -> list[Ring]:  # noqa: ANN401
+    """Return the rings of a polygon or of several, largest polygon first."""
+    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    rings: list[Ring] = []
+    for part in sorted(parts, key=lambda part: -part.area):
+        turned = shapely.geometry.polygon.orient(part)
+        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *turned.interiors)]
+    return rings
