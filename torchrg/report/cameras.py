@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
 _MARGIN = 0.03  # of the picture on each side
+_NEAREST = 0.25  # distance of the nearest point, in depths of the cloud
+_FLATTEST = 0.25  # ratio of height to width
 
 
 def make_camera(
@@ -72,7 +74,7 @@ def fit_camera(
 
     A point at ``(x, y, z)`` along the axes is in the picture of a camera at ``(a, b, -d)`` if
     ``|x - a| <= t (d + z)`` with t the tangent of half the angle of view: the largest ``x - t z``
-    and ``-x - t z`` give a and d in closed form.
+    and the smallest ``x + t z`` give a and d in closed form.
 
     Args:
         points: What to show, shape ``(N, 3)``, finite.
@@ -85,29 +87,27 @@ def fit_camera(
     Returns:
         The camera. If all points are in one place, it looks at it from a distance of 1.
     """
-    wide = math.tan(math.radians(field_of_view_deg) / 2) * (1 - 2 * _MARGIN)
-    tangents = [wide, wide]
-    if height is not None:
-        tangents = [wide * width / max(width, height), wide * height / max(width, height)]
     across = points.double() @ axes.to(points.device).T
-    reach = [_reach(across[:, axis], across[:, 2], tangents[axis]) for axis in (0, 1)]
-    spans = [sum(pair) for pair in reach]
-    if height is None:
-        part = spans[1] / spans[0] if spans[0] > 0 else 1.0
-        rows = round(width * min(max(part, 0.25), 1.0))
-        return fit_camera(
-            points, axes, width=width, height=rows, field_of_view_deg=field_of_view_deg
-        )
-    low, high = _bounds(across[:, 2])
-    distance = max(
-        *(span / (2 * t) for span, t in zip(spans, tangents, strict=True)), high - 2 * low
-    )
-    middle = [(pair[0] - pair[1]) / 2 for pair in reach]
+    nearest, farthest = _bounds(across[:, 2])
+    forward = across[:, 2] - nearest
+    longer = max(width, height or width)
+    half = math.tan(math.radians(field_of_view_deg) / 2)
+    distance = _NEAREST * (farthest - nearest)
+    middle = across.new_zeros(2)
+    for axis, size in enumerate((width, height or width)):
+        tangent = half * (1 - 2 * _MARGIN) * size / longer
+        _, high = _bounds(across[:, axis] - tangent * forward)
+        low, _ = _bounds(across[:, axis] + tangent * forward)
+        middle[axis] = (low + high) / 2
+        distance = max(distance, (high - low) / (2 * tangent))
+    if bool((across == across[:1]).all()):
+        distance = 1.0
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = axes
-    matrix[:3, 3] = torch.tensor([-middle[0], -middle[1], distance if distance > 0 else 1.0])
-    focal = max(width, height) / 2 / math.tan(math.radians(field_of_view_deg) / 2)
-    return make_camera(matrix, focal, ((width - 1) / 2, (height - 1) / 2), width, height)
+    matrix[:2, 3], matrix[2, 3] = -middle, distance - nearest
+    focal = longer / 2 / half
+    rays = (across[:, :2] - middle) / (forward + distance)[:, None]
+    return _frame(matrix, focal, rays, width, height)
 
 
 def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "PinholeCamera":
@@ -123,18 +123,30 @@ def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "
         The camera.
     """
     ahead = points[points[:, 2] > 0].double()
-    bounds = [_bounds(ahead[:, axis] / ahead[:, 2]) for axis in (0, 1)]
-    spans = [high - low for low, high in bounds]
-    if height is None:
-        part = spans[1] / spans[0] if spans[0] > 0 else 1.0
-        height = round(width * min(max(part, 0.25), 1.0))
-    scales = [size / span for size, span in zip((width, height), spans, strict=True) if span > 0]
-    focal = min(scales) * (1 - 2 * _MARGIN) if scales else float(width)
-    center = [
-        (size - 1) / 2 - focal * (low + high) / 2
-        for size, (low, high) in zip((width, height), bounds, strict=True)
+    rays = ahead[:, :2] / ahead[:, 2:]
+    (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
+    room = (1 - 2 * _MARGIN) * width, (1 - 2 * _MARGIN) * (height or width)
+    scales = [
+        size / span
+        for size, span in zip(room, (right - left, bottom - top), strict=True)
+        if span > 0
     ]
-    return make_camera(torch.eye(4), focal, (center[0], center[1]), width, height)
+    return _frame(torch.eye(4), min(scales, default=float(width)), rays, width, height)
+
+
+def _frame(
+    world_to_camera: Tensor, focal: float, rays: Tensor, width: int, height: int | None
+) -> "PinholeCamera":
+    """Return the camera that has rays ``(N, 2)`` in the middle, of the height that they need."""
+    (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
+    if height is None:
+        needed = focal * (bottom - top) / (1 - 2 * _MARGIN)
+        height = max(1, round(min(max(needed, _FLATTEST * width), width)))
+    center = (
+        (width - 1) / 2 - focal * (left + right) / 2,
+        (height - 1) / 2 - focal * (top + bottom) / 2,
+    )
+    return make_camera(world_to_camera, focal, center, width, height)
 
 
 class Projection(NamedTuple):
@@ -180,12 +192,6 @@ def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Pro
     matrix = camera.extrinsics[:1].double().clone()
     matrix[0, :3, 3] += matrix[0, :3, :3] @ origin.to(matrix)
     return Projection(matrix.to(origin.device).float(), intrinsics.to(origin.device).float())
-
-
-def _reach(across: Tensor, forward: Tensor, tangent: float) -> tuple[float, float]:
-    """Return the largest ``x - t z`` and ``-x - t z``."""
-    spread = forward * tangent
-    return _bounds(across - spread)[1], _bounds(-across - spread)[1]
 
 
 def _bounds(values: Tensor) -> tuple[float, float]:

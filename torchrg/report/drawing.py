@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _BLOCK = 131_072  # points in work at a time
 _RADIUS = 1.3  # of a disc, in units of the local spacing: closes surfaces but for a few gaps
 _LARGEST = 4  # times the usual radius, for stray points
-_WIDEST = 0.02  # radius of a disc, in widths of the picture
+_WIDEST, _ALWAYS = 0.02, 8.0  # largest radius of a disc, in widths of the picture or in pixels
 _GAP = 0.6  # half the width of the gaps that are closed, in disc radii
 _STEEPEST = 0.05  # least cosine of the angle under which a disc is seen
 
@@ -52,7 +52,7 @@ def draw_picture(
     lengths = _RADIUS * spacing.clamp(max=_LARGEST * float(spacing.median()))
     places = kept.nonzero().squeeze(-1)
     radius, length = _usual_radius(project, grid.points, lengths, places)
-    widest = max(1.0, _WIDEST * width * supersampling)
+    widest = supersampling * max(_ALWAYS, _WIDEST * width)
     buffer = DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
