@@ -192,6 +192,19 @@ def test_points_are_spread_evenly_over_curved_faces():
     )
 
 
+def test_ends_of_extruded_parts_follow_their_rounded_outline():
+    plate = make_shape("plate", 50_000)
+    ends = plate.points[plate.labels < 2].double()
+    corner = (ends[:, 0] < 0.15) & (ends[:, 1] < 0.15)
+    assert corner.any()
+    assert (ends[corner, :2] - 0.15).norm(dim=1).max() < 0.15 + 1e-6
+    bracket = make_shape("bracket", 50_000)
+    ends = bracket.points[bracket.labels < 2].double()
+    fillet = (ends[:, 0] > 0.25 + 1e-6) & (ends[:, 1] > 0.25 + 1e-6)
+    assert fillet.any()
+    assert (ends[fillet, :2] - 0.37).norm(dim=1).min() > 0.12 - 1e-6
+
+
 def test_curved_faces_are_marked():
     bracket = make_shape("bracket", 10)
     assert bracket.planar.tolist() == [True] * 8 + [False] * 3

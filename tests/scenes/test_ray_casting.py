@@ -29,6 +29,7 @@ from torchrg.scenes.rays import cast_rays
 from torchrg.scenes.rings import Ring
 from torchrg.scenes.scene import Part, plane_table
 from torchrg.scenes.surfaces import Flat
+from torchrg.scenes.turns import solve_quadratic
 from torchrg.structures import UNLABELED
 
 CURVED = RoomLayout(
@@ -182,6 +183,12 @@ def test_rays_into_seams_do_not_slip_through():
     assert (hits.distances <= 1 + 1e-9).all()
 
 
+def test_rays_along_the_sides_of_a_cone_are_solved_without_loss():
+    # (1e-20 t^2 - 2 t + 1) has roots near 2e20 and 0.5; the usual formula loses the second.
+    roots = solve_quadratic(np.array([1e-20]), np.array([-1.0]), np.array([1.0]))
+    assert sorted(root[0] for root in roots) == pytest.approx([0.5, 2e20])
+
+
 def test_rays_may_be_opposite():
     down_and_up = np.array([[[0, 0, -1.0], [0, 0, 1.0]]])
     distances = cast_rays(build_room(0), np.array([0.3, 0.3, 1.0]), down_and_up).distances
@@ -320,7 +327,11 @@ def test_kinect_drops_what_is_out_of_its_range():
     exact, noisy = render_depth(model, camera), render_depth(model, camera, sensor="kinect")
     assert (noisy.depth[exact.depth > 9.5] == 0).all()
     assert (noisy.depth <= 8).all()
-    assert (noisy.depth > 0).any()
+    dropped = noisy.depth == 0
+    assert dropped.any()
+    assert not dropped.all()
+    assert torch.equal(noisy.labels == UNLABELED, dropped)
+    assert (noisy.normals[dropped] == 0).all()
 
 
 def test_unknown_sensor_is_refused():
