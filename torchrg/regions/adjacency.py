@@ -12,8 +12,10 @@ from torchrg.structures import Neighbors, PlaneAdjacency
 
 _LEAST_CONTACTS = 3
 _PARALLEL_DEG = 15.0
-_MAX_STEEPNESS = 0.5
-"""An edge with more than this share of its length across the planes leads to a parallel one."""
+_MAX_STEEPNESS = 0.25
+_REACH = 4.0
+"""An edge that leads farther across the planes than this many times their thickness, and than a
+quarter of the way to the 8th neighbour, leads to a parallel surface."""
 
 _CHUNK_SIZE = 65536
 
@@ -32,6 +34,8 @@ def find_adjacency(
     labels: Tensor,
     neighbors: Neighbors,
     normal: Tensor,
+    thickness: Tensor,
+    *,
     curved: Tensor,
 ) -> PlaneAdjacency:
     r"""Find pairs of regions that meet, and measure where they do.
@@ -48,6 +52,7 @@ def find_adjacency(
         labels: Region of each point, shape ``(N,)``: 0 to M-1 or negative.
         neighbors: Neighbours of each point.
         normal: Unit normals of the planes, shape ``(M, 3)``.
+        thickness: Standard deviation of the points from the planes, shape ``(M,)``.
         curved: Regions that are not flat, shape ``(M,)``, bool.
 
     Returns:
@@ -62,7 +67,8 @@ def find_adjacency(
         >>> cloud = torch.cat([floor, floor[:, [2, 1, 0]] + torch.tensor([0.0, 0.1, 0.5])])
         >>> labels = torch.arange(2).repeat_interleave(270)
         >>> normal, curved = torch.eye(3)[[2, 0]].double(), torch.zeros(2, dtype=torch.bool)
-        >>> found = find_adjacency(cloud, labels, search_knn(cloud, 12), normal, curved)
+        >>> neighbors, thickness = search_knn(cloud, 12), torch.zeros(2).double()
+        >>> found = find_adjacency(cloud, labels, neighbors, normal, thickness, curved=curved)
         >>> found.pairs.tolist(), found.dihedral_deg.round().tolist()
         ([[0, 1]], [90.0])
         >>> bool((found.boundary_length - 29).abs() < 2)
@@ -74,7 +80,9 @@ def find_adjacency(
     crossing = (angle > _PARALLEL_DEG) & ~curved[pairs].any(dim=1)
     edge = points[contacts.target].double() - points[contacts.source].double()
     across = torch.stack([(edge * side[contacts.pair]).sum(dim=1) for side in (first, second)])
-    flat = across.abs().amax(dim=0) <= _MAX_STEEPNESS * edge.norm(dim=1)
+    spacing, _ = _contact_radii(points, neighbors, contacts.source)
+    reach = (_REACH * thickness[pairs].amax(dim=1))[contacts.pair]
+    flat = across.abs().amax(dim=0) <= torch.maximum(reach, _MAX_STEEPNESS * spacing)
     used = crossing[contacts.pair] | (flat & (contacts.rank < NUM_CONTACTS))
     contacts = _Contacts(*(values[used] for values in contacts))
     num_contacts = torch.bincount(contacts.pair, minlength=len(pairs))
@@ -134,15 +142,20 @@ def _length_by_crossings(
     points: Tensor, neighbors: Neighbors, contacts: _Contacts, num_pairs: int
 ) -> Tensor:
     """Return the length of the curve that each pair's edges cross, shape ``(E,)``."""
-    nearest, counted = contact_neighbors(neighbors)
-    num_nearest = counted.sum(dim=1)[contacts.source]
-    last = nearest[contacts.source].gather(1, (num_nearest - 1).clamp(min=0)[:, None]).squeeze(1)
-    source = points[contacts.source].double()
-    sq_reach = (points[last].double() - source).square().sum(dim=1)
-    length = (points[contacts.target].double() - source).norm(dim=1)
-    share = math.pi**2 * sq_reach / (2 * num_nearest * num_nearest * length)
+    radius, num_nearest = _contact_radii(points, neighbors, contacts.source)
+    edge = points[contacts.target].double() - points[contacts.source].double()
+    length = edge.norm(dim=1)
+    share = math.pi**2 * radius * radius / (2 * num_nearest * num_nearest * length)
     share = torch.where((contacts.rank < NUM_CONTACTS) & (length > 0), share, 0.0)
     return _sum_of(contacts.pair, share, num_pairs)
+
+
+def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distance to the last of the contact neighbours of points, and their number."""
+    nearest, counted = contact_neighbors(neighbors)
+    number = counted.sum(dim=1)[rows]
+    last = nearest[rows].gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
+    return (points[last].double() - points[rows].double()).norm(dim=1), number
 
 
 def _sum_of(owner: Tensor, values: Tensor, num_owners: int) -> Tensor:

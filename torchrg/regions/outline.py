@@ -54,7 +54,7 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
     covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
     shape = shapely.union_all(shapely.polygons(triangles[covered]))
-    return _rings(shapely, shapely.simplify(shape, width / 6))
+    return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
 
 
 def _is_inside(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -69,11 +69,14 @@ def _is_inside(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return inside
 
 
-def _rings(shapely: Any, shape: Any) -> list[Ring]:  # noqa: ANN401
-    """Return the rings of a polygon or of several, largest polygon first."""
+def _rings(shapely: Any, shape: Any, min_area: float) -> list[Ring]:  # noqa: ANN401
+    """Return the rings of a polygon or of several, largest polygon first, without specks."""
     parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    largest = max((part.area for part in parts), default=0.0)
+    parts = [part for part in parts if part.area >= min(min_area, largest)]
     rings: list[Ring] = []
     for part in sorted(parts, key=lambda part: -part.area):
         turned = shapely.geometry.polygon.orient(part)
-        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *turned.interiors)]
+        holes = [hole for hole in turned.interiors if shapely.Polygon(hole).area >= min_area]
+        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *holes)]
     return rings

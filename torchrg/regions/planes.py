@@ -97,7 +97,9 @@ def summarize_planes(
         frame = (fit.center, first, second)
         planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
     if neighbors is not None:
-        found = find_adjacency(points, labels, neighbors, fit.normal, planes.curved)
+        found = find_adjacency(
+            points, labels, neighbors, fit.normal, fit.thickness, curved=planes.curved
+        )
         lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
     return planes
@@ -171,7 +173,15 @@ def _outlines(
 
 def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
     """Return two unit directions that span each plane, the first along the region."""
-    component = (fit.along * fit.normal).sum(dim=1, keepdim=True)
-    first = fit.along - component * fit.normal
+    first = _without(fit.along, fit.normal)
+    # The points of one place have no direction of their own: any in the plane will do.
+    least = fit.normal.abs().argmin(dim=1)
+    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
+    first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
     first = first / first.norm(dim=1, keepdim=True)
     return first, torch.linalg.cross(fit.normal, first)
+
+
+def _without(vectors: Tensor, normals: Tensor) -> Tensor:
+    """Return vectors less their component along the normals."""
+    return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals

@@ -1,0 +1,310 @@
+"""The plane table against shapes whose planes, areas and extents are known."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
+from torchrg.neighbors import search_knn
+from torchrg.regions import planes_to_json, planes_to_rows, summarize_planes
+from torchrg.structures import PLANE_KINDS
+
+
+def rotation(rng):
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.diag(r))
+
+
+def rectangle(rng, n, length, width, *, noise=0.0, turn=None, shift=(0.0, 0.0, 0.0)):
+    """Random points on a rectangle, with its rotation, as float64 tensors."""
+    turn = rotation(rng) if turn is None else turn
+    flat = rng.uniform(-0.5, 0.5, (n, 3)) * [length, width, 0]
+    flat[:, 2] = noise * rng.normal(size=n)
+    return torch.from_numpy(flat @ turn.T + np.asarray(shift)), torch.from_numpy(turn)
+
+
+def one_region(points):
+    return torch.zeros(len(points), dtype=torch.int64)
+
+
+def angle_deg(a, b):
+    return torch.rad2deg(torch.asin(torch.linalg.cross(a, b).norm(dim=-1).clamp(max=1)))
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e3])
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e6, -4e6, 100.0)])
+def test_noisy_rectangle_anywhere_in_any_unit(unit, shift):
+    rng = np.random.default_rng(0)
+    points, turn = rectangle(rng, 4000, 4.0, 1.5, noise=0.01)
+    points = points * unit + torch.tensor(shift, dtype=torch.float64)
+    normals = turn[:, 2].expand(len(points), 3)
+    planes = summarize_planes(points, normals, one_region(points))
+    assert angle_deg(planes.normal[0], turn[:, 2]) < 0.05
+    center = torch.tensor(shift, dtype=torch.float64)
+    assert torch.allclose(planes.centroid[0], center, atol=0.05 * unit)
+    assert torch.allclose((planes.centroid * planes.normal).sum(1), planes.offset, atol=1e-3 * unit)
+    assert math.isclose(planes.rms[0], 0.01 * unit, rel_tol=0.05)
+    assert math.isclose(planes.area[0], 6.0 * unit**2, rel_tol=0.04)
+    assert torch.allclose(planes.extent[0], torch.tensor([4.0, 1.5]).double() * unit, rtol=0.02)
+    assert (angle_deg(planes.axes[0], turn[:, :2].T) < 0.5).all()
+    assert not planes.curved[0]
+
+
+def test_exact_plane_is_exact():
+    grid = torch.cartesian_prod(torch.arange(40.0), torch.arange(25.0), torch.tensor([3.0]))
+    planes = summarize_planes(grid, torch.eye(3)[[2] * len(grid)], one_region(grid))
+    assert planes.normal.tolist() == [[0.0, 0.0, 1.0]]
+    assert planes.offset.tolist() == [3.0]
+    assert planes.rms.tolist() == [0.0]
+    assert planes.extent.tolist() == [[39.0, 24.0]]
+    assert planes.centroid.tolist() == planes.center.tolist() == [[19.5, 12.0, 3.0]]
+
+
+def test_points_of_another_surface_do_not_tilt_the_plane():
+    rng = np.random.default_rng(1)
+    floor, turn = rectangle(rng, 2000, 2.0, 2.0, noise=0.003, turn=np.eye(3))
+    wall = torch.from_numpy(rng.uniform([0.9, -1, 0], [1.0, 1, 0.4], (300, 3)))
+    points = torch.cat([floor, wall])
+    planes = summarize_planes(points, turn[:, 2].expand(len(points), 3), one_region(points))
+    assert angle_deg(planes.normal[0], turn[:, 2]) < 0.1
+    covariance = np.cov(points.numpy().T)
+    plain = torch.from_numpy(np.linalg.eigh(covariance)[1][:, 0])
+    assert angle_deg(plain, turn[:, 2]) > 2
+
+
+def test_l_shape_has_its_own_area_not_that_of_its_box():
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 1, (9000, 3)) * [1, 1, 0]
+    points = torch.from_numpy(points[(points[:, 0] < 0.3) | (points[:, 1] < 0.3)])
+    planes = summarize_planes(points, torch.eye(3).double()[[2] * len(points)], one_region(points))
+    assert math.isclose(planes.area[0], 0.51, rel_tol=0.05)
+    assert math.isclose(planes.extent[0].prod(), 1.0, rel_tol=0.02)
+
+
+def test_uneven_density_leaves_no_holes_in_the_area():
+    rng = np.random.default_rng(3)
+    radius = 0.1 * 80 ** rng.uniform(0, 1, 20000)
+    angle = rng.uniform(0, 2 * np.pi, 20000)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    points = torch.from_numpy(points[np.abs(points[:, :2]).max(axis=1) < 4])
+    planes = summarize_planes(points, torch.eye(3).double()[[2] * len(points)], one_region(points))
+    assert math.isclose(planes.area[0], 64.0, rel_tol=0.08)
+
+
+def test_thin_strip_keeps_its_area():
+    rng = np.random.default_rng(4)
+    points, turn = rectangle(rng, 200, 2.0, 0.04)
+    normals = turn[:, 2].expand(len(points), 3)
+    planes = summarize_planes(points, normals, one_region(points))
+    assert math.isclose(planes.area[0], 0.08, rel_tol=0.1)
+    assert math.isclose(planes.extent[0, 1], 0.04, rel_tol=0.1)
+
+
+@pytest.mark.parametrize("num_points", [1, 2, 3, 5])
+def test_few_and_collinear_points_take_the_normals_they_have(num_points, dtype):
+    along = torch.tensor([1.0, 0.0, 0.0], dtype=dtype)
+    points = torch.arange(num_points, dtype=dtype)[:, None] * along + 2
+    normals = torch.tensor([[0.2, 0.6, 0.8], [-0.2, -0.6, -0.8]], dtype=dtype)
+    normals = torch.nn.functional.normalize(normals, dim=1)[torch.arange(num_points) % 2]
+    planes = summarize_planes(points, normals, one_region(points))
+    expected = [0.0, 0.6, 0.8] if num_points > 1 else (-normals[0] * -1).tolist()
+    assert torch.allclose(planes.normal[0], torch.tensor(expected, dtype=dtype), atol=1e-6)
+    assert planes.area.tolist() == [0.0]
+    assert planes.rms[0] < 1e-6
+    assert planes.extent[0, 0] == num_points - 1
+    assert all(part.isfinite().all() for part in planes[:9])
+
+
+def test_coincident_points_are_a_plane_of_no_extent():
+    points = torch.full((30, 3), 0.7)
+    planes = summarize_planes(points, torch.eye(3)[[1] * 30], one_region(points))
+    assert planes.normal.tolist() == [[0.0, 1.0, 0.0]]
+    assert planes.extent.tolist() == [[0.0, 0.0]]
+    assert planes.area.tolist() == [0.0]
+
+
+def test_table_of_no_region_is_empty():
+    points = torch.rand(5, 3)
+    planes = summarize_planes(
+        points, points, torch.full((5,), -1), neighbors=search_knn(points, 3), up=(0, 0, 1)
+    )
+    assert len(planes.count) == len(planes.normal) == len(planes.adjacency.pairs) == 0
+    assert planes_to_rows(planes) == []
+    nothing = summarize_planes(points[:0], points[:0], torch.zeros(0, dtype=torch.int64))
+    assert len(nothing.count) == 0
+
+
+def test_rows_do_not_depend_on_the_order_of_the_points(rng):
+    generator = np.random.default_rng(5)
+    parts = [rectangle(generator, 500, 2.0, 1.0, noise=0.01)[0] for _ in range(3)]
+    points, labels = torch.cat(parts), torch.arange(3).repeat_interleave(500)
+    normals = torch.nn.functional.normalize(points, dim=1)
+    first = summarize_planes(points, normals, labels)
+    order = torch.randperm(1500, generator=rng)
+    again = summarize_planes(points[order], normals[order], labels[order])
+    for a, b in zip(first[:9], again[:9], strict=True):
+        assert torch.allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_threads_change_nothing():
+    generator = np.random.default_rng(6)
+    points = torch.cat([rectangle(generator, 3000, 2.0, 1.0, noise=0.01)[0] for _ in range(3)])
+    labels = torch.arange(3).repeat_interleave(3000)
+    neighbors = search_knn(points, 10)
+    before = torch.get_num_threads()
+    tables = []
+    for num_threads in (1, 3):
+        torch.set_num_threads(num_threads)
+        tables.append(summarize_planes(points, points, labels, neighbors=neighbors))
+    torch.set_num_threads(before)
+    for a, b in zip(tables[0][:10], tables[1][:10], strict=True):
+        assert torch.equal(a, b)
+    for a, b in zip(tables[0].adjacency, tables[1].adjacency, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_column_is_curved_and_a_wall_is_not():
+    angle = torch.linspace(0, 2 * math.pi, 200)[:-1].repeat(20)
+    ring = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=1)
+    column = ring + torch.arange(20.0).repeat_interleave(199)[:, None] * torch.tensor([0, 0, 0.1])
+    planes = summarize_planes(column, ring, one_region(column))
+    assert planes.curved.tolist() == [True]
+    gentle = torch.stack([ring[:, 0] * 0.02, ring[:, 1] * 0.02, torch.ones(len(ring))], dim=1)
+    gentle = torch.nn.functional.normalize(gentle, dim=1)
+    assert summarize_planes(column, gentle, one_region(column)).curved.tolist() == [False]
+
+
+def box_of_points(rng, size=(4.0, 3.0, 2.5), n=3000, noise=0.002):
+    """The six faces of a room, seen from inside: floor and ceiling first."""
+    points, labels = [], []
+    for label, (axis, side) in enumerate([(2, 0), (2, 1), (0, 0), (0, 1), (1, 0), (1, 1)]):
+        face = rng.uniform(0, 1, (n, 3))
+        face[:, axis] = side
+        face = face * size
+        face[:, axis] += noise * rng.normal(size=n)
+        points.append(face)
+        labels += [label] * n
+    normals = np.eye(3)[[2, 2, 0, 0, 1, 1]].repeat(n, axis=0)
+    return torch.from_numpy(np.concatenate(points)), torch.from_numpy(normals), torch.tensor(labels)
+
+
+def test_faces_of_a_room_meet_along_its_edges():
+    points, normals, labels = box_of_points(np.random.default_rng(7))
+    neighbors = search_knn(points, 20)
+    found = summarize_planes(points, normals, labels, neighbors=neighbors).adjacency
+    lengths = {(0, 2): 3, (0, 3): 3, (0, 4): 4, (0, 5): 4, (1, 2): 3, (1, 3): 3}
+    lengths |= {(1, 4): 4, (1, 5): 4, (2, 4): 2.5, (2, 5): 2.5, (3, 4): 2.5, (3, 5): 2.5}
+    assert list(map(tuple, found.pairs.tolist())) == sorted(lengths)
+    for pair, length in zip(found.pairs.tolist(), found.boundary_length, strict=True):
+        assert math.isclose(length, lengths[tuple(pair)], rel_tol=0.05)
+    assert (found.dihedral_deg > 89.5).all()
+
+
+def test_boundary_within_one_plane_has_the_length_of_the_curve():
+    rng = np.random.default_rng(8)
+    points = torch.from_numpy(rng.uniform(0, 4, (30000, 3)) * [1, 1, 0])
+    inside = ((points[:, :2] - 2).norm(dim=1) < 1).long()
+    normals = torch.eye(3).double()[[2] * len(points)]
+    neighbors = search_knn(points, 12)
+    found = summarize_planes(points, normals, inside, neighbors=neighbors).adjacency
+    assert math.isclose(found.boundary_length[0], 2 * math.pi, rel_tol=0.05)
+    assert found.dihedral_deg[0] < 1e-3
+
+
+def test_parallel_faces_do_not_meet():
+    rng = np.random.default_rng(9)
+    points = torch.from_numpy(rng.uniform(0, 1, (4000, 3)) * [1, 1, 0])
+    points[2000:, 2] = 0.01
+    labels = torch.arange(2).repeat_interleave(2000)
+    normals = torch.eye(3).double()[[2] * len(points)]
+    neighbors = search_knn(points, 20)
+    assert len(summarize_planes(points, normals, labels, neighbors=neighbors).adjacency.pairs) == 0
+
+
+def test_kinds_follow_the_up_direction():
+    points, normals, labels = box_of_points(np.random.default_rng(10), n=800)
+
+    def kinds(up):
+        table = summarize_planes(points, normals, labels, up=up)
+        return [PLANE_KINDS[kind] for kind in table.kind]
+
+    assert kinds((0, 0, 2)) == ["floor", "ceiling"] + ["wall"] * 4
+    assert kinds((0, 0, -1)) == ["ceiling", "floor"] + ["wall"] * 4
+    assert kinds((1, 0, 0)) == ["wall", "wall", "floor", "ceiling", "wall", "wall"]
+    assert summarize_planes(points, normals, labels).kind is None
+
+
+def test_table_tops_and_cabinets_are_neither_floor_nor_wall():
+    rng = np.random.default_rng(11)
+    points, normals, labels = box_of_points(rng, n=800)
+    top = torch.from_numpy(rng.uniform([1, 1, 0.7], [2, 2, 0.7], (500, 3)))
+    side = torch.from_numpy(rng.uniform([1, 1, 0.0], [2, 1, 0.7], (500, 3)))
+    points = torch.cat([points, top, side])
+    normals = torch.cat([normals, torch.eye(3).double()[[2] * 500 + [1] * 500]])
+    labels = torch.cat([labels, torch.tensor([6] * 500 + [7] * 500)])
+    table = summarize_planes(points, normals, labels, up=(0, 0, 1))
+    assert [PLANE_KINDS[kind] for kind in table.kind[6:]] == ["other", "other"]
+
+
+def test_outline_of_a_frame_has_a_hole_and_its_area():
+    shapely = pytest.importorskip("shapely")
+    rng = np.random.default_rng(12)
+    turn = rotation(rng)
+    flat = rng.uniform(-1, 1, (12000, 3)) * [1, 1, 0]
+    flat = flat[np.abs(flat[:, :2]).max(axis=1) > 0.5]
+    points = torch.from_numpy(flat @ turn.T + 100)
+    normals = torch.from_numpy(turn[:, 2]).expand(len(points), 3)
+    planes = summarize_planes(points, normals, one_region(points), outline=True)
+    outer, hole = planes.outline[0]
+    residual = (torch.cat([outer, hole]) * planes.normal[0]).sum(1) - planes.offset[0]
+    assert residual.abs().max() < 1e-9
+    back = [(ring.numpy() - 100) @ turn[:, :2] for ring in (outer, hole)]
+    polygon = shapely.Polygon(back[0], [back[1]])
+    assert math.isclose(polygon.area, 3.0, rel_tol=0.03)
+    sign = torch.sign(planes.normal[0] @ torch.from_numpy(turn[:, 2]))
+    assert shapely.LinearRing(back[0]).is_ccw == (sign > 0)
+    assert shapely.LinearRing(back[1]).is_ccw != (sign > 0)
+
+
+def test_outlines_of_points_and_lines_are_empty():
+    pytest.importorskip("shapely")
+    points = torch.zeros(6, 3)
+    points[:5, 0] = torch.arange(5.0)
+    labels = torch.tensor([0] * 5 + [1])
+    planes = summarize_planes(points, torch.eye(3)[[2] * 6], labels, outline=True)
+    assert planes.outline == ((), ())
+
+
+def test_outlines_without_shapely_say_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "shapely", None)
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[outline\]'"):
+        summarize_planes(points, points, one_region(points), outline=True)
+
+
+def test_rows_and_json_hold_the_table():
+    points, normals, labels = box_of_points(np.random.default_rng(13), n=500)
+    planes = summarize_planes(
+        points, normals, labels, neighbors=search_knn(points, 20), up=(0, 0, 1)
+    )
+    rows = planes_to_rows(planes)
+    assert [row["label"] for row in rows] == list(range(6))
+    assert rows[0]["kind"] == "floor"
+    assert rows[2]["normal"] == planes.normal[2].tolist()
+    assert sorted(found["plane"] for found in rows[0]["neighbors"]) == [2, 3, 4, 5]
+    assert json.loads(planes_to_json(planes)) == {"planes": rows}
+    plain = planes_to_rows(summarize_planes(points, normals, labels))
+    assert "kind" not in plain[0]
+    assert "neighbors" not in plain[0]
+    assert "outline" not in plain[0]
+
+
+def test_wrong_arguments_are_refused():
+    points = torch.rand(5, 3)
+    with pytest.raises(ShapeError, match=r"summarize_planes: expected labels of shape \(N\)"):
+        summarize_planes(points, points, torch.zeros(4, dtype=torch.int64))
+    with pytest.raises(ConfigError, match="expected up to be three numbers"):
+        summarize_planes(points, points, one_region(points), up=(0, 0, 0))
