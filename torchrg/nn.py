@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance, eigh3
-from torchrg.robust import qn
+from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, qn
+from torchrg.robust.mcd import Starts
 
 
 class Covariance(nn.Module):
@@ -77,3 +78,129 @@ class Qn(nn.Module):
     def extra_repr(self) -> str:
         """Return the settings."""
         return f"dim={self.dim}, finite_sample={self.finite_sample}"
+
+
+class DetMCD(nn.Module):
+    """Deterministic MCD of patches; see :func:`torchrg.robust.fit_detmcd`.
+
+    Args:
+        support_fraction: Share of the points that may be trusted.
+        quantile: Quantile of the chi-square distribution at which inliers end.
+        starts: Which deterministic starts.
+        small_sample: Whether to correct for the number of points.
+
+    Example:
+        >>> DetMCD()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        support_fraction: float = 0.5,
+        *,
+        quantile: float = 0.975,
+        starts: Starts = "paper",
+        small_sample: bool = False,
+    ) -> None:
+        super().__init__()
+        self.support_fraction = support_fraction
+        self.quantile = quantile
+        self.starts: Starts = starts
+        self.small_sample = small_sample
+
+    def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
+        """Return the fits."""
+        return fit_detmcd(
+            patches,
+            mask,
+            support_fraction=self.support_fraction,
+            quantile=self.quantile,
+            starts=self.starts,
+            small_sample=self.small_sample,
+        )
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return (
+            f"support_fraction={self.support_fraction}, quantile={self.quantile}, "
+            f"starts={self.starts!r}, small_sample={self.small_sample}"
+        )
+
+
+class FastMCD(nn.Module):
+    """MCD of patches with random starts; see :func:`torchrg.robust.fit_fastmcd`.
+
+    Args:
+        support_fraction: Share of the points that may be trusted.
+        quantile: Quantile of the chi-square distribution at which inliers end.
+        num_starts: Number of random starts.
+        small_sample: Whether to correct for the number of points.
+
+    Example:
+        >>> FastMCD()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        support_fraction: float = 0.5,
+        *,
+        quantile: float = 0.975,
+        num_starts: int = 500,
+        small_sample: bool = False,
+    ) -> None:
+        super().__init__()
+        self.support_fraction = support_fraction
+        self.quantile = quantile
+        self.num_starts = num_starts
+        self.small_sample = small_sample
+
+    def forward(
+        self,
+        patches: Tensor,
+        mask: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> RobustFit:
+        """Return the fits; the generator draws the starts."""
+        return fit_fastmcd(
+            patches,
+            mask,
+            support_fraction=self.support_fraction,
+            quantile=self.quantile,
+            num_starts=self.num_starts,
+            small_sample=self.small_sample,
+            generator=generator,
+        )
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return (
+            f"support_fraction={self.support_fraction}, quantile={self.quantile}, "
+            f"num_starts={self.num_starts}, small_sample={self.small_sample}"
+        )
+
+
+class DetMM(nn.Module):
+    """Deterministic MM-estimator of patches; see :func:`torchrg.robust.fit_detmm`.
+
+    Args:
+        quantile: Quantile of the chi-square distribution at which inliers end.
+        starts: Which deterministic starts.
+
+    Example:
+        >>> DetMM()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
+        tensor(True)
+    """
+
+    def __init__(self, *, quantile: float = 0.975, starts: Starts = "robustbase") -> None:
+        super().__init__()
+        self.quantile = quantile
+        self.starts: Starts = starts
+
+    def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
+        """Return the fits."""
+        return fit_detmm(patches, mask, quantile=self.quantile, starts=self.starts)
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return f"quantile={self.quantile}, starts={self.starts!r}"

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ class Cloud:
             ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8).
         grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
         source: The file it came from, for messages.
+        header: What the file says about the cloud as a whole, so that it can be written again:
+            ``viewpoint`` of a PCD file (seven numbers, position and quaternion w x y z), ``las``
+            (the header of a LAS file), ``scans`` of an E57 file.
 
     Example:
         >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
@@ -36,6 +39,7 @@ class Cloud:
     fields: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
     grid_shape: tuple[int, int] | None = None
     source: str = ""
+    header: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.coordinates)

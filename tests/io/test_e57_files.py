@@ -6,7 +6,7 @@ import pytest
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.io.e57_pose import Scan, to_cartesian
-from torchrg.io.fields import FileCloud
+from torchrg.structures import Cloud
 
 pye57 = pytest.importorskip("pye57")
 
@@ -72,7 +72,7 @@ def test_scans_are_written_with_their_poses(tmp_path, scans, make_segmentation):
 
 def test_normals_turn_with_the_points(tmp_path):
     normals = np.array([[1.0, 0, 0], [0, 1, 0]])
-    cloud = FileCloud(
+    cloud = Cloud(
         np.eye(3)[:2], {"normals": normals}, header={"scans": (Scan("a", tuple(QUARTER)),)}
     )
     write_cloud(tmp_path / "a.e57", cloud)
@@ -87,7 +87,7 @@ def test_normals_turn_with_the_points(tmp_path):
 def test_shuffled_scans_are_written_as_one(tmp_path, scans):
     cloud = read_cloud(scans[0])
     order = np.random.default_rng(0).permutation(40)
-    shuffled = FileCloud(
+    shuffled = Cloud(
         cloud.coordinates[order], {"scan": cloud.fields["scan"][order]}, header=cloud.header
     )
     write_cloud(tmp_path / "a.e57", shuffled)
@@ -99,9 +99,7 @@ def test_shuffled_scans_are_written_as_one(tmp_path, scans):
 
 def test_scans_without_points_left_are_left_out(tmp_path, scans):
     cloud = read_cloud(scans[0])
-    second = FileCloud(
-        cloud.coordinates[20:], {"scan": cloud.fields["scan"][20:]}, header=cloud.header
-    )
+    second = Cloud(cloud.coordinates[20:], {"scan": cloud.fields["scan"][20:]}, header=cloud.header)
     write_cloud(tmp_path / "a.e57", second)
     again = read_cloud(tmp_path / "a.e57")
     np.testing.assert_allclose(again.coordinates, second.coordinates, rtol=0, atol=2e-9)
@@ -127,13 +125,13 @@ def test_spherical_coordinates_are_the_standards():
 
 
 def test_names_are_made_fit_for_xml(tmp_path, make_cloud):
-    cloud = FileCloud(np.eye(3), {"a b/c": np.arange(3.0)})
+    cloud = Cloud(np.eye(3), {"a b/c": np.arange(3.0)})
     write_cloud(tmp_path / "a.e57", cloud)
     assert read_cloud(tmp_path / "a.e57").fields["a_b_c"].tolist() == [0, 1, 2]
 
 
 def test_integers_beyond_the_format_are_refused(tmp_path):
-    cloud = FileCloud(np.eye(3), {"id": np.full(3, 2**63, np.uint64)})
+    cloud = Cloud(np.eye(3), {"id": np.full(3, 2**63, np.uint64)})
     with pytest.raises(FormatError, match=r"a\.e57: expected field id below 2\^63; leave it out"):
         write_cloud(tmp_path / "a.e57", cloud)
 

@@ -12,7 +12,7 @@ import numpy as np
 from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path, check_place
 from torchrg.io.e57 import check_e57, read_e57, write_e57
-from torchrg.io.fields import FileCloud, checked_coordinates
+from torchrg.io.fields import checked_coordinates
 from torchrg.io.files import check_file
 from torchrg.io.las import check_las, read_las, write_las
 from torchrg.io.npy import (
@@ -29,7 +29,7 @@ from torchrg.io.result import check_segmentation, result_arrays, with_segmentati
 from torchrg.io.text import read_text, write_text
 from torchrg.structures import Cloud, Segmentation
 
-__all__ = ["FORMATS", "FileCloud", "atomic_path", "check_output", "read_cloud", "write_cloud"]
+__all__ = ["FORMATS", "atomic_path", "check_output", "read_cloud", "write_cloud"]
 
 
 class Format(NamedTuple):

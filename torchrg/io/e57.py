@@ -19,7 +19,7 @@ from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, flatten_cloud, narrow_integers
 from torchrg.io.e57_points import AXES, COLOR, STATE, Block, read_points, write_points
 from torchrg.io.e57_pose import Scan, to_cartesian
-from torchrg.io.fields import FileCloud, assemble_cloud
+from torchrg.io.fields import assemble_cloud
 from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
 from torchrg.structures import Cloud
 
@@ -103,7 +103,7 @@ def write_e57(path: Path, cloud: Cloud) -> None:
         MissingDependencyError: If pye57 is not installed.
     """
     pye57 = require("pye57", extra="e57", purpose="write E57 files")
-    stored = cloud.header.get("scans", ()) if isinstance(cloud, FileCloud) else ()
+    stored = cloud.header.get("scans", ())
     columns = flatten_cloud(path, cloud, SPELLING)
     for name, column in columns.items():
         columns[name] = column = narrow_integers(column, ("i8",))

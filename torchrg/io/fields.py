@@ -9,7 +9,6 @@ else keeps its name.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,18 +43,6 @@ TRIPLES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class FileCloud(Cloud):
-    """A cloud with what its file says about the whole of it, so that it can be written again.
-
-    Args:
-        header: ``viewpoint`` of a PCD file (seven numbers, position and quaternion w x y z),
-            ``las`` (the header of a LAS file as laspy holds it), ``scans`` of an E57 file.
-    """
-
-    header: Mapping[str, Any] = field(default_factory=dict)
-
-
 def assemble_cloud(
     path: Path,
     columns: Columns,
@@ -69,7 +56,7 @@ def assemble_cloud(
         path: The file, for messages.
         columns: Values of each point by the file's own names, each of shape ``(N, ...)``.
         grid_shape: ``(height, width)`` of an organised cloud.
-        header: What the file says about the whole cloud, see :class:`FileCloud`.
+        header: What the file says about the whole cloud, see :class:`Cloud`.
 
     Returns:
         The cloud; its fields have torchrg's names.
@@ -98,7 +85,7 @@ def cloud_of(
     header: Mapping[str, Any] | None = None,
 ) -> Cloud:
     """Build a cloud from coordinates and further columns; see :func:`assemble_cloud`."""
-    return FileCloud(
+    return Cloud(
         coordinates=checked_coordinates(path, coordinates),
         fields=_renamed(path, columns),
         grid_shape=grid_shape,

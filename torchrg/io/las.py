@@ -16,7 +16,7 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, flatten_cloud
-from torchrg.io.fields import FileCloud, assemble_cloud
+from torchrg.io.fields import assemble_cloud
 from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
 from torchrg.io.las_checks import check_chunks, check_header
 from torchrg.structures import Cloud
@@ -177,7 +177,7 @@ def _unused(point_format: Any, columns: dict[str, NDArray[Any]]) -> set[str]:  #
 
 def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
     """Return the header the cloud came with, or a new one, and whether it has a date."""
-    stored = cloud.header.get("las") if isinstance(cloud, FileCloud) else None
+    stored = cloud.header.get("las")
     if stored is None:
         header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
         low, high = cloud.coordinates.min(axis=0), cloud.coordinates.max(axis=0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torchrg.errors import FormatError
 from torchrg.io.atomic import atomic_path
 from torchrg.io.columns import Spelling, flatten_cloud
-from torchrg.io.fields import FileCloud, assemble_cloud
+from torchrg.io.fields import assemble_cloud
 from torchrg.io.files import check_file, check_promise
 from torchrg.io.pcd_header import DEFAULT_VIEWPOINT, PADDING, Header, format_header, read_header
 from torchrg.io.tables import read_table
@@ -82,12 +82,11 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
     )
     for name, column in columns.items():
         records[name] = column
-    stored = cloud.header if isinstance(cloud, FileCloud) else {}
     header = format_header(
         columns,
         width=width,
         height=height,
-        viewpoint=stored.get("viewpoint", DEFAULT_VIEWPOINT),
+        viewpoint=cloud.header.get("viewpoint", DEFAULT_VIEWPOINT),
     )
     with atomic_path(path) as beside, beside.open("wb") as stream:
         stream.write(header.encode())
@@ -145,7 +144,7 @@ def _read_compressed(
     path: Path, stream: BinaryIO, header: Header, size: int
 ) -> dict[str, NDArray[Any]]:
     """Read the fields of a compressed file: one field after the other, in one block of LZF."""
-    import lzf  # type: ignore[import-not-found]
+    import lzf
 
     names = [n for n in header.dtype.names or () if not n.startswith(f"{PADDING} ")]
     # PCL leaves padding out of the block; writers that copy whole records do not.
