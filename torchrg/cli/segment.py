@@ -14,7 +14,7 @@ from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
 from torchrg.cli.provenance import describe_run
 from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import read_cloud, write_cloud
+from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud, Segmentation
 
@@ -93,6 +93,7 @@ def _segment_file(source: Path, target: Path, settings: PipelineConfig) -> None:
     begin = time.perf_counter()
     cloud = read_cloud(source)
     _check_points(cloud)
+    check_output(target, cloud)
     with tqdm(total=len(STAGES), desc=source.name, unit="stage", leave=False, disable=None) as bar:
 
         def advance(stage: str) -> None:
