@@ -217,7 +217,7 @@ def test_boundary_within_one_plane_has_the_length_of_the_curve():
 def test_parallel_faces_do_not_meet():
     rng = np.random.default_rng(9)
     points = torch.from_numpy(rng.uniform(0, 1, (4000, 3)) * [1, 1, 0])
-    points[2000:, 2] = 0.01
+    points[2000:, 2] = 0.02
     labels = torch.arange(2).repeat_interleave(2000)
     normals = torch.eye(3).double()[[2] * len(points)]
     neighbors = search_knn(points, 20)
