@@ -71,8 +71,8 @@ def test_nearest_hit_is_that_of_brute_force_over_triangles(directions):
     model = build_room(1)
     assert all(isinstance(surface, Flat) for surface in model.surfaces)
     origin = model.viewpoints[0]
-    hits = cast_rays(model, origin, directions[:6])
-    for row, column in np.ndindex(6, 25):
+    hits = cast_rays(model, origin, directions[:2])
+    for row, column in np.ndindex(2, 25):
         found = [
             min(_meet_triangle(origin, directions[row, column], *t) for t in _triangles(surface))
             for surface in model.surfaces
@@ -125,7 +125,7 @@ def test_rays_meet_curved_surfaces_where_their_points_are(surface):
     rng = np.random.default_rng(0)
     origin = np.array([[1.5, -1.0, 0.9]])
     # A ray to a point of the surface meets it there or before, at a point of the surface.
-    targets = surface.sample(rng, 3000)
+    targets = surface.sample(rng, 1000)
     found = surface.intersect(origin, targets - origin)
     met = found <= 1 + 1e-7
     # A body with bumps is followed in steps, and may be missed where it is only grazed.

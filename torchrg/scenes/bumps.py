@@ -90,17 +90,15 @@ class Bumpy:
         rows = np.flatnonzero(far > near)
         start = np.broadcast_to(start, step.shape)[rows]
         step, near, far = step[rows], near[rows], far[rows]
-        before, found = near, np.full(len(rows), np.inf)
-        outside = self._is_outside(start, step, before)
+        width = (far - near) / _STEPS
+        first = np.full(len(rows), _STEPS)
+        outside = self._is_outside(start, step, near)
         for number in range(1, _STEPS + 1):
-            after = near + (far - near) * (number / _STEPS)
-            still = self._is_outside(start, step, after)
-            crossed = np.flatnonzero((outside != still) & np.isinf(found))
-            found[crossed] = self._crossing(
-                start[crossed], step[crossed], before[crossed], after[crossed], outside[crossed]
-            )
-            before, outside = after, still
-        nearest[rows] = found
+            crossed = self._is_outside(start, step, near + number * width) != outside
+            first = np.where(crossed, np.minimum(first, number - 1), first)
+        before = near + first * width
+        found = self._crossing(start, step, before, before + width, outside)
+        nearest[rows] = np.where(first < _STEPS, found, np.inf)
         return nearest
 
     def _entry_and_exit(self, start: Array, step: Array) -> tuple[Array, Array]:
