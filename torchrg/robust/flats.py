@@ -173,7 +173,12 @@ def _simplices(num_points: int, num_edges: int) -> list[list[int]]:
     """Vertices of the simplices looked at: ``num_edges + 1`` lists of point indices."""
     corners = num_edges + 1
     if comb(num_points, corners) <= NUM_SIMPLICES:
-        chosen = list(combinations(range(num_points), corners))
+        # In every cyclic order: where the first vertices coincide, they span nothing.
+        chosen = [
+            (*vertices[turn:], *vertices[:turn])
+            for turn in range(corners)
+            for vertices in combinations(range(num_points), corners)
+        ]
     else:
         draw = random.Random(num_points)  # noqa: S311 - a fixed list, not a secret
         chosen = [tuple(draw.sample(range(num_points), corners)) for _ in range(NUM_SIMPLICES)]

@@ -30,14 +30,12 @@ def take_lanes(columns: list[Tensor], lanes: Tensor) -> list[Tensor]:
 def sum_points(values: Tensor) -> Tensor:
     """Sum each lane of ``(K, *)`` over its points, in the same order for every lane."""
     if values.device.type == "cpu":
-        flat = values.reshape(len(values), -1)
+        # NumPy adds row by row only where rows are contiguous and longer than one.
+        flat = values.reshape(len(values), -1).contiguous()
         if flat.shape[1] == 1:
-            # NumPy adds a single column pairwise, two columns row by row.
             flat = flat.expand(-1, 2).contiguous()
-            return torch.from_numpy(np.add.reduce(flat.numpy(), axis=0))[:1].reshape(
-                values.shape[1:]
-            )
-        return torch.from_numpy(np.add.reduce(flat.numpy(), axis=0)).reshape(values.shape[1:])
+        total = torch.from_numpy(np.add.reduce(flat.numpy(), axis=0))
+        return total[: values[0].numel()].reshape(values.shape[1:])
     while len(values) > 1:
         half = len(values) // 2
         folded = values[:half] + values[half : 2 * half]
