@@ -12,6 +12,7 @@ from tests.regions import algorithm2, growing_clouds
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
+from torchrg.regions.frontier import grow_in_turn
 
 RULES = [
     {
@@ -68,6 +69,35 @@ def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
 def test_labels_equal_the_literal_algorithm(kind, variant):
     rng = np.random.default_rng(variant)
     check_all_rules(growing_clouds.KINDS[kind](rng), **VARIANTS[variant])
+
+
+@pytest.mark.parametrize("kind", ["room", "quantized", "sphere", "graded", "plates"])
+def test_whole_levels_of_the_queue_give_the_labels_of_single_steps(kind, monkeypatch):
+    monkeypatch.setitem(grow_in_turn.__globals__, "_LONG_QUEUE", 2)
+    rng = np.random.default_rng(7)
+    settings = {"k": 8, "max_angle_deg": 20.0, "curvature_quantile": 0.6, "min_size": 2}
+    check_all_rules(growing_clouds.KINDS[kind](rng), **settings)
+
+
+@pytest.mark.parametrize("kind", growing_clouds.KINDS)
+def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, monkeypatch):
+    rng = np.random.default_rng(list(growing_clouds.KINDS).index(kind))
+    for _ in range(15):
+        k, ties = int(rng.integers(4, 12)), int(rng.choice([0, 3, 6]))
+        cloud = growing_clouds.prepare(growing_clouds.KINDS[kind](rng), k, ties=ties)
+        rules = dict(RULES[rng.integers(len(RULES))])
+        if rules["connectivity"] is not None:
+            rules["connectivity"] = float(rng.choice([0.3, 0.5, 0.75]))
+        config = GrowingConfig(
+            **rules,
+            max_angle_deg=float(rng.choice([3.0, 8.0, 20.0, 40.0])),
+            curvature_quantile=float(rng.choice([0.0, 0.3, 0.6, 0.95, 1.0])),
+            min_size=int(rng.choice([1, 2, k + 1])),
+        )
+        monkeypatch.setitem(grow_in_turn.__globals__, "_LONG_QUEUE", int(rng.choice([2, 32])))
+        valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.9)
+        labels = grow_regions(*cloud, config, valid=valid, canonical=True)
+        assert labels.tolist() == expected_labels(*cloud, config, valid), config
 
 
 @pytest.mark.parametrize("name", ["region_growing_tutorial.pcd", "room_scan1.pcd"])

@@ -142,7 +142,7 @@ def test_touching_pieces_of_one_plane_are_merged():
 
 def test_pieces_across_a_gap_are_not_merged():
     points = sheet(np.random.default_rng(7), 3000)
-    points[points[:, 0] > 0.5, 0] += 0.12
+    points[points[:, 0] > 0.5, 0] += 0.07
     cloud, _ = flat_cloud(points, k=50)
     labels = (cloud.points[:, 0] > 0.5).long()
     assert len(count_contacts(labels, cloud.neighbors)[0]) == 0
@@ -166,12 +166,12 @@ def test_a_step_or_a_bend_is_not_merged(noise):
 
 def test_curved_regions_are_neither_merged_nor_fed():
     rng = np.random.default_rng(9)
-    angle, height = rng.uniform(0, np.pi, 3000), rng.uniform(0, 1, 3000)
+    angle, height = rng.uniform(0, np.pi, 3000), rng.uniform(0, 8, 3000)
     points = np.stack([np.cos(angle), np.sin(angle), height], axis=1)
     normals = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     cloud, _ = flat_cloud(points, normals=normals)
-    labels = (cloud.points[:, 2] > 0.5).long()
-    labels[cloud.points[:, 2] > 0.9] = UNLABELED
+    labels = (cloud.points[:, 2] > 3.5).long()
+    labels[cloud.points[:, 2] > 7.2] = UNLABELED
     config = with_settings(absorb=True, merge_coplanar=True)
     assert torch.equal(refine_regions(cloud, labels, config), labels)
 

@@ -73,13 +73,16 @@ def claim_leftovers(
         order: All points that may start a region, in the order in which they do.
 
     Example:
-        >>> heads = np.full(3, -1, dtype=np.int32)
-        >>> claim_leftovers(np.array([0, 1]), np.array([1, 2]), heads, np.arange(3))
+        >>> heads = np.full(4, -1, dtype=np.int32)
+        >>> claim_leftovers(np.array([0, 1, 3]), np.array([1, 2, 2]), heads, np.arange(4))
         >>> heads.tolist()
-        [0, 0, 2]
+        [0, 0, 2, 3]
     """
     free = heads < 0
-    open_edges = free[sources] & free[targets]
+    turn = np.empty(len(heads), dtype=np.int32)
+    turn[order] = np.arange(len(order), dtype=np.int32)
+    # A free point whose turn was before has started a region of its own.
+    open_edges = free[sources] & free[targets] & (turn[sources] < turn[targets])
     sources, targets = sources[open_edges], targets[open_edges]
     starts = np.searchsorted(sources, np.arange(len(heads) + 1))
     claiming = order[free[order] & (np.diff(starts)[order] > 0)]
