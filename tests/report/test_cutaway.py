@@ -92,6 +92,14 @@ def test_tables_are_no_ceilings(rng):
     assert float(shares[[0, 2, 3, 4, 5, 6]].amin()) == 1
 
 
+def test_a_table_as_large_as_half_the_room_is_no_ceiling(rng):
+    points, faces = box_room(rng, table=False)
+    top = rectangle(rng, (0.9, 0.6, 0.75), (5.1, 3.4, 0.75))
+    points = torch.cat([points[faces != 1], top])
+    faces = torch.cat([faces[faces != 1], torch.full((len(top),), 6)])
+    assert float(kept_share(points, faces, "above")[6]) == 1
+
+
 def test_upward_axis_is_a_setting(rng):
     points, faces = box_room(rng)
     shares = kept_share(points[:, [0, 2, 1]], faces, "above", up=torch.tensor([0.0, 1, 0]))

@@ -155,6 +155,25 @@ def test_points_behind_the_camera_do_not_show(rng):
     assert hue_share(render_cloud(points, colors, view="sensor", width=60), BLUE) == 0
 
 
+def test_points_in_the_plane_of_the_camera_do_not_show():
+    near, red = square(2.0, RED)
+    beside, blue = square(0.0, BLUE)
+    points, colors = torch.cat([beside, near]), torch.cat([blue, red])
+    assert hue_share(render_points(points, colors, front_camera()), BLUE) == 0
+
+
+def test_discs_lie_in_their_planes():
+    line = torch.linspace(-1, 1, 6)
+    x, y = torch.cartesian_prod(line, line).unbind(dim=1)
+    ridge = [torch.stack([x, y, 3 + sign * x], dim=1) for sign in (-1, 1)]
+    colors = torch.tensor([RED, BLUE], dtype=torch.uint8).repeat_interleave(len(x), dim=0)
+    normals = torch.tensor([[0.7, 0.0, 0.7], [-0.7, 0.0, 0.7]]).repeat_interleave(len(x), dim=0)
+    picture = render_points(torch.cat(ridge), colors, front_camera(), normals=normals)
+    middle = picture[20:40, 25:55]
+    expected = torch.where(torch.arange(30) >= 15, 0, 2).expand(20, 30)
+    assert float((middle.argmax(dim=-1) == expected).float().mean()) > 0.98
+
+
 def test_sensor_view_is_what_a_camera_in_the_origin_sees():
     points, colors = square(3.0, RED)
     right, blue = square(3.0, BLUE, half=0.3)

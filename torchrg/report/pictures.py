@@ -30,7 +30,7 @@ def render_cloud(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     azimuth_deg: float | None = None,
     elevation_deg: float | None = None,
-    width: int = 1600,
+    width: int = 1400,
     height: int | None = None,
     supersampling: int = 2,
 ) -> Tensor:
