@@ -15,6 +15,7 @@ from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.detmcd import fit_normals_detmcd
 from torchrg.normals.irls import fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
+from torchrg.normals.orient import orient_normals
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.normals.robust_fits import (
     fit_normals_detmm,
@@ -39,6 +40,7 @@ __all__ = [
     "fit_normals_jet",
     "fit_normals_mve",
     "fit_normals_pca",
+    "orient_normals",
 ]
 
 ESTIMATORS: dict[str, Estimator] = {
