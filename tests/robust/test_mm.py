@@ -76,13 +76,15 @@ def test_detmm_agrees_with_statsmodels_where_the_scales_do(oracles_folder):
 
 
 def test_float32_agrees(oracles_folder):
-    for fit, key, tolerance in ((fit_dets, "s_cov", 3e-4), (fit_detmm, "mm_shape_cov", 1e-3)):
+    for fit, key, tolerance in ((fit_dets, "s_cov", 1e-4), (fit_detmm, "mm_shape_cov", 1e-3)):
         for name, found, ours in regular_fits(
             oracles_folder, fit, ["ref_numpy"], local_float32, FLAT_IN_FLOAT32
         ):
             expected = ours.get("dets_mm", {}).get(key)
             if expected is None:
                 continue
+            if name == "planar_very_fine":
+                tolerance = 1e-3  # its noise is a hundred times the rounding of a coordinate
             assert_same_scatter(found, expected, tolerance, name)
             if name != "line_noisy":
                 angle = angle_deg(normal_of(found.covariance), normal_of(expected))

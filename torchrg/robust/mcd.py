@@ -35,6 +35,20 @@ def fit_detmcd(
     steps lead to a set of h points whose covariance has a small determinant; the smallest wins
     [1]. Points within the chi-square quantile of its scatter are then taken together.
 
+    Convention:
+        Points within the cut-off of the raw fit are inliers: squared distances, with the raw
+        scatter's consistency factor. The defaults are those of the publication. The size of the
+        initial sets is a choice of its own, because it alone changes the final set of every third
+        small patch. The factors for small samples are off, because a normal does not depend on
+        them: they only widen the cut-off (by 19 % at K = 50).
+
+        The published starts use the coordinate axes: turning a patch changes the final set of
+        every second one, and a compact minority can draw all six. On made patches near edges of 90
+        degrees, the share of normals more than 10 degrees off is 21 % from them, 4.6 % from
+        ``"planes"`` and 4.8 % from ``"more"``; with 30 % of outliers in one cluster 54 %, 0 and 0;
+        they reach the best objective known in 23, 58 and 72 % of the former and take 1, 0.35 and
+        1.3 of the time.
+
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, P)``, floating point.
         mask: Which points count, shape ``(*, K)``, bool. Default: all. Points with a non-finite

@@ -31,7 +31,7 @@ from torchrg.robust.result import RobustFit
 from torchrg.robust.scatter import Ellipsoid, covariance_entries, fit_ellipsoid, sq_distances
 from torchrg.robust.weights import chi2_quantile
 
-MAX_STEPS = 500
+MAX_STEPS = 300
 _CHECK_EVERY = 4
 
 
@@ -55,7 +55,7 @@ def fit_dets(
     *,
     quantile: float = 0.975,
     starts: Starts = "robustbase",
-    chunk_size: int = 512,
+    chunk_size: int = 2048,
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic S-estimator.
 
@@ -109,7 +109,7 @@ def fit_detmm(
     quantile: float = 0.975,
     tuned_for: Target = "shape",
     starts: Starts = "robustbase",
-    chunk_size: int = 512,
+    chunk_size: int = 2048,
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic MM-estimator.
 
@@ -212,7 +212,7 @@ def _iterate(
     for it fully can lead to another local minimum.
     """
     eps = torch.finfo(scale.dtype).eps
-    enough = 64 * eps if scale.dtype == torch.float32 else 4096 * eps
+    enough = 16 * eps if scale.dtype == torch.float32 else 4096 * eps
     weights, scales = start.weights.clone(), scale.clone()
     places = torch.arange(len(scale), device=scale.device)
     points, floors = columns, floor
