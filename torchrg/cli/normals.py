@@ -1,0 +1,124 @@
+"""``torchrg normals``: normals and curvature of scans."""
+
+import dataclasses
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+
+from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.cli.provenance import describe_run
+from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
+from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals.orient import Orientation
+from torchrg.structures import Cloud, NormalFit
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Estimate normals and curvature of scans, and tell sharp feature points."""
+
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
+    out: Path
+    """File to write, its format by suffix; for several inputs a directory."""
+    method: NormalMethod | None = None
+    """Estimator; short for --normals.method."""
+    orient: Orientation | Literal["none"] = "none"
+    """How to choose the sign of each normal: towards the viewpoint or along an axis, so that
+    neighbours agree (consistent), or into the free space of rooms (interior)."""
+    viewpoint: tuple[float, float, float] | None = None
+    """Where the scanner stood, in the coordinates of the input; for --orient viewpoint."""
+    normals: NormalsConfig = dataclasses.field(default_factory=lambda: load_config().normals)
+    """How normals and curvature are estimated."""
+    chunk_size: int = PipelineConfig.chunk_size
+    """Points handled at a time; bounds memory, never changes a result."""
+    threads: int | None = None
+    """Threads to use. Default: as torch decides, usually one a core."""
+
+
+def run(argv: list[str]) -> int:
+    """Parse the arguments, estimate the normals of each input and write them."""
+    arguments = parse(Arguments, argv, prog="torchrg normals")
+    _check(arguments)
+    if arguments.method is not None:
+        arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
+    if arguments.threads is not None:
+        torch.set_num_threads(arguments.threads)
+    outputs = output_paths(arguments.inputs, arguments.out)
+    failed = 0
+    for source, target in zip(arguments.inputs, outputs, strict=True):
+        try:
+            _estimate_file(source, target, arguments)
+        except TorchrgError as error:
+            if len(outputs) == 1:
+                raise
+            failed += 1
+            fail(str(error))
+    if failed:
+        return fail(
+            f"{failed} of {len(outputs)} inputs failed, the others are written.", code=SOME_FAILED
+        )
+    return 0
+
+
+def _check(arguments: Arguments) -> None:
+    """Refuse settings out of range, before any work.
+
+    Raises:
+        ConfigError: If there is one.
+    """
+    if arguments.threads is not None and arguments.threads < 1:
+        raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
+    if arguments.chunk_size < 1:
+        raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
+    if (arguments.orient == "viewpoint") != (arguments.viewpoint is not None):
+        raise ConfigError("expected --viewpoint X Y Z and --orient viewpoint together.")
+
+
+def _estimate_file(source: Path, target: Path, arguments: Arguments) -> None:
+    """Estimate the normals of one file."""
+    begin = time.perf_counter()
+    cloud = read_cloud(source)
+    if not cloud.finite.any():
+        raise FormatError(f"{source}: expected finite points, got none in {len(cloud):,} points.")
+    check_output(target, cloud)
+    fit = estimate_normals(cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size)
+    if arguments.orient != "none":
+        place = arguments.viewpoint
+        towards = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
+        turned = orient_normals(
+            cloud.points, fit.normals, towards=arguments.orient, viewpoint=towards
+        )
+        fit = fit._replace(normals=turned)
+    settings = describe_run(source, arguments.normals)
+    settings |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
+    # As with segmentations, .npz holds the results alone, other formats the cloud's fields too.
+    kept = {} if target.suffix.lower() == ".npz" else cloud.fields
+    result = _with_normals(replace(cloud, fields=kept), fit)
+    write_cloud(target, result, provenance=settings)
+    num_valid = int(fit.valid.sum())
+    if num_valid < len(cloud):
+        warn(f"{source}: {len(cloud) - num_valid:,} of {len(cloud):,} points have no normal.")
+    sharp = "" if fit.sharp is None else f"{int(fit.sharp.sum()):,} sharp, "
+    seconds = time.perf_counter() - begin
+    print(f"{source}: {len(cloud):,} points, {sharp}{seconds:.1f} s -> {target}")
+
+
+def _with_normals(cloud: Cloud, fit: NormalFit) -> Cloud:
+    """Return a cloud with normals, curvature and masks beside its own fields."""
+    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
+    found = {
+        "normals": fit.normals.numpy(),
+        "curvature": fit.curvature.numpy(),
+        "sharp": sharp.numpy(),
+        "valid": fit.valid.numpy(),
+    }
+    kept = {name: values for name, values in cloud.fields.items() if name not in found}
+    return replace(cloud, fields={**kept, **found})
