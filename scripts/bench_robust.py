@@ -142,8 +142,8 @@ def report(name: str, value: float) -> None:
     print(f"  {name:32s} {value:12.2f} us")
 
 
-def contaminate(kind: str, share: float, count: int, seed: int = 0) -> Tensor:
-    """Noisy planes across z of 50 points, a share of them replaced by outliers."""
+def contaminate(kind: str, share: float, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Noisy planes of 50 points, turned at random, a share of them outliers; their normals."""
     draw = torch.Generator().manual_seed(seed)
     patches = torch.rand(count, K, 3, generator=draw) - 0.5
     patches[..., 2] = 0.01 * torch.randn(count, K, generator=draw)
@@ -156,7 +156,8 @@ def contaminate(kind: str, share: float, count: int, seed: int = 0) -> Tensor:
     else:
         outliers = torch.tensor([5.0, 5.0, 10.0]) + normal
     patches[:, :number] = outliers
-    return patches
+    turn = torch.linalg.qr(torch.randn(count, 3, 3, generator=draw)).Q
+    return patches @ turn, turn[:, 2]
 
 
 def print_breakdown(count: int) -> None:
@@ -175,11 +176,12 @@ def print_breakdown(count: int) -> None:
     print("outliers      " + "".join(f"{name:>14s}" for name in fits))
     for kind in ("cluster", "shell", "far"):
         for share in (0.0, 0.1, 0.3, 0.45):
-            patches = contaminate(kind, share, count)
+            patches, truth = contaminate(kind, share, count)
             cells = []
             for fit in fits.values():
                 normals = eigh3(fit(patches).double())[1][..., 0]
-                angle = torch.rad2deg(normals[:, 2].abs().clamp(max=1).acos())
+                cosine = (normals * truth).sum(dim=1).abs().clamp(max=1)
+                angle = torch.rad2deg(cosine.acos())
                 cells.append(f"{angle.median():.1f} / {angle.quantile(0.9):.1f}")
             print(f"{kind:8s} {share:4.0%} " + "".join(f"{cell:>14s}" for cell in cells))
 

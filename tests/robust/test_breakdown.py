@@ -1,0 +1,53 @@
+import pytest
+import torch
+
+from torchrg.linalg import eigh3
+from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd
+
+
+def contaminated(kind, share, rng, count=40):
+    """Noisy planes turned at random, a share of the points outliers, and their normals."""
+    patches = torch.rand(count, 50, 3, generator=rng) - 0.5
+    patches[..., 2] = 0.01 * torch.randn(count, 50, generator=rng)
+    number = round(share * 50)
+    scatter = torch.randn(count, number, 3, generator=rng)
+    patches[:, :number] = {
+        "cluster": torch.tensor([0.2, 0.1, 0.4]) + 0.05 * scatter,
+        "shell": 0.5 * scatter / scatter.norm(dim=-1, keepdim=True),
+        "far": torch.tensor([5.0, 5.0, 10.0]) + scatter,
+    }[kind]
+    turn = torch.linalg.qr(torch.randn(count, 3, 3, generator=rng)).Q
+    return patches @ turn, turn[:, 2]
+
+
+def angles_deg(covariance, normals):
+    found = eigh3(covariance.double())[1][..., 0]
+    return torch.rad2deg((found * normals).sum(dim=1).abs().clamp(max=1).acos())
+
+
+# The largest share of each kind that an estimator withstands in every patch.
+WITHSTOOD = {
+    "paper": (fit_detmcd, {"cluster": 0.1, "shell": 0.45, "far": 0.45}),
+    "planes": (
+        lambda p: fit_detmcd(p, starts="planes"),
+        {"cluster": 0.45, "shell": 0.45, "far": 0.45},
+    ),
+    "fastmcd": (
+        lambda p: fit_fastmcd(p, num_starts=200),
+        {"cluster": 0.3, "shell": 0.45, "far": 0.45},
+    ),
+    "detmm": (fit_detmm, {"cluster": 0.1, "shell": 0.3, "far": 0.45}),
+}
+
+
+@pytest.mark.parametrize("name", WITHSTOOD)
+@pytest.mark.parametrize("kind", ["cluster", "shell", "far"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.45])
+def test_normal_stays_within_two_degrees(name, kind, share, rng):
+    fit, withstood = WITHSTOOD[name]
+    if share > withstood[kind]:
+        pytest.skip("beyond what this estimator withstands")
+    patches, normals = contaminated(kind, share, rng)
+    angles = angles_deg(fit(patches).covariance, normals)
+    assert angles.median() < 1
+    assert angles.quantile(0.9) < 2
