@@ -5,7 +5,7 @@ from torchrg.linalg import eigh3
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd
 
 
-def contaminated(kind, share, rng, count=40):
+def contaminated(kind, share, rng, count=30):
     """Noisy planes turned at random, a share of the points outliers, and their normals."""
     patches = torch.rand(count, 50, 3, generator=rng) - 0.5
     patches[..., 2] = 0.01 * torch.randn(count, 50, generator=rng)
@@ -40,14 +40,18 @@ WITHSTOOD = {
 }
 
 
-@pytest.mark.parametrize("name", WITHSTOOD)
-@pytest.mark.parametrize("kind", ["cluster", "shell", "far"])
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.45])
+LEVELS = [
+    (name, kind, share)
+    for name, (_, withstood) in WITHSTOOD.items()
+    for kind, largest in withstood.items()
+    for share in (0.0, 0.1, 0.3, 0.45)
+    if share <= largest
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "share"), LEVELS)
 def test_normal_stays_within_two_degrees(name, kind, share, rng):
-    fit, withstood = WITHSTOOD[name]
-    if share > withstood[kind]:
-        pytest.skip("beyond what this estimator withstands")
     patches, normals = contaminated(kind, share, rng)
-    angles = angles_deg(fit(patches).covariance, normals)
+    angles = angles_deg(WITHSTOOD[name][0](patches).covariance, normals)
     assert angles.median() < 1
     assert angles.quantile(0.9) < 2

@@ -44,22 +44,29 @@ def share_chunks(
 ) -> None:
     """Call ``work`` once on each thread, with an iterator that hands out the chunks.
 
-    As :func:`run_chunks`, for work that keeps buffers from one chunk to the next.
+    As :func:`run_chunks`, for work that keeps buffers from one chunk to the next. A single chunk is
+    worked on by one thread too: threads that wait for each other within an operation make it many
+    times slower where another process wants a core.
     """
-    _keep_freed_memory()
-    num_threads = min(torch.get_num_threads(), len(chunks))
-    if device.type != "cpu" or num_threads < 2:
+    if device.type != "cpu":
         work(iter(chunks))
         return
-    shared, setting = _Shared(chunks), torch.get_num_threads()
+    _keep_freed_memory()
+    setting = torch.get_num_threads()
+    num_threads = min(setting, len(chunks))
     try:
+        # The setting is one of each thread, and the default of those that start later.
+        torch.set_num_threads(1)
+        if num_threads < 2:
+            work(iter(chunks))
+            return
+        shared = _Shared(chunks)
         with ThreadPoolExecutor(
             num_threads, initializer=torch.set_num_threads, initargs=(1,)
         ) as pool:
             for _ in pool.map(work, [shared] * num_threads):
                 pass
     finally:
-        # The initializer changed the default that later threads start with.
         torch.set_num_threads(setting)
 
 

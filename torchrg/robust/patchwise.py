@@ -23,6 +23,8 @@ Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
 CHUNK_SIZE = 1024
 """Patches worked on together; what they need has to fit the processor's cache."""
 
+_MIN_SHARE = 64
+
 
 def fit_patchwise(
     caller: str,
@@ -74,6 +76,7 @@ def _fit_groups(
         if count == 0:
             continue
         rows = torch.nonzero(counts == count).squeeze(1)
+        share = min(chunk_size, max(_MIN_SHARE, -(-len(rows) // torch.get_num_threads())))
 
         def work(
             chunk: slice, rows: Tensor = rows, whole: bool = count == num_points, count: int = count
@@ -89,7 +92,7 @@ def _fit_groups(
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
 
-        run_chunks(work, chunks_of(len(rows), chunk_size), patches.device)
+        run_chunks(work, chunks_of(len(rows), share), patches.device)
     return out
 
 
