@@ -23,7 +23,8 @@ def fit_normals_pca(
     Convention:
         The sign of a normal is arbitrary. Gradients flow through normals, curvature and residual,
         and are finite where two eigenvalues are equal: the turn between the two is left out.
-        ``torch.vmap`` and ``torch.compile(fullgraph=True)`` work.
+        ``torch.compile(fullgraph=True)`` works, and so does ``torch.vmap``, with
+        ``out_dims=NormalFit(0, 0, 0, 0, None)`` as the fit has no ``sharp``.
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, 3)``.

@@ -1,0 +1,222 @@
+"""Signs of normals: towards a place, along an axis, consistent on solids, into rooms."""
+
+import pytest
+import torch
+
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.neighbors import search_knn
+from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals.propagate import propagate_signs
+from torchrg.scenes import make_room, make_shape
+
+
+def shuffled_signs(normals):
+    signs = torch.rand(len(normals), generator=torch.Generator().manual_seed(5)) < 0.5
+    return torch.where(signs[:, None], -normals, normals)
+
+
+def share_right(oriented, truth):
+    """Share of right signs among normals that are about right."""
+    dot = (oriented * truth).sum(dim=1)
+    return float((dot > 0)[dot.abs() > 0.7].double().mean())
+
+
+@pytest.fixture(scope="module")
+def room():
+    scene = make_room(30_000, 0.003, 1)
+    fit = estimate_normals(scene.points, method="pca", k=20)
+    return scene, shuffled_signs(fit.normals)
+
+
+def box_room(size, at, rng, count=1500, faces=range(6)):
+    """Points on the faces of a box, and normals into it."""
+    points, normals = [], []
+    for face in faces:
+        axis, high = face // 2, face % 2
+        part = torch.rand(count, 3, generator=rng)
+        part[:, axis] = high
+        points.append(part * torch.tensor(size) + torch.tensor(at))
+        normals.append((1 - 2 * high) * torch.eye(3)[axis].expand(count, 3))
+    return torch.cat(points), torch.cat(normals)
+
+
+def test_normals_look_at_the_viewpoint(rng):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng)
+    oriented = orient_normals(
+        points, shuffled_signs(inwards), towards="viewpoint", viewpoint=torch.tensor([1.0, 2, 1])
+    )
+    assert torch.equal(oriented, inwards)
+
+
+def test_each_point_may_have_its_own_viewpoint(rng):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng)
+    oriented = orient_normals(points, inwards, towards="viewpoint", viewpoint=points - inwards)
+    assert torch.equal(oriented, -inwards)
+
+
+@pytest.mark.parametrize("axis", ["+x", "-x", "+y", "-y", "+z", "-z"])
+def test_normals_lie_along_the_axis(rng, axis):
+    normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=rng), dim=1)
+    oriented = orient_normals(torch.rand(50, 3, generator=rng), normals, towards=axis)
+    component = oriented[:, "xyz".index(axis[1])]
+    assert ((component > 0) if axis[0] == "+" else (component < 0)).all()
+    assert torch.equal(oriented.abs(), normals.abs())
+
+
+def test_right_angles_have_one_answer():
+    across = torch.tensor([[-1.0, 0, 0], [0, -1, 0], [0.6, -0.8, 0]])
+    for normals in (across, -across):
+        oriented = orient_normals(torch.zeros(3, 3), normals, towards="+z")
+        assert torch.equal(oriented, torch.tensor([[1.0, 0, 0], [0, 1, 0], [-0.6, 0.8, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("name", "num_points"),
+    [
+        ("cube", 5000),
+        ("dodecahedron", 5000),
+        ("stairs", 5000),
+        ("bracket", 5000),
+        ("torus", 5000),
+        ("coral", 5000),
+        ("thin_plate", 15_000),
+    ],
+)
+def test_consistent_is_outwards_on_solids(name, num_points):
+    scene = make_shape(name, num_points, 0.0)
+    oriented = orient_normals(scene.points, shuffled_signs(scene.normals), towards="consistent")
+    assert share_right(oriented, scene.normals) > 0.999
+
+
+def test_consistent_bears_noise_and_smoothed_edges():
+    scene = make_shape("bracket", 5000, 0.004)
+    fit = estimate_normals(scene.points, method="pca", k=20)
+    oriented = orient_normals(scene.points, shuffled_signs(fit.normals), towards="consistent")
+    assert share_right(oriented, scene.normals) > 0.995
+
+
+def test_components_are_turned_each_for_itself():
+    scene = make_shape("sphere", 1000)
+    points = torch.cat([scene.points, scene.points + 10, scene.points - 10])
+    normals = scene.normals.repeat(3, 1)
+    oriented = orient_normals(points, shuffled_signs(normals), towards="consistent")
+    assert torch.equal(oriented, normals)
+
+
+def test_open_surface_is_consistent(rng):
+    points = torch.rand(500, 3, generator=rng)
+    for bend, up in ((0.0, True), (0.3, False), (-0.3, True)):
+        points[:, 2] = bend * points[:, 0] ** 2
+        fit = estimate_normals(points, method="pca", k=12)
+        oriented = orient_normals(points, shuffled_signs(fit.normals), towards="consistent")
+        # Flat: upwards; bent: to the convex side.
+        assert ((oriented[:, 2] > 0) == up).all()
+
+
+def test_patches_end_at_edges(rng):
+    points, inwards = box_room((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), rng)
+    signs = propagate_signs(points, inwards, search_knn(points, 12), max_bend=0.05)
+    sizes = signs.patches.bincount()
+    assert sizes.sort(descending=True).values[:6].sum() > 0.98 * len(points)
+    assert sizes.max() <= 1500
+
+
+def test_rooms_are_seen_from_inside(room):
+    scene, normals = room
+    oriented = orient_normals(scene.points, normals)
+    # Table tops of 4 cm are thinner than the neighbourhoods of this sparse cloud.
+    assert share_right(oriented, scene.normals) > 0.95
+    kinds = torch.tensor([kind in ("floor", "ceiling", "wall") for kind in scene.kinds])
+    shell = kinds[scene.labels] & (scene.labels >= 0)
+    assert shell.sum() > 10_000
+    assert share_right(oriented[shell], scene.normals[shell]) > 0.998
+
+
+def test_wall_between_two_rooms_faces_both(rng):
+    left, into_left = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=3000)
+    right, into_right = box_room((3.0, 3.0, 2.5), (4.2, 0.0, 0.0), rng, count=3000)
+    truth = torch.cat([into_left, into_right])
+    oriented = orient_normals(torch.cat([left, right]), shuffled_signs(truth))
+    assert share_right(oriented, truth) > 0.999
+
+
+def test_floor_looks_up_without_a_ceiling(rng):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, faces=range(5))
+    oriented = orient_normals(points, shuffled_signs(inwards))
+    assert share_right(oriented, inwards) > 0.999
+
+
+def test_box_in_a_room_looks_outwards(rng):
+    points, inwards = box_room((5.0, 4.0, 2.5), (0.0, 0.0, 0.0), rng, count=4000)
+    box, into_box = box_room(
+        (0.8, 0.6, 0.7), (2.0, 1.5, 0.0), rng, count=500, faces=[0, 1, 2, 3, 5]
+    )
+    truth = torch.cat([inwards, -into_box])
+    oriented = orient_normals(torch.cat([points, box]), shuffled_signs(truth))
+    assert share_right(oriented[-2500:], truth[-2500:]) > 0.99
+    assert share_right(oriented, truth) > 0.995
+
+
+@pytest.mark.parametrize("towards", ["consistent", "interior"])
+def test_neither_signs_nor_order_matter(room, towards):
+    scene, normals = room
+    points = scene.points[:6000]
+    first = orient_normals(points, normals[:6000], towards=towards)
+    order = torch.randperm(6000, generator=torch.Generator().manual_seed(0))
+    again = orient_normals(points[order], -normals[:6000][order], towards=towards)
+    assert torch.equal(again, first[order])
+
+
+@pytest.mark.parametrize("towards", ["consistent", "interior"])
+@pytest.mark.parametrize("unit", [1e-4, 1e3])
+def test_unit_and_origin_do_not_matter(rng, towards, unit):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=500)
+    first = orient_normals(points, shuffled_signs(inwards), towards=towards)
+    moved = points.double() * unit + 5e6
+    again = orient_normals(moved, shuffled_signs(inwards), towards=towards)
+    assert (again != first).any(dim=1).sum() <= 3
+
+
+@pytest.mark.parametrize("towards", ["+z", "consistent", "interior"])
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_few_points_and_missing_normals_are_no_trouble(towards, count):
+    points, normals = torch.rand(count, 3), torch.zeros(count, 3)
+    assert torch.equal(orient_normals(points, normals, towards=towards), normals)
+    normals = torch.eye(3)[:1].expand(count, 3)
+    assert torch.equal(orient_normals(points, normals, towards=towards).abs(), normals)
+
+
+@pytest.mark.parametrize("towards", ["consistent", "interior"])
+def test_duplicates_and_bad_points_are_no_trouble(rng, towards):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=200)
+    points = torch.cat([points, points[:300], torch.full((2, 3), torch.nan)])
+    normals = torch.cat([inwards, inwards[:300], torch.zeros(2, 3)])
+    oriented = orient_normals(points, normals, towards=towards)
+    assert oriented.isfinite().all()
+    assert torch.equal(oriented.abs(), normals.abs())
+    same_place = torch.full((30, 3), 0.5)
+    assert orient_normals(same_place, torch.eye(3)[:1].expand(30, 3)).isfinite().all()
+
+
+def test_neighbors_may_be_given(rng):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=500)
+    for towards in ("consistent", "interior"):
+        oriented = orient_normals(
+            points, shuffled_signs(inwards), towards=towards, neighbors=search_knn(points, 20)
+        )
+        expected = inwards if towards == "interior" else -inwards
+        assert share_right(oriented, expected) > 0.999
+
+
+def test_wrong_arguments_are_refused():
+    points = torch.rand(4, 3)
+    with pytest.raises(ConfigError, match=r"towards to be one of viewpoint, .*, got 'up'"):
+        orient_normals(points, points, towards="up")
+    with pytest.raises(ConfigError, match="expected a viewpoint with towards='viewpoint'"):
+        orient_normals(points, points, towards="viewpoint")
+    with pytest.raises(ConfigError, match=r"expected no viewpoint with towards='\+z'"):
+        orient_normals(points, points, towards="+z", viewpoint=torch.zeros(3))
+    with pytest.raises(ShapeError, match="expected viewpoint of shape"):
+        orient_normals(points, points, towards="viewpoint", viewpoint=torch.zeros(2, 3))
+    with pytest.raises(ShapeError, match="expected normals of shape"):
+        orient_normals(points, points[:3])

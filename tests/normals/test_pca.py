@@ -1,0 +1,146 @@
+"""PCA planes: against NumPy, at every width, through vmap, compilers and autograd."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ShapeError
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.normals import fit_normals_pca
+from torchrg.structures import NormalFit
+
+
+def random_patches(rng, count=40, k=15, spread=(1.0, 0.7, 0.1)):
+    return torch.randn(count, k, 3, generator=rng, dtype=torch.float64) * torch.tensor(spread)
+
+
+def strips(rng, width, dtype, count=200, k=50):
+    """Patches of length one and the given width, turned at random."""
+    flat = torch.rand(count, k, 3, generator=rng, dtype=torch.float64)
+    turn = torch.linalg.qr(torch.randn(count, 3, 3, generator=rng, dtype=torch.float64))[0]
+    return (flat * torch.tensor([1.0, width, 0.0]) @ turn).to(dtype)
+
+
+def test_fit_is_that_of_numpy(rng):
+    patches = random_patches(rng)
+    fit = fit_normals_pca(patches)
+    for row, points in enumerate(patches.numpy()):
+        values, vectors = np.linalg.eigh(np.cov(points, rowvar=False, bias=True))
+        assert abs(fit.normals[row].numpy() @ vectors[:, 0]) == pytest.approx(1, abs=1e-12)
+        assert fit.curvature[row].item() == pytest.approx(values[0] / values.sum(), rel=1e-10)
+        assert fit.residual_rms[row].item() == pytest.approx(np.sqrt(values[0]), rel=1e-10)
+
+
+def test_masked_points_do_not_count_whatever_they_hold(rng):
+    patches = random_patches(rng)
+    mask = torch.rand(patches.shape[:2], generator=rng) < 0.6
+    fit = fit_normals_pca(torch.where(mask[..., None], patches, torch.nan), mask)
+    for row in range(len(patches)):
+        alone = fit_normals_pca(patches[row][mask[row]])
+        assert unsigned_angle_deg(fit.normals[row], alone.normals) < 1e-6
+        assert torch.allclose(fit.curvature[row], alone.curvature)
+
+
+def test_leading_axes_are_free(rng):
+    patches = random_patches(rng, count=12)
+    fit = fit_normals_pca(patches)
+    shaped = fit_normals_pca(patches.reshape(3, 2, 2, 15, 3))
+    assert torch.equal(shaped.normals.reshape(12, 3), fit.normals)
+    assert torch.equal(fit_normals_pca(patches[0]).normals, fit.normals[0])
+
+
+@pytest.mark.parametrize("width", [1e-1, 1e-2, 1e-3, 1e-4])
+def test_narrow_strips_are_planes(rng, dtype, width):
+    fit = fit_normals_pca(strips(rng, width, dtype))
+    assert fit.valid.all()
+
+
+@pytest.mark.parametrize("far", [0.0, 1.0, 1000.0])
+def test_lines_are_no_planes_wherever_they_are(rng, dtype, far):
+    lines = (strips(rng, 0.0, torch.float64) + far).to(dtype)
+    fit = fit_normals_pca(lines)
+    assert not fit.valid.any()
+    assert not fit.normals.any()
+
+
+def test_three_points_on_a_line_are_no_plane(dtype):
+    points = torch.tensor([[0.1, 0.2, 0.3], [0.2, 0.4, 0.6], [0.7, 1.4, 2.1]], dtype=dtype)
+    assert not fit_normals_pca(points).valid
+
+
+def test_resolution_decides_what_is_rounding(rng):
+    patches = strips(rng, 1e-4, torch.float64)
+    size = torch.full((len(patches),), 1e-3, dtype=torch.float64)
+    assert not fit_normals_pca(patches, resolution=size).valid.any()
+    assert fit_normals_pca(patches, resolution=size * 1e-3).valid.all()
+
+
+def test_gradients_are_right(rng):
+    patches = random_patches(rng, count=3, k=6).requires_grad_()
+    mask = torch.arange(6) < 5
+
+    def fit(points):
+        found = fit_normals_pca(points, mask.expand(3, 6))
+        return found.normals, found.curvature, found.residual_rms
+
+    assert torch.autograd.gradcheck(fit, patches)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        torch.zeros(5, 3),
+        torch.eye(3),
+        torch.cat([torch.eye(3), -torch.eye(3)]),
+        torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.zeros(1)),
+        torch.arange(4.0)[:, None].expand(4, 3),
+    ],
+    ids=["one place", "triangle", "octahedron", "lattice", "line"],
+)
+def test_gradients_are_finite_at_repeated_eigenvalues(points):
+    points = points.clone().requires_grad_()
+    fit = fit_normals_pca(points)
+    (fit.normals.sum() + fit.curvature + fit.residual_rms).backward()
+    assert points.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_vmap_is_the_batch(rng, dtype, masked):
+    patches = torch.cat([random_patches(rng), strips(rng, 0.0, torch.float64, k=15)]).to(dtype)
+    mask = torch.rand(patches.shape[:2], generator=rng) < 0.8 if masked else None
+    fit = fit_normals_pca(patches, mask)
+    axes = NormalFit(0, 0, 0, 0, None)
+    mapped = torch.vmap(fit_normals_pca, (0, 0 if masked else None), out_dims=axes)(patches, mask)
+    for name in ("normals", "curvature", "valid", "residual_rms"):
+        assert torch.equal(getattr(mapped, name), getattr(fit, name))
+    assert not fit.valid.all()
+
+
+def test_vmap_of_the_gradient_is_the_gradient(rng):
+    patches = random_patches(rng, count=8)
+    mapped = torch.vmap(torch.func.grad(lambda points: fit_normals_pca(points).curvature))(patches)
+    leaf = patches.clone().requires_grad_()
+    fit_normals_pca(leaf).curvature.sum().backward()
+    assert torch.allclose(mapped, leaf.grad)
+
+
+@pytest.mark.slow
+def test_compiled_fit_is_the_fit(rng):
+    patches = torch.cat([random_patches(rng), strips(rng, 0.0, torch.float64, k=15)]).float()
+    # The backend that needs no C++ compiler; it takes the same graph, without a break.
+    compiled = torch.compile(fit_normals_pca, fullgraph=True, backend="aot_eager")
+    for name, value in compiled(patches)._asdict().items():
+        assert value is None or torch.equal(value, getattr(fit_normals_pca(patches), name))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((torch.zeros(5, 2),), r"patches of shape \(\*, K, 3\), got \(5, 2\)"),
+        ((torch.zeros(2, 5, 3), torch.ones(2, 4, dtype=torch.bool)), "mask of shape"),
+        ((torch.zeros(5, 3, dtype=torch.int64),), "float32 or float64, got int64"),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments, message):
+    with pytest.raises(ShapeError, match=message):
+        fit_normals_pca(*arguments)

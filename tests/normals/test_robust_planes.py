@@ -1,0 +1,99 @@
+"""Planes of robust fits: PCA on the points that the fit keeps, right among outliers."""
+
+import pytest
+import torch
+
+from torchrg.errors import ShapeError
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.normals import (
+    fit_normals_detmcd,
+    fit_normals_detmm,
+    fit_normals_fastmcd,
+    fit_normals_mve,
+    fit_normals_pca,
+)
+from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
+
+PAIRS = [
+    (fit_normals_detmcd, fit_detmcd),
+    (fit_normals_fastmcd, fit_fastmcd),
+    (fit_normals_mve, fit_mve),
+    (fit_normals_detmm, fit_detmm),
+]
+fits = pytest.mark.parametrize("fit", [fit for fit, _ in PAIRS])
+
+
+def contaminated(rng, share, count=20, k=40):
+    """Noisy floors of which a share of the points is scattered above; float64."""
+    patches = torch.rand(count, k, 3, generator=rng, dtype=torch.float64)
+    patches[..., 2] = 0.01 * torch.randn(count, k, generator=rng, dtype=torch.float64)
+    num_outliers = round(share * k)
+    high = torch.rand(count, num_outliers, generator=rng, dtype=torch.float64)
+    patches[:, k - num_outliers :, 2] = 0.1 + high * patches[:, k - num_outliers :, 0]
+    return patches
+
+
+@pytest.mark.parametrize(("fit", "robust"), PAIRS)
+def test_plane_is_that_of_the_points_that_are_kept(rng, fit, robust):
+    patches = contaminated(rng, 0.3)
+    found, kept = fit(patches), robust(patches).support
+    for row in range(len(patches)):
+        expected = fit_normals_pca(patches[row][kept[row]])
+        assert unsigned_angle_deg(found.normals[row], expected.normals) < 1e-6
+        assert torch.allclose(found.curvature[row], expected.curvature)
+        assert torch.allclose(found.residual_rms[row], expected.residual_rms)
+
+
+@fits
+@pytest.mark.parametrize(("share", "allowed_deg"), [(0.0, 2.0), (0.1, 2.0), (0.3, 3.0), (0.4, 6.0)])
+def test_outliers_do_not_turn_the_normal(rng, fit, share, allowed_deg):
+    errors = unsigned_angle_deg(
+        fit(contaminated(rng, share)).normals, torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    )
+    assert errors.median() < allowed_deg
+
+
+@fits
+def test_most_points_on_a_plane_are_an_exact_fit(rng, fit, dtype):
+    patches = torch.rand(6, 40, 3, generator=rng).to(dtype)
+    patches[:, :28, 1] = 0.25
+    found = fit(patches)
+    assert found.valid.all()
+    assert torch.allclose(found.normals.abs(), torch.eye(3, dtype=dtype)[1], atol=1e-6)
+    assert not found.curvature.gt(1e-12).any()
+
+
+@fits
+def test_masked_points_do_not_count_whatever_they_hold(rng, fit):
+    patches = contaminated(rng, 0.2, count=4)
+    mask = torch.ones(4, 40, dtype=torch.bool)
+    mask[:, ::5] = False
+    found = fit(torch.where(mask[..., None], patches, torch.nan), mask)
+    expected = fit(patches[mask].reshape(4, 32, 3))
+    assert unsigned_angle_deg(found.normals, expected.normals).max() < 1e-6
+
+
+@fits
+def test_gradients_flow_through_the_plane_of_the_kept_points(rng, fit):
+    patches = contaminated(rng, 0.3, count=2).requires_grad_()
+    fit(patches).normals[:, 0].sum().backward()
+    assert patches.grad.isfinite().all()
+    assert patches.grad.abs().sum() > 0
+    kept = patches.grad.abs().sum(dim=-1) > 0
+    assert not kept.all()
+
+
+def test_generator_decides_the_random_sets(rng):
+    patches = contaminated(rng, 0.4)
+    for fit in (fit_normals_fastmcd, fit_normals_mve):
+        first = fit(patches, num_starts=5, generator=torch.Generator().manual_seed(1))
+        again = fit(patches, num_starts=5, generator=torch.Generator().manual_seed(1))
+        other = fit(patches, num_starts=5, generator=torch.Generator().manual_seed(2))
+        assert torch.equal(first.normals, again.normals)
+        assert not torch.equal(first.normals, other.normals)
+
+
+@fits
+def test_wrong_shapes_are_refused(fit):
+    with pytest.raises(ShapeError, match=rf"{fit.__name__}: expected patches of shape"):
+        fit(torch.zeros(5, 2))
