@@ -97,6 +97,18 @@ def test_exact_fit_in_any_unit_and_far_from_the_origin(estimator, unit, offset, 
     assert angle_deg(normal_of(fit.covariance / unit**2), turn.numpy() @ NORMAL) < tolerance
 
 
+@pytest.mark.parametrize("offset", [0.0, 30.0])
+def test_no_exact_plane_is_missed(offset, dtype, rng):
+    patches = torch.randn(1500, 50, 3, generator=rng, dtype=torch.float64)
+    patches[:, :30, 2] = 0
+    turn = torch.linalg.qr(torch.randn(1500, 3, 3, generator=rng, dtype=torch.float64)).Q
+    shift = offset * torch.randn(1500, 1, 3, generator=rng, dtype=torch.float64)
+    fit = fit_detmcd((patches @ turn + shift).to(dtype), starts="planes")
+    assert fit.exact_fit.all()
+    assert fit.support[:, :30].all()
+    assert fit.support[:, 30:].sum() < 5
+
+
 def test_half_of_the_points_on_a_plane_is_no_exact_mcd(rng):
     patch = torch.rand(50, 3, generator=rng, dtype=torch.float64)
     patch[:26] = tilted_plane(rng, 26)

@@ -14,6 +14,7 @@ from tests.robust.oracle_cases import (
 )
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.robust import fit_detmcd
+from torchrg.robust.starts import _score_table
 from torchrg.robust.weights import consistency_factor, small_sample_factor, subset_size
 
 
@@ -173,6 +174,12 @@ def test_distances_decide_the_support(rng):
     torch.testing.assert_close(fit.sq_distances, expected)
     inliers = patches[0][fit.support[0]]
     torch.testing.assert_close(fit.location[0], inliers.mean(0))
+
+
+def test_normal_scores_are_those_of_the_publication():
+    # scipy.stats.norm.ppf((np.arange(2, 9) / 2 - 1 / 3) / (4 + 1 / 3))
+    expected = [-1.02007623, -0.6151411, -0.29338123, 0.0, 0.29338123]
+    assert _score_table(4)[2:7] == pytest.approx(expected, abs=1e-7)
 
 
 def test_numpy_arrays_are_accepted(rng):

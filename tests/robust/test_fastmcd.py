@@ -5,6 +5,8 @@ import torch
 from tests.robust.oracle_cases import FRACTIONS, fit_all, load_oracles, local_float32, points_of
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_fastmcd
+from torchrg.robust.concentrate import Concentrated
+from torchrg.robust.fastmcd import _distinct_best
 
 
 def gaps(folder, convert, chosen):
@@ -84,6 +86,13 @@ def test_more_starts_never_lose_on_average(rng):
     few = fit_fastmcd(patches, num_starts=5).log_det
     many = fit_fastmcd(patches, num_starts=300).log_det
     assert np.mean((many - few).numpy()) < 0
+
+
+def test_equal_sets_are_kept_once():
+    determinants = torch.tensor([[3.0], [1.0], [2.0], [1.0], [2.0]], dtype=torch.float64)
+    members = torch.arange(5.0).reshape(1, 5, 1)
+    kept = _distinct_best(Concentrated(members, determinants, 1), 3)
+    assert kept.flatten().tolist() == [1, 2, 0]
 
 
 def test_refusals():

@@ -90,6 +90,15 @@ def test_qn_exceeds_at_the_value_of_qn_itself(dtype, rng):
         assert not qn_exceeds(row, value)
 
 
+def test_qn_exceeds_next_to_the_threshold(dtype, rng):
+    kind = np.float32 if dtype == torch.float32 else np.float64
+    for threshold in torch.rand(300, generator=rng).tolist():
+        step = kind(kind(threshold) / kind(2.2219))
+        for length in (np.nextafter(step, kind(0)), step, np.nextafter(step, kind(9))):
+            row = torch.tensor([0.0, float(length)], dtype=dtype)
+            assert qn_exceeds(row, threshold).item() == (qn(row) > threshold).item()
+
+
 def test_masked_values_do_not_count(dtype, rng):
     rows = torch.randn(12, 50, generator=rng, dtype=dtype)
     mask = torch.rand(12, 50, generator=rng) < torch.linspace(0, 1, 12)[:, None]

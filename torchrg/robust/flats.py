@@ -110,7 +110,7 @@ def _majorities(
     reach: Tensor,
     size: int,
 ) -> _Majorities:
-    """Count the points near the first few candidates of each lane, and keep the fullest."""
+    """Count the points near the first few candidates of each lane, and keep one full one."""
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
     simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
@@ -121,13 +121,14 @@ def _majorities(
     ]
     across = _reject(offsets, [[part[simplex, lane] for part in axis] for axis in axes])
     near = sum_squares(across) <= reach[simplex, lane] ** 2
-    count = near.sum(dim=0)
-    fullest = torch.zeros_like(open_lanes).scatter_reduce_(0, place, count, "amax")
+    # The best ruler among the full ones: a poor one may collect points beside the flat as well.
+    ruler = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)
+    best = reach.new_full((len(open_lanes),), torch.inf)
+    best.scatter_reduce_(0, place, ruler, "amin")
     order = torch.arange(len(place), device=place.device)
-    winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(
-        0, place, order.masked_fill(count < fullest[place], len(place)), "amin"
-    )
-    winner = winner[fullest >= size]
+    order = order.masked_fill((ruler > best[place]) | ruler.isinf(), len(place))
+    winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(0, place, order, "amin")
+    winner = winner[winner < len(place)]
     return _Majorities(lane[winner], near[:, winner])
 
 
