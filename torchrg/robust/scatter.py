@@ -70,13 +70,10 @@ def determinant(ellipsoid: Ellipsoid, denominator: float) -> Tensor:
 
 def sq_distances(ellipsoid: Ellipsoid, denominator: Tensor | float) -> Tensor:
     """Squared Mahalanobis distances to the scatter over ``denominator``, shape ``(K, M)``."""
-    distances = None
+    distances = torch.zeros_like(ellipsoid.residuals[0])
     for residual, square in zip(ellipsoid.residuals, ellipsoid.squares, strict=True):
         term = residual * residual
-        term.mul_(denominator / square)
-        distances = term if distances is None else distances.add_(term)
-    if distances is None:
-        raise AssertionError  # a patch has at least one coordinate
+        distances += term.mul_(denominator / square)
     return distances
 
 
