@@ -1,52 +1,19 @@
 """S and MM estimates of location and scatter from deterministic starts."""
 
-from typing import NamedTuple
-
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.robust.bisquare import (
-    BREAKDOWN,
-    Target,
-    bisquare_loss,
-    bisquare_weights,
-    breakdown_constant,
-    efficiency_constant,
-)
+from torchrg.robust.bisquare import Target, bisquare_loss, breakdown_constant, efficiency_constant
 from torchrg.robust.differences import half_size
 from torchrg.robust.estimate import Estimate
-from torchrg.robust.lanes import (
-    indicator,
-    join_columns,
-    median_points,
-    smallest_points,
-    sum_points,
-    take_lanes,
-)
+from torchrg.robust.lanes import indicator, join_columns, smallest_points, sum_points
 from torchrg.robust.mcd import Starts, check_starts, initial_sets
 from torchrg.robust.patchwise import fit_patchwise
 from torchrg.robust.result import RobustFit
-from torchrg.robust.scatter import Ellipsoid, covariance_entries, fit_ellipsoid, sq_distances
+from torchrg.robust.scatter import covariance_entries, fit_ellipsoid, sq_distances
+from torchrg.robust.shape import Shape, choose_shape, m_scale, reweight_shape, shape_of, volume
 from torchrg.robust.weights import chi2_quantile
-
-MAX_STEPS = 300
-_CHECK_EVERY = 4
-
-
-class Shape(NamedTuple):
-    """A weighted fit of each lane, its scatter scaled to determinant one.
-
-    Attributes:
-        weights: Of the points, shape ``(K, M)``.
-        ellipsoid: Their factored scatter.
-        distances: Squared distances to the scatter of determinant one, shape ``(K, M)``.
-    """
-
-    weights: Tensor
-    ellipsoid: Ellipsoid
-    distances: Tensor
 
 
 def fit_dets(
@@ -155,11 +122,11 @@ def fit_detmm(
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         first, scale = _best_s_estimate(columns, floor, size, starts)
         cutoff = efficiency_constant(len(columns), tuned_for)
-        final, _ = _iterate(columns, first, scale, floor, cutoff, adapt_scale=False)
+        final, _ = reweight_shape(columns, first, scale, floor, cutoff, adapt_scale=False)
         sq_unit = cutoff * cutoff * scale * scale
         before = sum_points(bisquare_loss(first.distances / sq_unit))
         after = sum_points(bisquare_loss(final.distances / sq_unit))
-        final = _choose(after <= before, final, first)
+        final = choose_shape(after <= before, final, first)
         return _estimate(columns, first, final, scale, quantile)
 
     return fit_patchwise(
@@ -181,9 +148,9 @@ def _best_s_estimate(
         members = initial.reshape(num_points, -1)
         ellipsoid = fit_ellipsoid(points, members, count, floors)
         members = smallest_points(sq_distances(ellipsoid, count), size)
-        shape = _shape_of(points, members, floors)
-        scale = _m_scale(shape.distances, cutoff)
-        shape, scale = _iterate(points, shape, scale, floors, cutoff, adapt_scale=True)
+        shape = shape_of(points, members, floors)
+        scale = m_scale(shape.distances, cutoff)
+        shape, scale = reweight_shape(points, shape, scale, floors, cutoff, adapt_scale=True)
         shapes.append(shape)
         scales.append(scale.reshape(num_starts, num_lanes))
     scale = torch.cat(scales)
@@ -192,106 +159,9 @@ def _best_s_estimate(
     weights = torch.cat(
         [shape.weights.reshape(num_points, -1, num_lanes) for shape in shapes], dim=1
     )
-    return _shape_of(
+    return shape_of(
         columns, weights.gather(1, best.expand(num_points, 1, -1)).squeeze(1), floor
     ), scale[best, lane]
-
-
-def _iterate(
-    columns: list[Tensor],
-    start: Shape,
-    scale: Tensor,
-    floor: Tensor,
-    cutoff: float,
-    *,
-    adapt_scale: bool,
-) -> tuple[Shape, Tensor]:
-    """Reweight until the weights settle; lanes that have settled leave the batch.
-
-    With ``adapt_scale`` the scale takes one step to the M-scale before each reweighting: solving
-    for it fully can lead to another local minimum.
-    """
-    eps = torch.finfo(scale.dtype).eps
-    enough = 16 * eps if scale.dtype == torch.float32 else 4096 * eps
-    weights, scales = start.weights.clone(), scale.clone()
-    places = torch.arange(len(scale), device=scale.device)
-    points, floors = columns, floor
-    distances, previous = start.distances, start.weights
-    for step in range(1, MAX_STEPS + 1):
-        if adapt_scale:
-            scale = _m_scale_step(distances, scale, cutoff)
-        current = bisquare_weights(distances / (cutoff * scale) ** 2)
-        distances = _shape_of(points, current, floors).distances
-        if step % _CHECK_EVERY and step != MAX_STEPS:
-            previous = current
-            continue
-        change = sum_points((current - previous).abs())
-        settled = change <= enough * sum_points(current)
-        if step == MAX_STEPS:
-            settled |= True
-        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
-        if len(done):
-            weights.index_copy_(1, places[done], current.index_select(1, done))
-            scales[places[done]] = scale[done]
-            if len(moving) == 0:
-                break
-            points = take_lanes(points, moving)
-            places, scale, floors = places[moving], scale[moving], floors[moving]
-            distances, current = take_lanes([distances, current], moving)
-        previous = current
-    return _shape_of(columns, weights, floor), scales
-
-
-def _shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> Shape:
-    """Fit the weighted points of each lane, and scale the scatter to determinant one."""
-    total = sum_points(weights)
-    ellipsoid = fit_ellipsoid(columns, weights, total, floor)
-    return Shape(weights, ellipsoid, sq_distances(ellipsoid, _volume(ellipsoid)))
-
-
-def _volume(ellipsoid: Ellipsoid) -> Tensor:
-    """The P-th root of the determinant of each lane's sums of squares."""
-    product = torch.ones_like(ellipsoid.squares[0], dtype=torch.float64)
-    for square in ellipsoid.squares:
-        product = product * square.double()
-    root = 1 / len(ellipsoid.squares)
-    if product.device.type == "cpu":
-        # NumPy's power is the same for a value wherever it stands; torch's is not.
-        product = torch.from_numpy(np.power(product.numpy(), root))
-    else:
-        product = product**root
-    return product.to(ellipsoid.squares[0].dtype)
-
-
-def _m_scale(distances: Tensor, cutoff: float) -> Tensor:
-    """Scale at which the mean loss of each lane's distances is half of its maximum."""
-    scale = (median_points(distances) / chi2_quantile(0.5, 1)).sqrt()
-    scale = scale.clamp(min=torch.finfo(scale.dtype).tiny)
-    for _ in range(50):
-        scale = _m_scale_step(distances, scale, cutoff)
-    return scale
-
-
-def _m_scale_step(distances: Tensor, scale: Tensor, cutoff: float) -> Tensor:
-    loss = sum_points(bisquare_loss(distances / (cutoff * scale) ** 2)) / len(distances)
-    return scale * (loss / BREAKDOWN).sqrt()
-
-
-def _choose(condition: Tensor, a: Shape, b: Shape) -> Shape:
-    """Shape a where the condition holds, otherwise b."""
-    return Shape(
-        torch.where(condition, a.weights, b.weights),
-        Ellipsoid(
-            [torch.where(condition, x, y) for x, y in zip(a[1].means, b[1].means, strict=True)],
-            [
-                torch.where(condition, x, y)
-                for x, y in zip(a[1].residuals, b[1].residuals, strict=True)
-            ],
-            [torch.where(condition, x, y) for x, y in zip(a[1].squares, b[1].squares, strict=True)],
-            a[1].singular | b[1].singular,
-        ),
-        torch.where(condition, a.distances, b.distances),
-    )
 
 
 def _estimate(
@@ -304,8 +174,8 @@ def _estimate(
     bound = distances.new_tensor([chi2_quantile(quantile, size)])
 
     def scatter(shape: Shape) -> Tensor:
-        volume = _volume(shape.ellipsoid) / sq_scale
-        return covariance_entries(columns, shape.ellipsoid.means, shape.weights, volume)
+        denominator = volume(shape.ellipsoid) / sq_scale
+        return covariance_entries(columns, shape.ellipsoid.means, shape.weights, denominator)
 
     return Estimate(
         location=join_columns(final.ellipsoid.means),

@@ -1,7 +1,6 @@
 """From patches of any shape to lanes and back: masks, units, exact planes, chunks, threads."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,8 +10,9 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
 from torchrg.robust.chunks import chunks_of, run_chunks
 from torchrg.robust.estimate import Estimate
-from torchrg.robust.flats import find_flats, flatness_tolerance, refine_flat
-from torchrg.robust.lanes import join_columns, median_points, split_columns, sum_points, take_lanes
+from torchrg.robust.flats import find_flats, refine_flat
+from torchrg.robust.frame import Frame, to_lanes
+from torchrg.robust.lanes import join_columns, sum_points, take_lanes
 from torchrg.robust.result import RobustFit, no_fit
 from torchrg.robust.scatter import covariance_entries
 from torchrg.robust.weights import subset_size
@@ -113,27 +113,6 @@ def _spread(fit: RobustFit, order: Tensor, num_points: int) -> RobustFit:
     )
 
 
-class _Frame(NamedTuple):
-    """Where lanes lie in their patches: ``point = (lane / zoom + middle) / unit``.
-
-    The factors are powers of two, which change no digit.
-    """
-
-    middle: Tensor
-    unit: Tensor
-    zoom: Tensor
-
-    def of(self, rows: Tensor) -> "_Frame":
-        return _Frame(*(field[rows] for field in self))
-
-    def point(self, lanes: Tensor) -> Tensor:
-        return (lanes / self.zoom[:, None] + self.middle) / self.unit[:, None]
-
-    def matrix(self, lanes: Tensor) -> Tensor:
-        length = (self.zoom * self.unit)[:, None, None]
-        return lanes / length / length
-
-
 def _fit_chunk(
     patches: Tensor,
     support_fraction: float,
@@ -144,7 +123,7 @@ def _fit_chunk(
     num_patches, num_points, size = patches.shape
     subset = subset_size(num_points, size, support_fraction)
     enough = subset if majority is None else majority(num_points)
-    columns, frame, tolerance = _to_lanes(patches)
+    columns, frame, tolerance = to_lanes(patches)
     flats = find_flats(columns, tolerance, enough)
     out = no_fit(torch.Size([num_patches]), num_points, size, patches)
 
@@ -187,27 +166,7 @@ def _fit_chunk(
     return out
 
 
-def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
-    """Columns about each patch's median, of size 1/2 to 1, with their frame and tolerance."""
-    unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
-    patches = patches * unit[:, None, None]
-    columns = split_columns(patches)
-    middle = [median_points(column) for column in columns]
-    columns = [column - center for column, center in zip(columns, middle, strict=True)]
-    extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
-    zoom = _power_of_two(extent)
-    tolerance = flatness_tolerance(patches, extent) * zoom
-    columns = [column * zoom for column in columns]
-    return columns, _Frame(join_columns(middle), unit, zoom), tolerance
-
-
-def _power_of_two(length: Tensor) -> Tensor:
-    """The power of two that brings a length to between 1/2 and 1; a finite one for zero."""
-    length = length.clamp(min=4 * torch.finfo(length.dtype).tiny)
-    return torch.frexp(length).mantissa / length
-
-
-def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
+def _general_fit(estimate: Estimate, frame: Frame) -> RobustFit:
     """The fit of lanes in general position, back in the patches' own coordinates."""
     size = estimate.location.shape[1]
     units = 2 * size * _log(frame.zoom.double() * frame.unit.double())
@@ -226,7 +185,7 @@ def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
     )
 
 
-def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustFit:
+def _exact_fit(columns: list[Tensor], members: Tensor, frame: Frame) -> RobustFit:
     """The fit of lanes whose ``members (K, M)`` lie on a plane; these are the inliers."""
     dtype = columns[0].dtype
     weights = members.double()
