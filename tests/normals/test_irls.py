@@ -77,11 +77,16 @@ def literal(patch, noise, decay):
     return first if share > 0.1 or error < other_error else second
 
 
-def test_fit_is_that_of_the_loop(rng):
-    patches = torch.cat([edges(rng, 15), edges(rng, 15, on_own=9, on_other=9, noise=0.03)])
-    noise = torch.full((30,), 0.02, dtype=torch.float64)
-    fit = fit_normals_irls(patches, noise=noise, mu_decay=1.3)
-    expected = np.stack([literal(patch, 0.02, 1.3) for patch in patches.numpy()])
+@pytest.mark.parametrize(
+    ("on_own", "on_other", "spread", "noise"),
+    [(12, 6, 0.01, 0.02), (9, 9, 0.03, 0.02), (6, 12, 0.02, 0.02), (10, 8, 0.1, 0.15)],
+    ids=["edge", "half", "minority", "few steps"],
+)
+def test_fit_is_that_of_the_loop(rng, on_own, on_other, spread, noise):
+    patches = edges(rng, 25, on_own=on_own, on_other=on_other, noise=spread)
+    size = torch.full((25,), noise, dtype=torch.float64)
+    fit = fit_normals_irls(patches, noise=size, mu_decay=1.5)
+    expected = np.stack([literal(patch, noise, 1.5) for patch in patches.numpy()])
     assert unsigned_angle_deg(fit.normals, torch.from_numpy(expected)).max() < 1e-5
     assert fit.valid.all()
 

@@ -1,11 +1,13 @@
 """Signs of normals: towards a place, along an axis, consistent on solids, into rooms."""
 
+import numpy as np
 import pytest
 import torch
 
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals.interior import vote_free_side
 from torchrg.normals.propagate import propagate_signs
 from torchrg.scenes import make_room, make_shape
 
@@ -158,13 +160,49 @@ def test_box_in_a_room_looks_outwards(rng):
 
 
 @pytest.mark.parametrize("towards", ["consistent", "interior"])
-def test_neither_signs_nor_order_matter(room, towards):
+@pytest.mark.parametrize("rounded", [False, True], ids=["generic", "ties"])
+def test_neither_signs_nor_order_matter(room, towards, rounded):
     scene, normals = room
-    points = scene.points[:6000]
-    first = orient_normals(points, normals[:6000], towards=towards)
-    order = torch.randperm(6000, generator=torch.Generator().manual_seed(0))
-    again = orient_normals(points[order], -normals[:6000][order], towards=towards)
+    points, normals = scene.points[:6000], normals[:6000]
+    if rounded:
+        # Equal distances everywhere, and normals that agree with nothing.
+        points, first = np.unique((points / 0.2).round().numpy(), axis=0, return_index=True)
+        points, normals = torch.from_numpy(points), normals[first]
+    first = orient_normals(points, normals, towards=towards)
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
+    again = orient_normals(points[order], -normals[order], towards=towards)
     assert torch.equal(again, first[order])
+
+
+@pytest.mark.parametrize("height", [0.75, 0.8, 0.86])
+def test_both_faces_of_a_thin_plate_look_away_from_it(rng, height):
+    # Thinner than a cell of the grid of free space.
+    points, inwards = box_room((4.0, 4.0, 2.5), (0.0, 0.0, 0.0), rng, count=6000)
+    plate, into = box_room((2.0, 1.6, 0.03), (1.0, 1.0, height), rng, count=4000, faces=[4, 5])
+    truth = torch.cat([inwards, -into])
+    oriented = orient_normals(torch.cat([points, plate]), shuffled_signs(truth))
+    assert share_right(oriented, truth) > 0.999
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e3])
+def test_votes_have_no_unit(room, unit):
+    points, normals = room[0].points[:5000].double(), room[1][:5000].double()
+    neighbors = search_knn(points, 20)
+    votes = vote_free_side(points, normals, neighbors)
+    again = vote_free_side(points * unit, normals, neighbors)
+    # Few points change cells by rounding.
+    assert ((votes - again).abs() > 1e-6).double().mean() < 0.05
+
+
+def test_tilted_plane_looks_up_whatever_rounding_says(rng):
+    for _ in range(5):
+        normal = torch.nn.functional.normalize(torch.randn(3, generator=rng), dim=0)
+        across = torch.linalg.svd(normal[None]).Vh[1:]
+        points = torch.rand(200, 2, generator=rng) @ across
+        oriented = orient_normals(
+            points, shuffled_signs(normal.expand(200, 3)), towards="consistent"
+        )
+        assert torch.equal(oriented, (normal * normal[2].sign()).expand(200, 3))
 
 
 @pytest.mark.parametrize("towards", ["consistent", "interior"])

@@ -41,6 +41,13 @@ def test_masked_points_do_not_count_whatever_they_hold(rng):
         assert torch.allclose(fit.curvature[row], alone.curvature)
 
 
+def test_masked_points_of_narrow_patches_do_not_count_either(rng, dtype):
+    mask = torch.rand(200, 50, generator=rng) < 0.7
+    for width, expected in ((1e-3, True), (0.0, False)):
+        patches = torch.where(mask[..., None], strips(rng, width, dtype), torch.nan)
+        assert (fit_normals_pca(patches, mask).valid == expected).all()
+
+
 def test_leading_axes_are_free(rng):
     patches = random_patches(rng, count=12)
     fit = fit_normals_pca(patches)

@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+from torchrg.config import NormalsConfig
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
+from torchrg.neighbors import gather_patches, search_knn
 from torchrg.normals import (
+    estimate_normals,
     fit_normals_detmcd,
     fit_normals_detmm,
     fit_normals_fastmcd,
@@ -97,3 +100,27 @@ def test_generator_decides_the_random_sets(rng):
 def test_wrong_shapes_are_refused(fit):
     with pytest.raises(ShapeError, match=rf"{fit.__name__}: expected patches of shape"):
         fit(torch.zeros(5, 2))
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("detmcd", {"support_fraction": 0.9, "inlier_quantile": 0.8}),
+        ("fastmcd", {"support_fraction": 0.9, "inlier_quantile": 0.8}),
+        ("mve", {"support_fraction": 0.9, "inlier_quantile": 0.8}),
+        ("detmm", {"inlier_quantile": 0.8}),
+    ],
+)
+def test_settings_reach_the_fit(rng, method, settings):
+    points = torch.rand(60, 3, generator=rng)
+    points[::2, 2] *= 0.02
+    neighbors = search_knn(points, 20)
+    found = estimate_normals(
+        points, neighbors=neighbors, config=NormalsConfig(method=method, **settings)
+    )
+    fit = {"detmcd": PAIRS[0][0], "fastmcd": PAIRS[1][0], "mve": PAIRS[2][0], "detmm": PAIRS[3][0]}
+    settings["quantile"] = settings.pop("inlier_quantile")
+    patches = gather_patches(points, neighbors.indices)
+    expected = fit[method](patches, **settings)
+    assert torch.allclose(found.normals, expected.normals)
+    assert not torch.allclose(found.curvature, fit[method](patches).curvature)

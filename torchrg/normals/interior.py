@@ -26,8 +26,8 @@ def vote_free_side(
     1. The cloud marks the cells of a grid, 1.5 point spacings wide (the 90th percentile of them,
        so that sparse walls have no holes).
     2. From each point, in each of the 26 directions to neighbouring cells, the free path is
-       measured to the next marked cell, a first marked cell excepted, as a surface may lie in two
-       layers of cells. A path that leaves the cloud's box without meeting anything counts half.
+       measured to the next marked cell. A path that leaves the cloud's box without meeting anything
+       counts half.
     3. If a neighbour lies straight in front, within 30 degrees of the normal, paths to the front
        are no longer than that: thin plates, whose faces are closer than cells; so for behind.
     4. The vote is the sum of ``sign(n . d) (n . d)^2 f(path)`` over the directions ``d``, where
@@ -56,17 +56,15 @@ def vote_free_side(
     votes = torch.zeros(len(points), dtype=torch.float64, device=points.device)
     if len(points) == 0 or width == 0:
         return votes
-    # Two empty cells on each side, so that the cell after the next one always exists.
-    cells = ((points - points.amin(dim=0)) / width).floor().long() + 2
-    occupied = torch.zeros((cells.amax(dim=0) + 3).tolist(), dtype=torch.bool, device=points.device)
+    cells = ((points - points.amin(dim=0)) / width).floor().long()
+    occupied = torch.zeros((cells.amax(dim=0) + 1).tolist(), dtype=torch.bool, device=points.device)
     occupied[cells.unbind(dim=-1)] = True
     for steps in product((-1, 0, 1), repeat=3):
         if any(steps):
             stride = width * math.sqrt(sum(step * step for step in steps))
             free = _free_cells(occupied, steps)
             direction = torch.tensor(steps, dtype=points.dtype, device=points.device)
-            here, following = cells.unbind(dim=-1), (cells + direction.long()).unbind(dim=-1)
-            count = torch.where(occupied[following], free[following], free[here])
+            count = free[cells.unbind(dim=-1)]
             is_open = count >= _OPEN
             length = torch.where(is_open, count - _OPEN, count) * stride
             cosine = (normals * direction).sum(dim=-1) / (stride / width)
@@ -114,7 +112,7 @@ def _cell_width(points: Tensor, neighbors: Neighbors) -> float:
     if width == 0:
         return float(max(extent)) / len(points)
     most = _CELLS_PER_POINT * len(points) + 1000
-    while math.prod(side / width + 5 for side in extent) > most:
+    while math.prod(side / width + 1 for side in extent) > most:
         width *= 1.25
     return width
 

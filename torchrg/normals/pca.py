@@ -126,8 +126,7 @@ def _spans_plane(
         widths = widths.double()
         widths[narrow] = _width(patches[narrow], None if mask is None else mask[narrow])
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
-    valid = widths > flat
-    return valid if mask is None else valid & (mask.sum(dim=-1) >= 3)
+    return widths > flat
 
 
 @_spans_plane.register_fake
@@ -161,9 +160,7 @@ def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
         offsets = torch.where(mask[..., None], offsets, 0.0)
     along = (offsets * direction[..., None, :]).sum(dim=-1, keepdim=True)
     across = offsets - along * direction[..., None, :]
-    # The direction is right to rounding only; what is left of the length would look like width.
-    slope = (along * across).sum(dim=-2, keepdim=True) / (along * along).sum(dim=-2, keepdim=True)
-    _, matrix = covariance(across - along * slope, mask)
+    _, matrix = covariance(across, mask)
     return eigh3(matrix)[0][..., 2].clamp(min=0).sqrt()
 
 
