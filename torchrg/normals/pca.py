@@ -156,8 +156,6 @@ def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
     mean, matrix = covariance(patches.double(), mask)
     direction = eigh3(matrix)[1][..., 2]
     offsets = patches - mean[..., None, :]
-    if mask is not None:
-        offsets = torch.where(mask[..., None], offsets, 0.0)
     along = (offsets * direction[..., None, :]).sum(dim=-1, keepdim=True)
     across = offsets - along * direction[..., None, :]
     _, matrix = covariance(across, mask)
