@@ -1,5 +1,7 @@
-"""``torchrg score``: labels and normals against a truth."""
+"""``torchrg score``: labels and normals against a truth, of one scan or of folders of scans."""
 
+import csv
+import io
 import json
 import math
 from dataclasses import dataclass
@@ -7,41 +9,81 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from tqdm import tqdm
 
 from torchrg.cli.console import parse
+from torchrg.cli.scans import Scores, mean_scores, pair_scans
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud
+from torchrg.io import atomic_path, read_cloud
+from torchrg.io.atomic import check_place
 from torchrg.metrics import score_labels, score_normals
+
+SHOWN = {
+    "labels": ("f1", "precision", "recall", "regions", "faces", "recall_iou50", "mean_best_iou"),
+    "normals": ("rms", "mean", "under_10_deg"),
+}
+"""What a table of scans shows of each; the mean, --json and --csv have everything."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Score labels and normals against a truth of the same points in the same order."""
+    """Score labels and normals against a truth of the same points in the same order.
+
+    Two files, or two folders: then files of the same name are compared, and the mean over the
+    scans is printed below them.
+    """
 
     predicted: Annotated[Path, tyro.conf.Positional]
-    """File with labels or normals, as torchrg segment writes it."""
+    """File with labels or normals, as torchrg segment writes it, or a folder of such files."""
     truth: Annotated[Path, tyro.conf.Positional]
-    """File with the true labels or normals."""
+    """File with the true labels or normals, or a folder with such a file for each result."""
     json: bool = False
-    """Print one JSON object instead of a table."""
+    """Print one JSON object instead of a table; for folders with the keys "scans" and "mean"."""
+    csv: Path | None = None
+    """Also write a CSV file: a row for each scan in natural order, for folders the mean last."""
 
 
 def run(argv: list[str]) -> int:
-    """Parse the arguments, score what both files have, and print it."""
+    """Parse the arguments, score what both sides have, and print it."""
     arguments = parse(Arguments, argv, prog="torchrg score")
-    scores = score_files(arguments.predicted, arguments.truth)
+    predicted, truth = arguments.predicted, arguments.truth
+    if predicted.is_dir() != truth.is_dir():
+        file, folder = (truth, predicted) if predicted.is_dir() else (predicted, truth)
+        raise FormatError(f"{file}: expected a folder, as {folder} is one; or give two files.")
+    if arguments.csv is not None:
+        check_place(arguments.csv)
+    if not predicted.is_dir():
+        scores = score_files(predicted, truth)
+        rows, printed = {predicted.stem: scores}, scores
+    else:
+        scans = score_folders(predicted, truth)
+        mean = mean_scores(scans)
+        rows, printed = {**scans, "mean": mean}, {"scans": scans, "mean": mean}
+    if arguments.csv is not None:
+        with atomic_path(arguments.csv) as path:
+            path.write_text(_table_of(rows), encoding="utf-8")
     if arguments.json:
-        print(json.dumps(scores))
-        return 0
-    for part, values in scores.items():
-        print(part)
-        for name, value in values.items():
-            shown = f"{value:.4f}".rstrip("0").rstrip(".") if isinstance(value, float) else value
-            print(f"  {name:<22}{shown}")
+        print(json.dumps(printed))
+    elif predicted.is_dir():
+        _print_scans(scans)
+        _print_scores(mean)
+    else:
+        _print_scores(scores)
     return 0
 
 
-def score_files(predicted: Path, truth: Path) -> dict[str, dict[str, Any]]:
+def score_folders(predicted: Path, truth: Path) -> dict[str, Scores]:
+    """Return the scores of each scan of two folders, in natural order.
+
+    Raises:
+        FormatError: If a scan has no counterpart, or a pair cannot be compared.
+    """
+    pairs = pair_scans(predicted, truth)
+    bar = tqdm(pairs.items(), desc="score", unit="scan", leave=False, disable=None)
+    return {name: score_files(*files) for name, files in bar}
+
+
+def score_files(predicted: Path, truth: Path) -> Scores:
     """Return the scores of whatever two files both have.
 
     Raises:
@@ -52,7 +94,7 @@ def score_files(predicted: Path, truth: Path) -> dict[str, dict[str, Any]]:
         raise FormatError(
             f"{predicted}: expected as many points as {truth} ({len(theirs):,}), got {len(ours):,}."
         )
-    scores: dict[str, dict[str, Any]] = {}
+    scores: Scores = {}
     if "labels" in ours.fields and "labels" in theirs.fields:
         labels = score_labels(ours.fields["labels"], theirs.fields["labels"])
         scores["labels"] = _defined(labels._asdict())
@@ -71,3 +113,53 @@ def _defined(values: dict[str, Any]) -> dict[str, Any]:
         for name, value in values.items()
         if value is not None
     }
+
+
+def _table_of(rows: dict[str, Scores]) -> str:
+    """Return scores as CSV, one row for each name; numbers in full."""
+    columns = dict.fromkeys(
+        (part, name)
+        for scores in rows.values()
+        for part, values in scores.items()
+        for name in values
+    )
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["scan", *(f"{part}.{name}" for part, name in columns)])
+    for name, scores in rows.items():
+        writer.writerow([name, *(scores.get(part, {}).get(index) for part, index in columns)])
+    return text.getvalue()
+
+
+def _print_scans(scans: dict[str, Scores]) -> None:
+    """Print a line for each scan."""
+    columns = [
+        (part, name)
+        for part, names in SHOWN.items()
+        for name in names
+        if any(part in scores for scores in scans.values())
+    ]
+    width = max(len(name) for name in ("scan", *scans)) + 2
+    widths = [max(len(name), 8) + 2 for _, name in columns]
+    heads = "".join(f"{name:>{size}}" for (_, name), size in zip(columns, widths, strict=True))
+    print(f"{'scan':<{width}}{heads}")
+    for name, scores in scans.items():
+        values = (_spelled(scores.get(part, {}).get(index)) for part, index in columns)
+        cells = "".join(f"{value:>{size}}" for value, size in zip(values, widths, strict=True))
+        print(f"{name:<{width}}{cells}")
+    print(f"\nmean of {len(scans):,} scans")
+
+
+def _print_scores(scores: Scores) -> None:
+    """Print all indices of a scan, one in a line."""
+    for part, values in scores.items():
+        print(part)
+        for name, value in values.items():
+            print(f"  {name:<22}{_spelled(value)}")
+
+
+def _spelled(value: float | None) -> str:
+    """Return a number with four places at most."""
+    if value is None:
+        return "none"
+    return f"{value:.4f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)

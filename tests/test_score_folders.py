@@ -1,0 +1,147 @@
+"""``torchrg score`` of folders: the right pairs, their mean, JSON and CSV."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from torchrg.cli import main
+from torchrg.metrics import score_labels, score_normals
+
+NAMES = ("scan10", "scan9", "hall/scan1")
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Two folders of scans with labels; two of the three have normals too."""
+    rng = np.random.default_rng(0)
+    for kind, suffix in (("ours", ".npz"), ("truth", ".ply")):
+        for number, name in enumerate(NAMES):
+            arrays = {
+                "points": rng.normal(size=(60 + number, 3)).astype(np.float32),
+                "labels": rng.integers(0, 4, 60 + number),
+            }
+            if name != "scan9":
+                arrays["normals"] = rng.normal(size=(60 + number, 3)).astype(np.float32)
+            path = tmp_path / kind / f"{name}{suffix if number == 0 else '.npz'}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_scan(path, arrays)
+    return tmp_path / "ours", tmp_path / "truth"
+
+
+def write_scan(path, arrays):
+    from torchrg import Cloud, write_cloud
+
+    fields = {name: values for name, values in arrays.items() if name != "points"}
+    write_cloud(path, Cloud(arrays["points"], fields))
+
+
+def read_scan(folder, name):
+    from torchrg import read_cloud
+
+    (path,) = (folder / name).parent.glob(f"{(folder / name).name}.*")
+    return read_cloud(path).fields
+
+
+def run_score(*arguments):
+    return main(["score", *map(str, arguments)])
+
+
+def test_each_scan_is_scored_against_its_counterpart_in_natural_order(folders, capsys):
+    assert run_score(*folders, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["scans", "mean"]
+    assert list(found["scans"]) == ["hall/scan1", "scan9", "scan10"]
+    for name in NAMES:
+        ours, truth = (read_scan(folder, name) for folder in folders)
+        expected = score_labels(ours["labels"], truth["labels"])
+        assert found["scans"][name]["labels"] == expected._asdict()
+        if name == "scan9":
+            assert "normals" not in found["scans"][name]
+        else:
+            errors = score_normals(ours["normals"], truth["normals"])
+            assert found["scans"][name]["normals"]["msae"] == errors.msae
+
+
+def test_mean_is_over_the_scans_that_have_the_part(folders, capsys):
+    run_score(*folders, "--json")
+    found = json.loads(capsys.readouterr().out)
+    scans, mean = found["scans"], found["mean"]
+    assert (mean["labels"]["scans"], mean["normals"]["scans"]) == (3, 2)
+    for part, index in (("labels", "f1"), ("labels", "regions"), ("normals", "rms")):
+        values = [scores[part][index] for scores in scans.values() if part in scores]
+        assert mean[part][index] == pytest.approx(sum(values) / len(values), rel=1e-12)
+
+
+def test_table_of_scans_ends_with_the_mean(folders, capsys):
+    assert run_score(*folders) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:3] == ["scan", "f1", "precision"]
+    assert [line.split()[0] for line in lines[1:4]] == ["hall/scan1", "scan9", "scan10"]
+    assert lines[2].split()[-1] == "none"
+    assert "mean of 3 scans" in lines
+
+
+def test_csv_has_every_index_of_every_scan_and_the_mean_last(folders, tmp_path, capsys):
+    target = tmp_path / "scores.csv"
+    assert run_score(*folders, "--csv", target, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    with target.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["scan"] for row in rows] == ["hall/scan1", "scan9", "scan10", "mean"]
+    for row in rows:
+        scores = found["mean"] if row["scan"] == "mean" else found["scans"][row["scan"]]
+        for part, values in scores.items():
+            for index, value in values.items():
+                shown = row[f"{part}.{index}"]
+                assert (float(shown) if shown else None) == value, (row["scan"], part, index)
+    assert rows[1]["normals.msae"] == ""
+
+
+def test_two_files_give_one_row_of_csv(folders, tmp_path, capsys):
+    files = [folder / "scan9.npz" for folder in folders]
+    assert run_score(*files, "--csv", tmp_path / "one.csv") == 0
+    assert capsys.readouterr().out.startswith("labels\n")
+    with (tmp_path / "one.csv").open(newline="") as stream:
+        assert [row["scan"] for row in csv.DictReader(stream)] == ["scan9"]
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_missing_counterparts_are_named(folders, capsys, side):
+    for name in ("scan9.npz", "hall/scan1.npz"):
+        (folders[side] / name).unlink()
+    assert run_score(*folders) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert line.startswith(f"torchrg: {folders[side]}: expected a counterpart of every scan")
+    assert line.endswith("got none of hall/scan1, scan9.\n")
+
+
+def test_many_missing_counterparts_are_counted(folders, capsys):
+    for number in range(100, 109):
+        (folders[0] / f"scan{number}.npz").touch()
+    assert run_score(*folders) == 2
+    assert "scan100, scan101, scan102, scan103, scan104 and 4 more." in capsys.readouterr().err
+
+
+def test_mistakes_are_one_line(folders, tmp_path, capsys):
+    ours, truth = folders
+    (tmp_path / "empty").mkdir()
+    (ours / "notes.md").write_text("not a scan")
+    (ours / ".hidden.npz").write_text("not a scan")
+    assert run_score(ours, truth) == 0
+    (truth / "scan9.pcd").touch()
+    cases = {
+        (ours, tmp_path / "empty"): "empty: expected scans",
+        (ours, truth / "scan9.npz"): "scan9.npz: expected a folder",
+        (truth / "scan9.npz", ours): "scan9.npz: expected a folder",
+        (ours, truth): "got scan9.npz and scan9.pcd",
+        (ours, ours, "--csv", tmp_path / "no" / "a.csv"): "there is no folder",
+    }
+    capsys.readouterr()
+    for arguments, message in cases.items():
+        assert run_score(*arguments) == 2
+        captured = capsys.readouterr()
+        assert message in captured.err
+        assert (captured.err.count("\n"), captured.out) == (1, "")
