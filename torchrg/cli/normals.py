@@ -10,8 +10,8 @@ import numpy as np
 import torch
 import tyro
 
+from torchrg.batch.provenance import describe_run
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
-from torchrg.cli.provenance import describe_run
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import check_output, read_cloud, write_cloud
