@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from torchrg.batch.provenance import describe_run
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.cli.picture import draw_segmentation, picture_paths
 from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import check_output, read_cloud, write_cloud
@@ -32,6 +33,8 @@ class Arguments:
     """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
+    picture: Path | None = None
+    """Picture of the planes to write too, a .png file; for several inputs a directory."""
     preset: str = DEFAULT_PRESET
     """Settings to start from: classic, detmm, paper or consensus."""
     config: Path | None = None
@@ -55,10 +58,11 @@ def run(argv: list[str]) -> int:
             raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
         torch.set_num_threads(arguments.threads)
     outputs = output_paths(arguments.inputs, arguments.out)
+    pictures = picture_paths(outputs, arguments.picture)
     failed = 0
-    for source, target in zip(arguments.inputs, outputs, strict=True):
+    for source, target, picture in zip(arguments.inputs, outputs, pictures, strict=True):
         try:
-            _segment_file(source, target, settings)
+            _segment_file(source, target, picture, settings)
         except TorchrgError as error:
             if len(outputs) == 1:
                 raise
@@ -88,7 +92,9 @@ def _starting_point(argv: list[str]) -> Arguments:
     )
 
 
-def _segment_file(source: Path, target: Path, settings: PipelineConfig) -> None:
+def _segment_file(
+    source: Path, target: Path, picture: Path | None, settings: PipelineConfig
+) -> None:
     """Segment one file, with a progress bar on a terminal."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
@@ -102,6 +108,8 @@ def _segment_file(source: Path, target: Path, settings: PipelineConfig) -> None:
 
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     write_cloud(target, cloud, seg, provenance=describe_run(source, settings))
+    if picture is not None:
+        draw_segmentation(picture, cloud, seg)
     _report(source, target, cloud, seg, time.perf_counter() - begin)
 
 

@@ -9,7 +9,8 @@ import tyro
 from torch import Tensor
 
 from torchrg.cli.console import parse
-from torchrg.errors import ConfigError, FormatError
+from torchrg.cli.picture import check_picture
+from torchrg.errors import ConfigError
 from torchrg.io import read_cloud
 from torchrg.report import (
     color_curvature,
@@ -57,8 +58,7 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, draw the cloud and write the picture."""
     arguments = parse(Arguments, argv, prog="torchrg view")
-    if arguments.out.suffix.lower() != ".png":
-        raise FormatError(f"{arguments.out}: expected a file that ends in .png.")
+    check_picture(arguments.out)
     cloud = read_cloud(arguments.file)
     normals = cloud.fields.get("normals")
     picture = render_cloud(
