@@ -51,6 +51,7 @@ def test_a_file_holds_differences_only(tmp_path):
         ("normals: {k: true}", "normals: k: expected int, got True"),
         ("normals: {method: ransac}", "expected one of pca, jet"),
         ("growing: {connectivity: yes}", "expected float or null, got True"),
+        ("planes: {up: w}", "up: expected one of x, y, z, -x, -y, -z or null, got 'w'"),
         ("growing: 5", "growing: expected a mapping of settings, got 5"),
         ("growing: [", "expected YAML"),
         ("- 1", "expected a mapping"),

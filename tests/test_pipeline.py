@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.config import PipelineConfig, load_config
+from torchrg.config import PipelineConfig, PlanesConfig, load_config
 from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
-from torchrg.structures import UNLABELED
+from torchrg.structures import PLANE_KINDS, UNLABELED
 
 PRESETS = ["classic", "paper", "consensus"]
 
@@ -44,6 +44,14 @@ def same_partition(a, b):
     )
 
 
+def assert_same_planes(ours, theirs):
+    """Check that two tables without outlines are equal."""
+    for one, other in zip(ours[:-1], theirs[:-1], strict=True):
+        assert one is other is None or torch.equal(one, other)
+    for one, other in zip(ours.adjacency, theirs.adjacency, strict=True):
+        assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_box_faces_are_found(preset):
     generator = np.random.default_rng(0)
@@ -58,6 +66,21 @@ def test_box_faces_are_found(preset):
     assert torch.stack([axis, offset]).unique(dim=1).shape[1] == 6
 
 
+def test_table_says_what_meets_and_what_is_asked_for(room):
+    plain = load_config("consensus")
+    planes = segment_planes(room.points, plain).planes
+    assert planes.adjacency is not None
+    assert [0, 2] in planes.adjacency.pairs.tolist()
+    assert [planes.kind, planes.outline] == [None, None]
+    asked = dataclasses.replace(plain, planes=PlanesConfig(up="z", outline=True))
+    planes = segment_planes(room.points, asked).planes
+    assert [PLANE_KINDS[kind] for kind in planes.kind[:6]] == ["ceiling", "floor"] + ["wall"] * 4
+    assert len(planes.outline) == len(planes.count)
+    turned = dataclasses.replace(plain, planes=PlanesConfig(up="-y"))
+    points = room.points[:, [0, 2, 1]] * torch.tensor([1.0, -1, 1])
+    assert segment_planes(points, turned).planes.kind.tolist() == planes.kind.tolist()
+
+
 def test_order_changes_nothing(room, config):
     shuffled = torch.randperm(len(room.points), generator=torch.Generator().manual_seed(3))
     plain = segment_planes(room.points, config)
@@ -66,8 +89,7 @@ def test_order_changes_nothing(room, config):
     assert torch.equal(other.normals, plain.normals[shuffled])
     assert torch.equal(other.curvature, plain.curvature[shuffled])
     assert torch.equal(other.sharp, plain.sharp[shuffled])
-    for ours, theirs in zip(other.planes, plain.planes, strict=True):
-        assert ours is theirs is None or torch.equal(ours, theirs)
+    assert_same_planes(other.planes, plain.planes)
 
 
 def test_chunks_and_threads_change_nothing(room, config):

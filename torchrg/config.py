@@ -124,6 +124,25 @@ class GrowingConfig:
 
 
 @dataclass(frozen=True)
+class PlanesConfig:
+    """What the table of planes says beyond the planes themselves."""
+
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis that points up: planes are then floor, ceiling, wall or other. None: not told apart."""
+    outline: bool = False
+    """Whether to trace the outline of each plane; needs shapely."""
+
+    @property
+    def up_direction(self) -> tuple[float, float, float] | None:
+        """The upward direction as a vector, None where there is none."""
+        if self.up is None:
+            return None
+        length = -1.0 if self.up.startswith("-") else 1.0
+        x, y, z = (length if self.up.endswith(axis) else 0.0 for axis in "xyz")
+        return x, y, z
+
+
+@dataclass(frozen=True)
 class PipelineConfig:
     """Everything that decides the result of :func:`torchrg.segment_planes`, and its memory."""
 
@@ -133,6 +152,8 @@ class PipelineConfig:
     """How regions grow."""
     chunk_size: int = 16384
     """Points handled at a time; bounds the memory of each stage, never changes a result."""
+    planes: PlanesConfig = field(default_factory=PlanesConfig)
+    """What the table of planes says."""
 
     def __post_init__(self) -> None:
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
@@ -226,7 +247,8 @@ def build_config(kind: type[Settings], values: object, *, where: str) -> Setting
 
 def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
     """Return a value of the annotated type, or say what was expected."""
-    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    unions = (types.UnionType, typing.Union)
+    choices = typing.get_args(hint) if typing.get_origin(hint) in unions else (hint,)
     for choice in choices:
         if typing.get_origin(choice) is Literal:
             if value in typing.get_args(choice):

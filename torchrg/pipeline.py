@@ -78,7 +78,14 @@ def segment_planes(
     )
 
     begin("planes")
-    planes = summarize_planes(cloud, fit.normals, labels)
+    planes = summarize_planes(
+        cloud,
+        fit.normals,
+        labels,
+        neighbors=neighbors,
+        up=config.planes.up_direction,
+        outline=config.planes.outline,
+    )
     begin("done")
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     num_points = len(tensor)

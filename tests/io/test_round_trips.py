@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import torchrg.io
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, check_output, read_cloud, write_cloud
-from torchrg.structures import Cloud
+from torchrg.structures import Cloud, PlaneAdjacency, Planes
 
 EXACT = [".npz", ".npy", ".ply", ".pcd", ".e57"]
 TEXT = [".xyz", ".txt"]
@@ -120,6 +121,7 @@ def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, mak
         arrays = dict(result)
     points = ["points", "labels", "normals", "curvature", "sharp", "valid"]
     planes = ["normal", "offset", "centroid", "area", "count", "rms"]
+    planes += ["extent", "axes", "center", "curved"]
     assert list(arrays) == [*points, *(f"plane_{name}" for name in planes), "provenance"]
     assert json.loads(str(arrays["provenance"])) == {"torchrg": "1", "config": {"k": 50}}
     assert arrays["points"].dtype == np.float64
@@ -143,12 +145,45 @@ def test_planes_are_written_in_the_coordinates_of_the_input(
     write_cloud(tmp_path / "a.npz", cloud, seg)
     with np.load(tmp_path / "a.npz") as result:
         normal, offset = result["plane_normal"], result["plane_offset"]
-        centroid = result["plane_centroid"]
-    assert offset.dtype == centroid.dtype == np.float64
+        centroid, center = result["plane_centroid"], result["plane_center"]
+    assert offset.dtype == centroid.dtype == center.dtype == np.float64
     np.testing.assert_allclose(centroid - cloud.origin, seg.planes.centroid, atol=1e-8)
+    np.testing.assert_allclose(center - cloud.origin, seg.planes.center, atol=1e-8)
     # The centroids lie in their planes, there and here; float32 at a few metres is good for 1e-6.
     distance = (normal.astype(np.float64) * centroid).sum(axis=1) - offset
     np.testing.assert_allclose(distance, 0, atol=2e-6)
+
+
+def test_kinds_adjacency_and_outlines_are_written(tmp_path, make_cloud, make_segmentation):
+    seg, cloud = make_segmentation(60), make_cloud(dtype="f8", origin=UTM)
+    rings = [torch.rand(size, 3) for size in (5, 4, 6)]
+    adjacency = PlaneAdjacency(
+        torch.tensor([[0, 2], [1, 2]]), torch.tensor([1.5, 2]), torch.tensor([90.0, 45])
+    )
+    table = seg.planes._replace(
+        kind=torch.tensor([1, 3, 0]),
+        adjacency=adjacency,
+        outline=((rings[0], rings[1]), (), (rings[2],)),
+    )
+    write_cloud(tmp_path / "a.npz", cloud, seg._replace(planes=table))
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as result:
+        arrays = dict(result)
+    assert arrays["plane_kind"].tolist() == ["floor", "wall", "other"]
+    for name, values in zip(PlaneAdjacency._fields, adjacency, strict=True):
+        np.testing.assert_array_equal(arrays[f"adjacency_{name}"], values)
+    assert arrays["outline_ring_planes"].tolist() == [0, 0, 2]
+    ends = np.cumsum(arrays["outline_ring_sizes"])[:-1]
+    for found, ring in zip(np.split(arrays["outline_points"], ends), rings, strict=True):
+        np.testing.assert_allclose(found - cloud.origin, ring, atol=1e-8)
+
+
+def test_no_planes_make_a_file_too(tmp_path, make_cloud, make_segmentation):
+    seg = make_segmentation(60)
+    none = Planes(*(column[:0] for column in seg.planes[:10]), None, (), None)
+    write_cloud(tmp_path / "a.npz", make_cloud(), seg._replace(planes=none))
+    with np.load(tmp_path / "a.npz") as result:
+        assert result["outline_points"].shape == (0, 3)
+        assert result["plane_axes"].shape == (0, 2, 3)
 
 
 def test_reading_a_result_gives_fields_of_points_only(tmp_path, make_cloud, make_segmentation):

@@ -114,10 +114,15 @@ def write_cloud(
     Convention:
         A segmentation is written as ``label``, normals and ``curvature`` of each point, beside the
         cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. ``.npz``
-        holds exactly: ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the
-        plane table as ``plane_normal``, ``plane_offset``, ``plane_centroid``, ``plane_area``,
-        ``plane_count`` and ``plane_rms`` in the input's own coordinates, and ``provenance``. Equal
-        input gives equal bytes (``.e57`` excepted: its files carry random identifiers).
+        holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the table of
+        :class:`torchrg.structures.Planes` as ``plane_normal``, ``plane_offset``,
+        ``plane_centroid``, ``plane_area``, ``plane_count``, ``plane_rms``, ``plane_extent``,
+        ``plane_axes``, ``plane_center``, ``plane_curved`` and, where it has them, ``plane_kind``
+        (words), ``adjacency_pairs``, ``adjacency_boundary_length``, ``adjacency_dihedral_deg``,
+        ``outline_points``, ``outline_ring_sizes`` and ``outline_ring_planes`` (rings one after the
+        other: their lengths, and the planes they belong to), all in the input's own coordinates,
+        and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
+        identifiers).
 
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.

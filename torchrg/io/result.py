@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import FormatError
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
 
 def with_segmentation(cloud: Cloud, segmentation: Segmentation) -> Cloud:
@@ -36,10 +37,11 @@ def result_arrays(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray
         segmentation: Its segmentation, about the cloud's origin.
 
     Returns:
-        The arrays by name. Coordinates, offsets and centroids of planes are the input's own.
+        The arrays by name. Coordinates, offsets, centroids, centers and outlines of planes are the
+        input's own. What the table of planes does not have is left out. Rings of outlines follow
+        each other in ``outline_points``; ``outline_ring_sizes`` and ``outline_ring_planes`` say how
+        long each is and to which plane it belongs.
     """
-    planes = segmentation.planes
-    normal, origin = _array(planes.normal), cloud.origin
     return {
         "points": cloud.coordinates,
         "labels": _array(segmentation.labels),
@@ -47,13 +49,41 @@ def result_arrays(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray
         "curvature": _array(segmentation.curvature),
         "sharp": _array(segmentation.sharp),
         "valid": _array(segmentation.valid),
+        **_plane_arrays(segmentation.planes, cloud.origin),
+    }
+
+
+def _plane_arrays(planes: Planes, origin: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a table of planes whose coordinates are about an origin."""
+
+    def moved(places: Tensor) -> NDArray[np.float64]:
+        return _array(places).astype(np.float64) + origin
+
+    normal = _array(planes.normal)
+    arrays = {
         "plane_normal": normal,
         "plane_offset": _array(planes.offset).astype(np.float64) + normal @ origin,
-        "plane_centroid": _array(planes.centroid).astype(np.float64) + origin,
+        "plane_centroid": moved(planes.centroid),
         "plane_area": _array(planes.area),
         "plane_count": _array(planes.count),
         "plane_rms": _array(planes.rms),
+        "plane_extent": _array(planes.extent),
+        "plane_axes": _array(planes.axes),
+        "plane_center": moved(planes.center),
+        "plane_curved": _array(planes.curved),
     }
+    if planes.kind is not None:
+        arrays["plane_kind"] = np.array(PLANE_KINDS)[_array(planes.kind)]
+    if planes.adjacency is not None:
+        arrays["adjacency_pairs"] = _array(planes.adjacency.pairs)
+        arrays["adjacency_boundary_length"] = _array(planes.adjacency.boundary_length)
+        arrays["adjacency_dihedral_deg"] = _array(planes.adjacency.dihedral_deg)
+    if planes.outline is not None:
+        rings = [(plane, ring) for plane, own in enumerate(planes.outline) for ring in own]
+        arrays["outline_points"] = moved(torch.cat([planes.center[:0], *(r for _, r in rings)]))
+        arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], dtype=np.int64)
+        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)
+    return arrays
 
 
 def check_segmentation(path: Path, cloud: Cloud, segmentation: Segmentation) -> None:

@@ -78,39 +78,53 @@ def find_adjacency(
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
     angle = unsigned_angle_deg(first, second)
     crossing = (angle > _PARALLEL_DEG) & ~curved[pairs].any(dim=1)
-    edge = points[contacts.target].double() - points[contacts.source].double()
-    across = torch.stack([(edge * side[contacts.pair]).sum(dim=1) for side in (first, second)])
-    spacing, _ = _contact_radii(points, neighbors, contacts.source)
-    reach = (_REACH * thickness[pairs].amax(dim=1))[contacts.pair]
+    is_crossing = crossing[contacts.pair]
+    on_lines = _select(contacts, is_crossing)
+    on_curves = _select(contacts, ~is_crossing & (contacts.rank < NUM_CONTACTS))
+    edge = points[on_curves.target].double() - points[on_curves.source].double()
+    across = torch.stack([(edge * side[on_curves.pair]).sum(dim=1) for side in (first, second)])
+    spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
+    reach = (_REACH * thickness[pairs].amax(dim=1))[on_curves.pair]
     flat = across.abs().amax(dim=0) <= torch.maximum(reach, _MAX_STEEPNESS * spacing)
-    used = crossing[contacts.pair] | (flat & (contacts.rank < NUM_CONTACTS))
-    contacts = _Contacts(*(values[used] for values in contacts))
-    num_contacts = torch.bincount(contacts.pair, minlength=len(pairs))
+    on_curves = _select(on_curves, flat)
+    num_contacts = torch.bincount(torch.cat([on_lines.pair, on_curves.pair]), minlength=len(pairs))
     along = torch.linalg.cross(first, second)
     length = torch.where(
         crossing,
-        _length_on_line(points, contacts, along / along.norm(dim=1, keepdim=True), len(pairs)),
-        _length_by_crossings(points, neighbors, contacts, len(pairs)),
+        _length_on_line(points, on_lines, along / along.norm(dim=1, keepdim=True), len(pairs)),
+        _length_by_crossings(
+            on_curves.pair, edge[flat].norm(dim=1), spacing[flat], num_nearest[flat], len(pairs)
+        ),
     )
     kept = num_contacts >= _LEAST_CONTACTS
     return PlaneAdjacency(pairs[kept], length[kept], angle[kept])
 
 
+def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
+    """Return the chosen ones of the edges."""
+    rows = chosen.nonzero().squeeze(1)
+    return _Contacts(*(values.index_select(0, rows) for values in contacts))
+
+
 def _find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, _Contacts]:
     """Return the pairs of regions with an edge between them, ascending, and these edges."""
     num_regions = int(labels.max()) + 1 if len(labels) else 0
+    narrow = labels.to(torch.int32)
     keys, sources, targets, ranks = [], [], [], []
     for start in range(0, max(len(labels), 1), _CHUNK_SIZE):
         rows = slice(start, start + _CHUNK_SIZE)
         indices = neighbors.indices[rows]
-        own = labels[rows, None]
-        other = labels.index_select(0, indices.reshape(-1)).view(indices.shape)
-        touches = (other != own) & (other >= 0) & (own >= 0)
+        own = narrow[rows]
+        other = narrow.index_select(0, indices.reshape(-1)).view(indices.shape)
+        differs = other != own[:, None]
         if neighbors.valid is not None:
-            touches &= neighbors.valid[rows]
-        source, column = touches.nonzero(as_tuple=True)
-        pair = torch.stack([own.squeeze(1)[source], other[source, column]])
-        keys.append(pair.amin(dim=0) * num_regions + pair.amax(dim=0))
+            differs &= neighbors.valid[rows]
+        source, column = differs.nonzero(as_tuple=True)
+        ends = torch.stack([own[source], other[source, column]])
+        low, high = ends.amin(dim=0), ends.amax(dim=0)
+        touches = low >= 0
+        source, column = source[touches], column[touches]
+        keys.append(low[touches].long() * num_regions + high[touches])
         sources.append(source + start)
         targets.append(indices[source, column].long())
         ranks.append(column - 1)
@@ -139,22 +153,21 @@ def _length_on_line(points: Tensor, contacts: _Contacts, along: Tensor, num_pair
 
 
 def _length_by_crossings(
-    points: Tensor, neighbors: Neighbors, contacts: _Contacts, num_pairs: int
+    pair: Tensor, length: Tensor, radius: Tensor, num_nearest: Tensor, num_pairs: int
 ) -> Tensor:
     """Return the length of the curve that each pair's edges cross, shape ``(E,)``."""
-    radius, num_nearest = _contact_radii(points, neighbors, contacts.source)
-    edge = points[contacts.target].double() - points[contacts.source].double()
-    length = edge.norm(dim=1)
     share = math.pi**2 * radius * radius / (2 * num_nearest * num_nearest * length)
-    share = torch.where((contacts.rank < NUM_CONTACTS) & (length > 0), share, 0.0)
-    return _sum_of(contacts.pair, share, num_pairs)
+    return _sum_of(pair, torch.where(length > 0, share, 0.0), num_pairs)
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance to the last of the contact neighbours of points, and their number."""
-    nearest, counted = contact_neighbors(neighbors)
-    number = counted.sum(dim=1)[rows]
-    last = nearest[rows].gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
+    mask = neighbors.valid
+    nearest, counted = contact_neighbors(
+        Neighbors(neighbors.indices[rows], None if mask is None else mask[rows])
+    )
+    number = counted.sum(dim=1)
+    last = nearest.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
     return (points[last].double() - points[rows].double()).norm(dim=1), number
 
 

@@ -1,6 +1,7 @@
 """The smallest rectangle in its plane that holds each region."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from torchrg.regions.segments import Segments
 
 _NUM_DIRECTIONS = 32
+_SLACK = 1 - 1e-6
 _COARSE_STEP_DEG, _FINE_STEP_DEG = 2.0, 0.1
 
 
@@ -67,15 +69,33 @@ def _extreme_points(segments: Segments, u: Tensor, v: Tensor) -> tuple[Tensor, T
     scale_u, scale_v = (segments.spread(segments.mean(x.abs())) for x in (u, v))
     wide_u = u / torch.where(scale_u > 0, scale_u, 1.0)
     wide_v = v / torch.where(scale_v > 0, scale_v, 1.0)
-    found_u, found_v = [], []
-    for step in range(_NUM_DIRECTIONS):
-        angle = math.pi * step / _NUM_DIRECTIONS
-        reach = wide_u * math.cos(angle) + wide_v * math.sin(angle)
-        for bound in segments.bounds(reach):
-            rows = segments.first_of_each(reach == segments.spread(bound))
-            found_u.append(u[rows])
-            found_v.append(v[rows])
-    return torch.stack(found_u, dim=1), torch.stack(found_v, dim=1)
+    corners = _extremes(segments, wide_u, wide_v, (0.0, math.pi / 2))
+    angles = [math.pi * step / _NUM_DIRECTIONS for step in range(_NUM_DIRECTIONS)]
+    # Nearer to the origin than the hull of four of its points is anywhere: no corner of the hull.
+    near = _least_reach(wide_u[corners], wide_v[corners], angles) * _SLACK
+    outer = wide_u * wide_u + wide_v * wide_v >= segments.spread(near * near.abs())
+    rows = outer.nonzero().squeeze(1)
+    corners = rows[_extremes(Segments(segments.labels[rows]), wide_u[rows], wide_v[rows], angles)]
+    return u[corners], v[corners]
+
+
+def _extremes(segments: Segments, u: Tensor, v: Tensor, angles: Sequence[float]) -> Tensor:
+    """Return the places of the points that reach farthest along and against directions."""
+    places = []
+    for angle in angles:
+        reach = u * math.cos(angle) + v * math.sin(angle)
+        places += [
+            segments.first_of_each(reach == segments.spread(bound))
+            for bound in segments.bounds(reach)
+        ]
+    return torch.stack(places, dim=1)
+
+
+def _least_reach(u: Tensor, v: Tensor, angles: Sequence[float]) -> Tensor:
+    """Return how far some points reach along that direction, or against, where it is least."""
+    reach = [u * math.cos(angle) + v * math.sin(angle) for angle in angles]
+    ends = [bound for along in reach for bound in (along.amax(dim=1), -along.amin(dim=1))]
+    return torch.stack(ends).amin(dim=0)
 
 
 def _best_turn(u: Tensor, v: Tensor) -> Tensor:
