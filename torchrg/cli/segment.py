@@ -13,7 +13,14 @@ from tqdm import tqdm
 from torchrg.batch.provenance import describe_run
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
 from torchrg.cli.picture import draw_segmentation, picture_paths
-from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
+from torchrg.config import (
+    DEFAULT_PRESET,
+    GrowingConfig,
+    NormalsConfig,
+    PipelineConfig,
+    PlanesConfig,
+    load_config,
+)
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
@@ -43,6 +50,8 @@ class Arguments:
     """How normals and curvature are estimated."""
     growing: GrowingConfig = dataclasses.field(default_factory=GrowingConfig)
     """How regions grow."""
+    planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
+    """What the table of planes says."""
     chunk_size: int = PipelineConfig.chunk_size
     """Points handled at a time; bounds memory, never changes a result."""
     threads: int | None = None
@@ -52,7 +61,9 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     arguments = parse(Arguments, argv, prog="torchrg segment", default=_starting_point(argv))
-    settings = PipelineConfig(arguments.normals, arguments.growing, arguments.chunk_size)
+    settings = PipelineConfig(
+        arguments.normals, arguments.growing, arguments.chunk_size, arguments.planes
+    )
     if arguments.threads is not None:
         if arguments.threads < 1:
             raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
@@ -88,6 +99,7 @@ def _starting_point(argv: list[str]) -> Arguments:
         out=tyro.MISSING,
         normals=settings.normals,
         growing=settings.growing,
+        planes=settings.planes,
         chunk_size=settings.chunk_size,
     )
 
