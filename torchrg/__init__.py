@@ -1,6 +1,6 @@
 """Robust normals, curvature and plane labels for indoor point clouds."""
 
-from torchrg import metrics, nn, normals, robust, scenes, transforms
+from torchrg import datasets, metrics, nn, normals, robust, scenes, transforms
 from torchrg.config import load_config
 from torchrg.errors import TorchrgError
 from torchrg.io import read_cloud, write_cloud
@@ -16,6 +16,7 @@ __all__ = [
     "UNLABELED",
     "Cloud",
     "TorchrgError",
+    "datasets",
     "estimate_normals",
     "grow_regions",
     "load_config",

@@ -205,8 +205,36 @@ def _read_member(
         ) from error
 
 
+def map_array(path: Path) -> NDArray[Any]:
+    """Map the array of a ``.npy`` file into memory, copy-on-write: no change reaches the file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The array; its values are read from the disk when they are used.
+
+    Raises:
+        FormatError: If the file is missing, damaged, or holds Python objects.
+    """
+    size = check_file(path)
+    with path.open("rb") as stream:
+        shape = _read_header(path, stream, size, content="the array")
+    if 0 in shape:
+        return np.asarray(np.load(path, allow_pickle=False))
+    return np.asarray(np.load(path, mmap_mode="c", allow_pickle=False))
+
+
 def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> NDArray[Any]:
     """Read an array of NumPy's format of which ``size`` bytes are there."""
+    _read_header(path, stream, size, content=content)
+    stream.seek(0)
+    values: NDArray[Any] = npy_format.read_array(stream, allow_pickle=False)
+    return values
+
+
+def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> tuple[int, ...]:
+    """Read the header of an array, check it against the file, and return the shape."""
     try:
         version = npy_format.read_magic(stream)
         # Versions 2 and 3 differ in the encoding of field names only, which sizes do not need.
@@ -237,6 +265,4 @@ def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> ND
         available=size - start,
         content=f"{content} of shape {shape}",
     )
-    stream.seek(0)
-    values: NDArray[Any] = npy_format.read_array(stream, allow_pickle=False)
-    return values
+    return tuple(shape)

@@ -1,0 +1,44 @@
+"""Data sets: S3DIS as released, any folder of clouds, and Pointcept's processed layout.
+
+Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``, ``data[i]`` is a
+sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...), ``transform=`` is
+called with it, and ``data.scenes`` lists what there is without reading it: :class:`Scene` with
+``name`` (the place below an output folder), ``path``, and ``files`` (every input file).
+
+* ``S3DIS(root, areas=(1, ..., 6), *, class_order="pointcept", cache=FOLDER, transform=None)``;
+  ``S3DIS.read_room(i)`` is ``Room(coord, color, segment, instance, report)``.
+* ``read_room(path, *, class_order="pointcept")`` reads one room without any cache. Its ``report``
+  has ``repairs`` (:class:`Repair`: file, line, column, line before and after), ``skipped`` (file,
+  reason) and ``as_clutter`` (files of classes that are not among the 13).
+* ``FolderOfClouds(root, *, suffixes=..., transform=None)``; folders of Pointcept count as clouds.
+* ``read_pointcept_scene(folder)`` is a sample; ``write_pointcept_scene(folder, sample,
+  segmentation, *, superpoint=False, origin=None)`` writes or completes a scene folder, and returns
+  the names of the files it wrote.
+* ``describe_planes(planes, *, origin=None)`` is the content of ``planes.json``.
+* ``collate_offset(samples)`` joins samples into a ragged batch.
+"""
+
+from torchrg.datasets.annotations import Repair
+from torchrg.datasets.collate import collate_offset
+from torchrg.datasets.folder import FolderOfClouds
+from torchrg.datasets.plane_table import describe_planes
+from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
+from torchrg.datasets.rooms import CLASS_ORDERS, Room, RoomReport, Skipped, read_room
+from torchrg.datasets.s3dis import S3DIS
+from torchrg.datasets.scene_list import Scene
+
+__all__ = [
+    "CLASS_ORDERS",
+    "S3DIS",
+    "FolderOfClouds",
+    "Repair",
+    "Room",
+    "RoomReport",
+    "Scene",
+    "Skipped",
+    "collate_offset",
+    "describe_planes",
+    "read_pointcept_scene",
+    "read_room",
+    "write_pointcept_scene",
+]

@@ -1,0 +1,69 @@
+"""Ragged batches: clouds one after the other, and where each ends."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import default_collate
+
+from torchrg._checks import as_tensor
+from torchrg.errors import ShapeError
+
+
+def collate_offset(samples: Sequence[Mapping[str, Any]], *, coord: str = "coord") -> dict[str, Any]:
+    """Join samples as Pointcept does: arrays end to end, ``offset`` the row each cloud ends before.
+
+    Convention:
+        Labels stay those of their cloud: plane 0 of the first is another plane than plane 0 of the
+        second.
+
+    Args:
+        samples: Samples with the same keys. Tensors and arrays are joined along their first axis,
+            scalars stacked, everything else becomes a list.
+        coord: Key that says how many points a sample has.
+
+    Returns:
+        The batch, with ``offset`` ``(B,)`` int64. Samples that are batches themselves, with an
+        ``offset`` of their own, are joined into one.
+
+    Raises:
+        ShapeError: If there are no samples, or their keys differ.
+
+    Example:
+        >>> samples = [{"coord": torch.zeros(2, 3)}, {"coord": torch.ones(3, 3)}]
+        >>> batch = collate_offset(samples)
+        >>> batch["coord"].shape, batch["offset"]
+        (torch.Size([5, 3]), tensor([2, 5]))
+    """
+    keys = list(samples[0]) if samples else []
+    for i, sample in enumerate(samples):
+        if set(sample) != set(keys):
+            different = ", ".join(sorted(set(sample) ^ set(keys)))
+            raise ShapeError(
+                f"collate_offset: expected samples with the same keys, got {different} in only one "
+                f"of samples 0 and {i}."
+            )
+    if coord not in keys:
+        raise ShapeError(
+            f"collate_offset: expected samples with {coord!r}, got {', '.join(keys) or 'none'}."
+        )
+    counts = [
+        torch.as_tensor(s["offset"]).diff(prepend=torch.zeros(1, dtype=torch.int64))
+        if "offset" in s
+        else torch.tensor([len(s[coord])])
+        for s in samples
+    ]
+    batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}
+    return {**batch, "offset": torch.cat(counts).cumsum(0)}
+
+
+def _join(key: str, values: list[Any]) -> Any:  # noqa: ANN401
+    """Join the values of one key."""
+    first = values[0]
+    if isinstance(first, Tensor | np.ndarray) and first.ndim > 0:
+        return torch.cat([as_tensor("collate_offset", key, value) for value in values])
+    if isinstance(first, Tensor | np.ndarray | int | float):
+        return default_collate(values)
+    return list(values)

@@ -1,0 +1,114 @@
+"""Any folder of clouds."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from torchrg._checks import as_tensor
+from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
+from torchrg.datasets.scene_list import Scene, listed
+from torchrg.errors import FormatError
+from torchrg.io import FORMATS, read_cloud
+
+FIELD_KEYS = {"normals": "normal"}
+"""Fields of a cloud that have another name in a sample."""
+
+
+class FolderOfClouds(Dataset[Any]):
+    """All readable clouds below a folder, in natural order; hidden files are passed over.
+
+    A sample has ``coord`` ``(N, 3)`` float32 about ``origin`` ``(1, 3)`` float64, the fields of the
+    file (``normal``, ``color``, ``labels``, ``intensity``, ...), and ``name``, the path below
+    ``root`` without the suffix. A folder with ``coord.npy`` is one cloud, as Pointcept keeps them;
+    see :func:`torchrg.datasets.read_pointcept_scene`.
+
+    Args:
+        root: The folder.
+        suffixes: Which files are clouds. Default: all of :data:`torchrg.io.FORMATS`.
+        transform: Called with each sample.
+
+    Attributes:
+        scenes: Name, path and input files of each cloud. Names that would be equal without the
+            suffix keep it.
+
+    Raises:
+        FormatError: If there is no such folder, or no cloud in it.
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        *,
+        suffixes: Sequence[str] = tuple(FORMATS),
+        transform: Callable[[Mapping[str, Any]], Any] | None = None,
+    ) -> None:
+        self.root = Path(root)
+        self.transform = transform
+        if not self.root.is_dir():
+            raise FormatError(f"{root}: no such folder; check the spelling.")
+        paths = list(_clouds(self.root, tuple(suffix.lower() for suffix in suffixes)))
+        if not paths:
+            raise FormatError(
+                f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
+            )
+        names = [path.relative_to(self.root) for path in paths]
+        short = [
+            name if path.is_dir() else name.with_suffix("")
+            for name, path in zip(names, paths, strict=True)
+        ]
+        uses = Counter(short)
+        self.scenes = [
+            Scene((brief if uses[brief] == 1 else name).as_posix(), path, _files_of(path))
+            for brief, name, path in zip(short, names, paths, strict=True)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
+        """Return a sample, transformed."""
+        scene = self.scenes[index]
+        sample: dict[str, Tensor | str] = {**_read(scene.path), "name": scene.name}
+        return sample if self.transform is None else self.transform(sample)
+
+
+def _clouds(folder: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
+    """Yield the clouds below a folder; one that is a folder itself ends the descent."""
+    if (folder / "coord.npy").is_file():
+        yield folder
+        return
+    for path in listed(folder):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            yield from _clouds(path, suffixes)
+        elif path.suffix.lower() in suffixes:
+            yield path
+
+
+def _files_of(path: Path) -> tuple[Path, ...]:
+    """Return the input files of a cloud."""
+    if not path.is_dir():
+        return (path,)
+    files = (path / f"{name}.npy" for name in POINT_ARRAYS)
+    return tuple(file for file in files if file.is_file())
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    """Read a cloud as tensors."""
+    if path.is_dir():
+        return read_pointcept_scene(path)
+    cloud = read_cloud(path)
+    fields = {
+        FIELD_KEYS.get(name, name): as_tensor(str(path), name, values)
+        for name, values in cloud.fields.items()
+        if values.dtype.kind in "fiub"
+    }
+    origin = torch.from_numpy(cloud.origin).reshape(1, 3)
+    return {**fields, "coord": cloud.points, "origin": origin}

@@ -1,0 +1,176 @@
+"""Scenes in Pointcept's processed layout: a folder of ``.npy`` files for each scene.
+
+``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
+``instance`` int16 of shape ``(N, 1)``. Beside them torchrg puts ``plane`` int32 and ``curvature``
+float32 of shape ``(N,)``, ``planes.json``, and ``superpoint`` where it is asked for. Pointcept
+reads the files it knows and passes over the others.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor
+from torchrg.datasets.plane_table import describe_planes
+from torchrg.errors import FormatError
+from torchrg.io import atomic_path
+from torchrg.io.npy import map_array
+from torchrg.structures import Segmentation
+
+POINT_ARRAYS = (
+    "coord", "color", "normal", "strength", "segment", "instance",
+    "superpoint", "plane", "curvature",
+)  # fmt: skip
+"""Arrays of a scene folder that have a row for each point."""
+LABELS = ("segment", "instance", "superpoint", "plane")
+TABLE = "planes.json"
+
+
+def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Read a scene folder, whoever wrote it.
+
+    Args:
+        folder: A folder with ``coord.npy``.
+
+    Returns:
+        Those of :data:`POINT_ARRAYS` that are there; labels as int64 of shape ``(N,)``. The others
+        are mapped from the files copy-on-write.
+
+    Raises:
+        FormatError: If there are no coordinates, a file is damaged, or lengths differ.
+    """
+    paths = {name: Path(folder) / f"{name}.npy" for name in POINT_ARRAYS}
+    if not paths["coord"].is_file():
+        raise FormatError(f"{folder}: expected coord.npy in this folder, got none.")
+    arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
+    if arrays["coord"].ndim != 2 or arrays["coord"].shape[1] != 3:
+        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {arrays['coord'].shape}.")
+    for name, values in arrays.items():
+        _check_rows(paths[name], values, len(arrays["coord"]))
+    sample = {name: as_tensor("scene", name, values) for name, values in arrays.items()}
+    return {
+        name: values.reshape(-1).long() if name in LABELS else values
+        for name, values in sample.items()
+    }
+
+
+def write_pointcept_scene(
+    folder: str | os.PathLike[str],
+    sample: Mapping[str, Any],
+    segmentation: Segmentation,
+    *,
+    superpoint: bool = False,
+    origin: Sequence[float] | None = None,
+) -> list[str]:
+    """Write a scene folder, or complete one that Pointcept wrote.
+
+    What is there and was not written by this function is never changed: the arrays must have as
+    many rows, and the coordinates must be those of the sample. What it wrote itself, as
+    ``planes.json`` says, is replaced. All files are complete before the first one appears.
+
+    Args:
+        folder: The scene, ``OUT/Area_i/<room>``; it is made.
+        sample: ``coord`` ``(N, 3)`` and any of ``color``, ``normal``, ``strength``, ``segment``,
+            ``instance``, as tensors or arrays. Without ``normal`` those of the segmentation are
+            written.
+        segmentation: What :func:`torchrg.segment_planes` said about ``coord``.
+        superpoint: Whether the plane labels are written as ``superpoint`` too, -1 for no plane.
+        origin: Where the origin of ``coord`` is, for the plane table; see
+            :func:`describe_planes`. Default: ``coord`` is in the coordinates of the data set.
+
+    Returns:
+        Names of the files written.
+
+    Raises:
+        FormatError: If the folder holds another scene, or a ``plane``, ``curvature``,
+            ``superpoint`` or ``planes.json`` from elsewhere, or cannot be written.
+    """
+    place = Path(folder)
+    arrays = _arrays_of(place, sample, segmentation, superpoint=superpoint)
+    owned = _owned(place)
+    kept = {name for name in arrays if name not in owned and (place / f"{name}.npy").exists()}
+    _check_kept(place, arrays, kept)
+    new = [name for name in arrays if name not in kept]
+    table = {"written": new, **describe_planes(segmentation.planes, origin=origin)}
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"{place}: cannot be made: {error.strerror or error}.") from error
+    with ExitStack() as stack:
+        # Files take their places in reverse: the claim on them first, the coordinates last.
+        beside = [stack.enter_context(atomic_path(place / f"{name}.npy")) for name in new]
+        claim = stack.enter_context(atomic_path(place / TABLE))
+        for name, path in zip(new, beside, strict=True):
+            with path.open("wb") as stream:
+                npy_format.write_array(stream, arrays[name], allow_pickle=False)
+        claim.write_text(json.dumps(table, indent=1), encoding="utf-8")
+    return [*(f"{name}.npy" for name in new), TABLE]
+
+
+def _arrays_of(
+    place: Path, sample: Mapping[str, Any], segmentation: Segmentation, *, superpoint: bool
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a scene in Pointcept's types."""
+    found: dict[str, Any] = {"normal": segmentation.normals}
+    found |= {name: sample[name] for name in POINT_ARRAYS[:6] if name in sample}
+    found |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
+    if superpoint:
+        found["superpoint"] = segmentation.labels
+    dtypes = {"color": np.uint8, "plane": np.int32, "superpoint": np.int32}
+    arrays = {}
+    for name in (name for name in POINT_ARRAYS if name in found):
+        values = as_tensor("write_pointcept_scene", name, found[name]).detach().cpu().numpy()
+        _check_rows(place / f"{name}.npy", values, len(segmentation.labels))
+        if name in ("segment", "instance"):
+            arrays[name] = _short(values).reshape(-1, 1)
+        else:
+            arrays[name] = np.ascontiguousarray(values, dtypes.get(name, np.float32))
+    return arrays
+
+
+def _short(labels: NDArray[Any]) -> NDArray[Any]:
+    """Return labels as int16, or as int32 where they do not fit."""
+    limits = np.iinfo(np.int16)
+    fit = labels.size == 0 or (labels.min() >= limits.min and labels.max() <= limits.max)
+    return labels.astype(np.int16 if fit else np.int32)
+
+
+def _owned(place: Path) -> set[str]:
+    """Return the names of the arrays that torchrg wrote here."""
+    try:
+        return set(json.loads((place / TABLE).read_text(encoding="utf-8"))["written"])
+    except FileNotFoundError:
+        return set()
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise FormatError(
+            f"{place / TABLE}: expected a table of planes that torchrg wrote, got another file; "
+            "move it away."
+        ) from error
+
+
+def _check_kept(place: Path, arrays: Mapping[str, NDArray[Any]], kept: set[str]) -> None:
+    """Check that what stays in a folder belongs to the points that are written."""
+    for name in sorted(kept):
+        path = place / f"{name}.npy"
+        if name in ("plane", "curvature", "superpoint"):
+            raise FormatError(f"{path}: was not written by torchrg; move it away to have another.")
+        values = map_array(path)
+        _check_rows(path, values, len(arrays[name]))
+        if name == "coord" and not np.array_equal(values.astype(np.float32), arrays[name]):
+            raise FormatError(
+                f"{path}: expected the points of this scene, got others; write to another folder."
+            )
+
+
+def _check_rows(path: Path, values: NDArray[Any], num_points: int) -> None:
+    """Check that an array has a row for each point."""
+    if values.shape[:1] != (num_points,):
+        raise FormatError(f"{path}: expected {num_points} rows, got shape {values.shape}.")
