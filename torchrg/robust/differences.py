@@ -9,9 +9,11 @@ from torch import Tensor
 
 from torchrg.robust.chunks import chunks_of, share_chunks
 
-_CHUNK_BYTES = 2**20
+_CHUNK_BYTES = 2**21
 _NETWORK = 512
-"""Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions."""
+"""Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions.
+
+As integers, whose order is that of non-negative floats, they take two thirds of the time."""
 
 
 def half_size(n: int) -> int:
@@ -69,8 +71,7 @@ def count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
 class _Lagged:
     """A buffer for the differences at lags 1 to h - 1 of the rows of a chunk, side by side.
 
-    With ``paired``, differences that fill two sorting networks go to one each, those of the second
-    with their sign reversed.
+    With ``paired``, differences that fill two sorting networks go to one each.
     """
 
     def __init__(self, rows: Tensor, *, paired: bool) -> None:
@@ -90,36 +91,41 @@ class _Lagged:
         self.rows = rows.new_empty(size, n)
         self.differences = rows.new_empty(size, 2 * _NETWORK if self.paired else -(-width // 8) * 8)
         self._steps: list[tuple[Tensor, Tensor, Tensor]] = []
-        self._pads: list[tuple[Tensor, float]] = []
+        self._pads: list[Tensor] = []
         start = 0
         for lag in lags:
             if self.paired and lag == first + 1:
-                self._pads.append((self.differences[:, start:_NETWORK], torch.inf))
+                self._pads.append(self.differences[:, start:_NETWORK])
                 start = _NETWORK
             near, far = self.rows[:, :-lag], self.rows[:, lag:]
             out = self.differences[:, start : start + n - lag]
-            reverse = self.paired and lag > first
-            self._steps.append((near, far, out) if reverse else (far, near, out))
+            self._steps.append((far, near, out))
             start += n - lag
-        self._pads.append((self.differences[:, start:], -torch.inf if self.paired else torch.inf))
+        self._pads.append(self.differences[:, start:])
 
     def _fill(self, rows: Tensor) -> Tensor:
         """Write the differences of up to a chunk of sorted rows."""
         self.rows[: len(rows)] = rows
         for minuend, subtrahend, out in self._steps:
             torch.sub(minuend, subtrahend, out=out)
-        for pad, value in self._pads:
-            pad.fill_(value)
+        for pad in self._pads:
+            pad.fill_(torch.inf)
         return self.differences[: len(rows)]
 
     def select(self, rows: Tensor, rank: int) -> Tensor:
         """The ``rank``-th smallest difference of each row."""
         differences = self._fill(rows)
         if self.paired:
-            differences.view(-1, _NETWORK).numpy().sort(axis=1)
-            # Of two ascending rows, min(a_i, b_(r-1-i)) are the r smallest values together.
-            mirrored = -differences[:, 2 * _NETWORK - rank :]
-            return torch.minimum(differences[:, :rank], mirrored).amax(dim=1)
+            if not rows[:, :: rows.shape[1] - 1].isfinite().all():
+                differences.abs_()  # inf - inf may be a NaN with a sign, which would sort first
+            bits = differences.view(torch.int32)
+            second = bits[:, _NETWORK:]
+            torch.bitwise_not(second, out=second)
+            bits.view(-1, _NETWORK).numpy().sort(axis=1)
+            # Of two ascending rows, min(a_i, b_(r-1-i)) are the r smallest values together. The
+            # second network has them inverted, so that they descend.
+            mirrored = bits[:, 2 * _NETWORK - rank :].bitwise_not()
+            return torch.minimum(bits[:, :rank], mirrored).amax(dim=1).view(torch.float32)
         if self.on_cpu:
             differences.numpy().partition(rank - 1, axis=1)
             return differences[:, rank - 1]
