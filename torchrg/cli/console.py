@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, check_output
 
@@ -65,6 +66,24 @@ def _one_line(boxed: str) -> str:
     text = " ".join(part for part in message if part)
     text = re.sub(r"^Error parsing [\w.-]+: (?=\w+Config: )", "", text)
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def settings_asked_for(argv: list[str]) -> PipelineConfig:
+    """Return the settings of the preset or the file that is asked for: defaults of other flags.
+
+    Raises:
+        ConfigError: If there is no such preset or file, or it is wrong.
+
+    Example:
+        >>> settings_asked_for(["scan.pcd", "--preset=classic"]).normals.method
+        'pca'
+    """
+    values = {"--preset": DEFAULT_PRESET, "--config": ""}
+    for position, argument in enumerate(argv):
+        name, equals, value = argument.partition("=")
+        if name in values:
+            values[name] = value if equals else "".join(argv[position + 1 : position + 2])
+    return load_config(values["--config"] or values["--preset"])
 
 
 def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -> list[Path]:

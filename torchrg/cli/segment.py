@@ -11,7 +11,7 @@ import tyro
 from tqdm import tqdm
 
 from torchrg.batch.provenance import describe_run
-from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, settings_asked_for, warn
 from torchrg.cli.picture import draw_segmentation, picture_paths
 from torchrg.config import (
     DEFAULT_PRESET,
@@ -19,7 +19,6 @@ from torchrg.config import (
     NormalsConfig,
     PipelineConfig,
     PlanesConfig,
-    load_config,
 )
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import check_output, read_cloud, write_cloud
@@ -88,12 +87,7 @@ def run(argv: list[str]) -> int:
 
 def _starting_point(argv: list[str]) -> Arguments:
     """Return the arguments' defaults: those of the preset or the file that is asked for."""
-    values = {"--preset": DEFAULT_PRESET, "--config": ""}
-    for position, argument in enumerate(argv):
-        name, equals, value = argument.partition("=")
-        if name in values:
-            values[name] = value if equals else "".join(argv[position + 1 : position + 2])
-    settings = load_config(values["--config"] or values["--preset"])
+    settings = settings_asked_for(argv)
     return Arguments(
         inputs=tyro.MISSING,
         out=tyro.MISSING,

@@ -1,12 +1,15 @@
 """Files that appear whole or not at all."""
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from torchrg.errors import FormatError
+
+_BESIDE = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")
 
 
 @contextmanager
@@ -49,6 +52,26 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FormatError(f"{path}: cannot be written: {reason}.") from error
     finally:
         beside.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what :func:`atomic_path` left in a folder when its process was killed.
+
+    Args:
+        folder: The folder; nothing else may be writing there. Folders in it are left alone.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     Path(folder, ".a.0123abcd.txt").touch()
+        ...     Path(folder, "a.txt").touch()
+        ...     remove_leftovers(Path(folder))
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['a.txt']
+    """
+    for path in folder.iterdir():
+        if _BESIDE.fullmatch(path.name):
+            path.unlink()
 
 
 def check_place(path: str | os.PathLike[str]) -> None:

@@ -1,0 +1,159 @@
+"""Convert one scan, in whatever process: the job function of every engine."""
+
+import errno
+import os
+import platform
+import time
+import traceback
+from dataclasses import dataclass, field
+from typing import Literal
+
+from torchrg.batch.done import RECORD, describe_job, write_record
+from torchrg.batch.memory import peak_memory, reset_peak_memory
+from torchrg.batch.scans import Job
+from torchrg.errors import TorchrgError
+from torchrg.io.atomic import remove_leftovers
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+@dataclass(frozen=True)
+class ScanReport:
+    """What became of one scan.
+
+    Attributes:
+        name: Its name.
+        status: ``converted`` now, ``kept`` from an earlier run, ``failed``, or ``not started``.
+        num_points: Points read.
+        num_regions: Planes found.
+        seconds: Time of each stage by its name.
+        peak_memory: Largest resident memory of the process, in bytes.
+        repairs: What was put right in the input.
+        warnings: What a user should know.
+        reason: Why it failed, a line.
+        details: The traceback of a failure that was not foreseen.
+        disk_full: Whether it failed because there is no space left.
+        host: Machine and process that did it.
+        attempts: How often it was tried.
+    """
+
+    name: str
+    status: Literal["converted", "kept", "failed", "not started"]
+    num_points: int = 0
+    num_regions: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    peak_memory: int = 0
+    repairs: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    reason: str = ""
+    details: str = ""
+    disk_full: bool = False
+    host: str = ""
+    attempts: int = 1
+
+
+def convert_scan(job: Job) -> ScanReport:
+    """Convert one scan; what goes wrong with it is in the report and never raised.
+
+    The record of an earlier run is removed first, and the new one written last: whoever finds a
+    record finds complete files.
+
+    Args:
+        job: The scan and its settings.
+
+    Returns:
+        The report.
+    """
+    clock = StageClock()
+    where = f"{platform.node()} ({os.getpid()})"
+    reset_peak_memory()
+    try:
+        clock.begin("hash")
+        description = describe_job(job)
+        job.folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(job.folder)
+        (job.folder / RECORD).unlink(missing_ok=True)
+        converted = job.source.convert(job.scan, job.folder, job.settings, clock.begin)
+        clock.begin("record")
+        write_record(job, description, converted)
+    except Exception as error:  # noqa: BLE001 One scan must never end the others.
+        return ScanReport(
+            job.scan.name,
+            "failed",
+            seconds=clock.end(),
+            peak_memory=peak_memory(),
+            reason=_reason(error),
+            details="" if _is_foreseen(error) else traceback.format_exc(),
+            disk_full=_is_disk_full(error),
+            host=where,
+        )
+    return ScanReport(
+        job.scan.name,
+        "converted",
+        num_points=converted.num_points,
+        num_regions=converted.num_regions,
+        seconds=clock.end(),
+        peak_memory=peak_memory(),
+        repairs=converted.repairs,
+        warnings=converted.warnings,
+        host=where,
+    )
+
+
+class StageClock:
+    """Seconds of each stage; one that begins ends the one before it.
+
+    Example:
+        >>> clock = StageClock()
+        >>> clock.begin("read")
+        >>> clock.begin("done")
+        >>> list(clock.end())
+        ['read']
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._stage, self._start = "done", time.perf_counter()
+
+    def begin(self, stage: str) -> None:
+        """Begin a stage; ``"done"`` is none."""
+        now = time.perf_counter()
+        if self._stage != "done":
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._start
+        self._stage, self._start = stage, now
+
+    def end(self) -> dict[str, float]:
+        """End the last stage and return the seconds of all."""
+        self.begin("done")
+        return self.seconds
+
+
+def _reason(error: Exception) -> str:
+    """Return an error as one line that names the file where it can."""
+    if _is_out_of_memory(error):
+        return "out of memory; lower chunk_size in the settings, or use a machine with more."
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror or error}."
+    text = " ".join(str(error).split())
+    return text if isinstance(error, TorchrgError) else f"{type(error).__name__}: {text}"
+
+
+def _is_foreseen(error: Exception) -> bool:
+    """Return whether the reason says all there is to say."""
+    return isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Return whether memory could not be had; torch says so by a RuntimeError."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
+    )
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
+    """Return whether an error, or what caused it, is a full disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
+            return True
+        error = error.__cause__
+    return False

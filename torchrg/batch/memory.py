@@ -1,0 +1,71 @@
+"""How much memory a scan takes, and how much there is."""
+
+import os
+from pathlib import Path
+
+BASE_BYTES = 500_000_000
+"""What a worker takes before the first point: Python, torch, scipy."""
+BYTES_PER_POINT = 1_000
+"""What each point adds at the peak."""
+SHARE = 0.8
+"""Part of the available memory that a batch may take when no limit is given."""
+
+
+def memory_of_scan(num_points: int) -> int:
+    """Return the memory that a worker needs for a scan, in bytes.
+
+    Example:
+        >>> memory_of_scan(1_000_000)
+        1500000000
+    """
+    return BASE_BYTES + BYTES_PER_POINT * num_points
+
+
+def available_memory() -> int:
+    """Return the bytes that this process and its children can still take.
+
+    The smaller of what the machine has free and what a control group (a container) leaves.
+    """
+    free = [_machine_memory()]
+    for limit, used in (
+        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+        (
+            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+            "/sys/fs/cgroup/memory/memory.usage_in_bytes",
+        ),
+    ):
+        try:
+            free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
+        except (OSError, ValueError):
+            continue  # No such group, or one without a limit, which is the word "max".
+    return max(0, min(free))
+
+
+def _machine_memory() -> int:
+    """Return the machine's available memory, or all of it where only that is known."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        table = dict(line.split(":", 1) for line in lines)
+        return int(table["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def reset_peak_memory() -> None:
+    """Start a new measurement of this process's peak memory, where the system can (Linux)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return
+
+
+def peak_memory() -> int:
+    """Return the largest resident memory of this process since the last reset, in bytes."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        table = dict(line.split(":", 1) for line in lines if ":" in line)
+        return int(table["VmHWM"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,0 +1,93 @@
+"""What a batch is made of: scans, where they come from, and the job that converts one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from torchrg.config import PipelineConfig
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One scan of a data set, as far as can be told without reading it.
+
+    Attributes:
+        name: Folder of its results below the output directory, with forward slashes.
+        inputs: The files that it is made of.
+        num_points: Its number of points by the headers or sizes of its files.
+    """
+
+    name: str
+    inputs: tuple[Path, ...]
+    num_points: int
+
+
+class Converted(NamedTuple):
+    """What is known of a scan once its results are written; equal runs give equal values.
+
+    Attributes:
+        num_points: Number of points, those that are not finite included.
+        num_regions: Number of planes.
+        files: Names of the files written, in the scan's folder.
+        repairs: What was put right in the input, a line each.
+        warnings: What a user should know, a line each.
+    """
+
+    num_points: int
+    num_regions: int
+    files: tuple[str, ...]
+    repairs: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+class Source(Protocol):
+    """A data set that can be converted: it lists its scans, and reads and writes one of them.
+
+    Sources travel to other processes, so they hold settings and paths but no open files.
+    """
+
+    @property
+    def root(self) -> Path:
+        """The directory of the data set."""
+
+    @property
+    def bytes_per_point(self) -> int:
+        """Space that the results of one point take, to see beforehand whether the disk has it."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind of the source and every option that decides results, for JSON."""
+
+    def list_scans(self) -> list[Scan]:
+        """Return the scans in natural order."""
+
+    def convert(
+        self,
+        scan: Scan,
+        folder: Path,
+        settings: PipelineConfig,
+        begin: Callable[[str], None],
+    ) -> Converted:
+        """Read a scan, segment it, and write its results, each file whole or not at all.
+
+        Args:
+            scan: One of :meth:`list_scans`.
+            folder: Where its results go; it exists.
+            settings: How to segment.
+            begin: To be called with the name of each stage when it starts.
+        """
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scan to convert, with everything that a process on any machine needs for it."""
+
+    source: Source
+    scan: Scan
+    out: Path
+    settings: PipelineConfig
+
+    @property
+    def folder(self) -> Path:
+        """Where the results of the scan go."""
+        return self.out / self.scan.name
