@@ -19,7 +19,8 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     Returns:
         ``planes``: for each plane its ``id``, the value in ``plane.npy``, and ``normal``,
         ``offset`` (``normal . x = offset``), ``centroid``, ``area``, ``count``, ``rms``,
-        ``extent``, ``axes``, ``center``, ``curved``, and ``kind`` where it is known.
+        ``extent``, ``axes``, ``center``, ``curved``; ``kind`` and ``outline`` (rings of points)
+        where they are known.
         ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
 
     Example:
@@ -47,6 +48,11 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     lists = {name: values.tolist() for name, values in columns.items()}
     if planes.kind is not None:
         lists["kind"] = [PLANE_KINDS[kind] for kind in planes.kind.tolist()]
+    if planes.outline is not None:
+        lists["outline"] = [
+            [(ring.detach().cpu().double() + shift).tolist() for ring in rings]
+            for rings in planes.outline
+        ]
     table: dict[str, Any] = {"planes": _rows(lists)}
     if planes.adjacency is not None:
         pairs, lengths, angles = (part.tolist() for part in planes.adjacency)

@@ -1,5 +1,18 @@
-"""Modules for data pipelines: a dict of tensors in, a new dict out."""
+"""Modules for data pipelines: a dict of tensors (or a PyG ``Data``) in, a new one out."""
 
+from torchrg.transforms.cloud import CenterCloud, KeepFinite
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
+from torchrg.transforms.voxel_planes import segment_voxels
+from torchrg.transforms.voxels import SampleVoxels, restore_points, sample_voxels
 
-__all__ = ["EstimateNormals", "GrowRegions", "SegmentPlanes"]
+__all__ = [
+    "CenterCloud",
+    "EstimateNormals",
+    "GrowRegions",
+    "KeepFinite",
+    "SampleVoxels",
+    "SegmentPlanes",
+    "restore_points",
+    "sample_voxels",
+    "segment_voxels",
+]

@@ -5,54 +5,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor
 
-from torchrg._checks import as_tensor
 from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
-from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals import estimate_normals
 from torchrg.pipeline import segment_planes
 from torchrg.regions import grow_regions
 from torchrg.structures import UNLABELED
-
-KEYS = {"coord": "coord", "normal": "normal", "curvature": "curvature", "plane": "plane"}
-"""Names of the keys in a sample (Pointcept's, and ours)."""
+from torchrg.transforms.sample import CloudTransform
 
 
-class SampleTransform(nn.Module):
-    """Base of the transforms: holds the names of the keys, never changes a sample.
-
-    Args:
-        keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
-    """
-
-    def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
-        super().__init__()
-        unknown = set(keys or {}) - set(KEYS)
-        if unknown:
-            raise ConfigError(
-                f"{type(self).__name__}: expected keys to rename {', '.join(KEYS)}, got "
-                f"{', '.join(sorted(unknown))}."
-            )
-        self.keys = {**KEYS, **(keys or {})}
-
-    def read(self, sample: Mapping[str, Any], name: str) -> torch.Tensor:
-        """Return an entry of a sample as a tensor.
-
-        Raises:
-            ConfigError: If the sample lacks it.
-        """
-        key = self.keys[name]
-        if key not in sample:
-            raise ConfigError(
-                f"{type(self).__name__}: expected a sample with {key!r}, got "
-                f"{', '.join(map(str, sample))}; rename it with keys={{{name!r}: ...}}."
-            )
-        return as_tensor(type(self).__name__, key, sample[key])
-
-
-class EstimateNormals(SampleTransform):
+class EstimateNormals(CloudTransform):
     """Add unit normals and curvature; see :func:`torchrg.estimate_normals`.
 
     Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
@@ -78,21 +42,17 @@ class EstimateNormals(SampleTransform):
         super().__init__(keys=keys)
         self.config = dataclasses.replace(config or NormalsConfig(), **changes)
 
-    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a new sample with normals and curvature."""
-        fit = estimate_normals(self.read(sample, "coord"), config=self.config)
-        return {
-            **sample,
-            self.keys["normal"]: fit.normals,
-            self.keys["curvature"]: fit.curvature,
-        }
+    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return normals and curvature of a cloud."""
+        fit = estimate_normals(cloud["coord"], config=self.config)
+        return {"normal": fit.normals, "curvature": fit.curvature}
 
     def extra_repr(self) -> str:
         """Return the settings."""
         return repr(self.config)
 
 
-class GrowRegions(SampleTransform):
+class GrowRegions(CloudTransform):
     """Add plane labels grown on the normals that a sample has; see :func:`torchrg.grow_regions`.
 
     Reads ``coord``, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``; adds ``plane`` ``(N,)``,
@@ -111,6 +71,8 @@ class GrowRegions(SampleTransform):
         tensor([0])
     """
 
+    reads = ("coord", "normal", "curvature")
+
     def __init__(
         self,
         config: GrowingConfig | None = None,
@@ -123,34 +85,32 @@ class GrowRegions(SampleTransform):
         self.config = dataclasses.replace(config or GrowingConfig(), **changes)
         self.k = k
 
-    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a new sample with plane labels."""
-        points = self.read(sample, "coord")
-        normals = self.read(sample, "normal").to(points.dtype)
-        curvature = self.read(sample, "curvature").to(points.dtype)
+    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the plane labels of a cloud."""
+        points = cloud["coord"]
+        normals = cloud["normal"].to(points.dtype)
+        curvature = cloud["curvature"].to(points.dtype)
         rows = finite_rows(points)
-        cloud = points[rows]
-        if len(cloud) == 0:
-            labels = torch.full((len(points),), UNLABELED, device=points.device)
-            return {**sample, self.keys["plane"]: labels}
+        finite = points[rows]
+        if len(finite) == 0:
+            return {"plane": torch.full((len(points),), UNLABELED, device=points.device)}
         grown = grow_regions(
-            cloud,
+            finite,
             normals[rows],
             curvature[rows],
-            search_knn(cloud, min(self.k, len(cloud)), canonical=True),
+            search_knn(finite, min(self.k, len(finite)), canonical=True),
             self.config,
             valid=(normals[rows] != 0).any(dim=-1),
             canonical=True,
         )
-        labels = restore_rows(grown, rows, len(points), fill=UNLABELED)
-        return {**sample, self.keys["plane"]: labels}
+        return {"plane": restore_rows(grown, rows, len(points), fill=UNLABELED)}
 
     def extra_repr(self) -> str:
         """Return the settings."""
         return f"k={self.k}, {self.config!r}"
 
 
-class SegmentPlanes(SampleTransform):
+class SegmentPlanes(CloudTransform):
     """Add plane labels, normals and curvature; see :func:`torchrg.segment_planes`.
 
     Reads ``coord`` ``(N, 3)``; adds ``plane`` ``(N,)``, int64, -1 for none, ``normal`` ``(N, 3)``
@@ -175,15 +135,10 @@ class SegmentPlanes(SampleTransform):
         super().__init__(keys=keys)
         self.config = load_config(config) if isinstance(config, str) else config
 
-    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a new sample with plane labels, normals and curvature."""
-        seg = segment_planes(self.read(sample, "coord"), self.config)
-        return {
-            **sample,
-            self.keys["plane"]: seg.labels,
-            self.keys["normal"]: seg.normals,
-            self.keys["curvature"]: seg.curvature,
-        }
+    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return plane labels, normals and curvature of a cloud."""
+        seg = segment_planes(cloud["coord"], self.config)
+        return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
 
     def extra_repr(self) -> str:
         """Return the settings."""

@@ -1,0 +1,173 @@
+"""Samples: a dict of tensors or NumPy arrays, or a PyG ``Data``, which is never imported.
+
+A sample holds one cloud, or a ragged batch: ``offset`` ``(B,)``, the row each cloud ends before
+(Pointcept), or ``batch`` ``(N,)``, the cloud of each point in ascending order (PyG). Transforms
+treat each cloud by itself.
+"""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchrg._checks import as_tensor, check_shapes
+from torchrg.errors import ConfigError
+
+KEYS = {
+    "coord": "coord",
+    "normal": "normal",
+    "curvature": "curvature",
+    "plane": "plane",
+    "inverse": "inverse",
+    "origin": "origin",
+}
+"""Names of the keys in a sample (Pointcept's, and ours)."""
+PYG_KEYS = {"coord": "pos"}
+"""Names that a PyG ``Data`` has instead, unless others are given."""
+
+
+class SampleTransform(nn.Module):
+    """Base of the transforms: reads and writes samples of every kind, never changes one.
+
+    Results are NumPy arrays where the coordinates are. Names of new keys with a row for each point
+    are added to ``index_valid_keys`` where a sample has it, so that Pointcept's transforms take
+    points out of them too.
+
+    Args:
+        keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
+    """
+
+    def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
+        super().__init__()
+        unknown = set(keys or {}) - set(KEYS)
+        if unknown:
+            raise ConfigError(
+                f"{type(self).__name__}: expected keys to rename {', '.join(KEYS)}, got "
+                f"{', '.join(sorted(unknown))}."
+            )
+        self.renamed = dict(keys or {})
+
+    def key(self, sample: Any, name: str) -> str:  # noqa: ANN401
+        """Return what an entry is called in a sample."""
+        usual = KEYS if isinstance(sample, Mapping) else {**KEYS, **PYG_KEYS}
+        return self.renamed.get(name, usual[name])
+
+    def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
+        """Return an entry of a sample as a tensor.
+
+        Raises:
+            ConfigError: If the sample lacks it.
+            ShapeError: If it is no array, or coordinates that are not of shape ``(N, 3)``.
+        """
+        key, caller = self.key(sample, name), type(self).__name__
+        entries = entries_of(sample)
+        if key not in entries:
+            raise ConfigError(
+                f"{caller}: expected a sample with {key!r}, got {', '.join(map(str, entries))}; "
+                f"rename it with keys={{{name!r}: ...}}."
+            )
+        tensor = as_tensor(caller, key, entries[key])
+        if name == "coord":
+            check_shapes(caller, **{key: (tensor, "N 3")})
+        return tensor
+
+    def changed(
+        self,
+        sample: Any,  # noqa: ANN401
+        values: Mapping[str, Tensor],
+        *,
+        per_point: Sequence[str] = (),
+    ) -> Any:  # noqa: ANN401
+        """Return a new sample of the same kind with other values.
+
+        Args:
+            sample: The sample; it is not changed.
+            values: New values by key.
+            per_point: Those keys that have a row for each point.
+        """
+        entries = entries_of(sample)
+        is_numpy = isinstance(entries.get(self.key(sample, "coord")), np.ndarray)
+        new: dict[str, Any] = {
+            key: value.numpy() if is_numpy else value for key, value in values.items()
+        }
+        if "index_valid_keys" in entries:
+            known = list(entries["index_valid_keys"])
+            new["index_valid_keys"] = known + [key for key in per_point if key not in known]
+        if isinstance(sample, Mapping):
+            return {**sample, **new}
+        other = copy.copy(sample)
+        for key, value in new.items():
+            other[key] = value
+        return other
+
+
+class CloudTransform(SampleTransform):
+    """Base of the transforms that add a row for each point, cloud by cloud."""
+
+    reads: tuple[str, ...] = ("coord",)
+
+    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return new entries of one cloud, from those that are read."""
+        raise NotImplementedError
+
+    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample with the new entries; the given one is not changed."""
+        values = {name: self.read(sample, name) for name in self.reads}
+        ends = cloud_ends(sample, len(values["coord"]))
+        parts = [
+            self.add({name: value[begin:end] for name, value in values.items()})
+            for begin, end in zip([0, *ends], ends, strict=False)
+        ]
+        added = {
+            self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
+        }
+        return self.changed(sample, added, per_point=list(added))
+
+
+def entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
+    """Return what a sample holds by key.
+
+    Raises:
+        ConfigError: If it is neither a mapping nor like a PyG ``Data``.
+    """
+    if isinstance(sample, Mapping):
+        return sample
+    if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
+        entries: dict[str, Any] = sample.to_dict()
+        return entries
+    raise ConfigError(
+        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
+    )
+
+
+def cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
+    """Return the row that each cloud of a sample ends before; one cloud ends at the last.
+
+    Raises:
+        ConfigError: If ``offset`` or ``batch`` does not fit the points.
+
+    Example:
+        >>> cloud_ends({"batch": torch.tensor([0, 0, 1, 1, 1])}, 5)
+        [2, 5]
+    """
+    entries = entries_of(sample)
+    if entries.get("offset") is not None:
+        ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
+        if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
+            raise ConfigError(
+                f"expected offset to ascend to the number of points ({num_points}), got {ends}."
+            )
+        return ends
+    if entries.get("batch") is not None:
+        batch = torch.as_tensor(entries["batch"])
+        if len(batch) != num_points or bool((batch.diff() < 0).any()):
+            raise ConfigError(
+                f"expected batch to ascend over {num_points} points, got {len(batch)} numbers; "
+                "sort the points by cloud."
+            )
+        counts: list[int] = torch.bincount(batch).cumsum(0).tolist()
+        return counts or [0]
+    return [num_points]

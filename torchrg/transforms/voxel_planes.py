@@ -1,0 +1,80 @@
+"""Planes found on voxels, for every point: for clouds denser than the planes need."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor
+from torchrg.config import PipelineConfig, load_config
+from torchrg.neighbors import finite_rows
+from torchrg.pipeline import segment_planes
+from torchrg.regions import summarize_planes
+from torchrg.structures import UNLABELED, PlaneAdjacency, Segmentation
+from torchrg.transforms.voxels import restore_points, sample_voxels
+
+
+def segment_voxels(
+    points: Tensor | NDArray[np.floating],
+    size: float,
+    config: PipelineConfig | None = None,
+    *,
+    on_stage: Callable[[str], None] | None = None,
+) -> Segmentation:
+    """Segment one point of each voxel, and give every point the result of its voxel.
+
+    Args:
+        points: Points, shape ``(N, 3)``, float32 or float64.
+        size: Side of a voxel, in the unit of the cloud.
+        config: See :func:`torchrg.segment_planes`; sizes of regions are counted in voxels.
+        on_stage: See :func:`torchrg.segment_planes`.
+
+    Returns:
+        A segmentation of all points. Its planes are those of the voxels, described from all points
+        and numbered by their number; which planes meet is found on the voxels.
+
+    Raises:
+        ShapeError: If ``points`` has another shape or dtype.
+        ConfigError: If ``size`` is not positive.
+
+    Example:
+        >>> grid = torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0), torch.zeros(1))
+        >>> seg = segment_voxels(grid, 2.0)
+        >>> seg.labels.shape, seg.planes.count.tolist()
+        (torch.Size([1600]), [1600])
+    """
+    tensor = as_tensor("segment_voxels", "points", points)
+    config = load_config() if config is None else config
+    voxels = sample_voxels(tensor, size)
+    seg = segment_planes(tensor[voxels.rows], config, on_stage=on_stage)
+    labels = restore_points(seg.labels, voxels.inverse, fill=UNLABELED)
+    counts = torch.bincount(labels[labels >= 0], minlength=len(seg.planes.count))
+    place = counts.argsort(descending=True, stable=True).argsort()
+    labels = torch.where(labels >= 0, place[labels], labels) if len(place) else labels
+    normals, curvature, sharp, valid = (
+        restore_points(values, voxels.inverse)
+        for values in (seg.normals, seg.curvature, seg.sharp, seg.valid)
+    )
+    rows = finite_rows(tensor)
+    planes = summarize_planes(
+        tensor[rows],
+        normals[rows],
+        labels[rows],
+        up=config.planes.up_direction,
+        outline=config.planes.outline,
+    )
+    adjacency = _renumbered(seg.planes.adjacency, place)
+    return Segmentation(
+        labels, normals, curvature, sharp, valid, planes._replace(adjacency=adjacency)
+    )
+
+
+def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:
+    """Return which planes meet after the planes were given other numbers."""
+    if adjacency is None:
+        return None
+    pairs = place[adjacency.pairs].sort(dim=-1).values
+    order = (pairs[:, 0] * len(place) + pairs[:, 1]).argsort()
+    return PlaneAdjacency(*(part[order] for part in (pairs, *adjacency[1:])))
