@@ -1,0 +1,124 @@
+"""Pinhole cameras: depth images to points, through kornia, and back from organised clouds."""
+
+import torch
+from torch import Tensor
+
+from torchrg._checks import check_floating, check_shapes
+from torchrg.errors import ConfigError
+
+
+def depth_to_points(depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Return the point of each pixel in camera coordinates.
+
+    Convention:
+        Camera axes are x to the right, y down, z forwards; ``depth`` is z, not the length of the
+        ray. The middle of the first pixel is at (0, 0). A negative focal length turns an axis over,
+        as in ICL-NUIM.
+
+    Args:
+        depth: Shape ``(B, H, W)``, floating point, in any unit.
+        intrinsics: Camera matrices, shape ``(B, 3, 3)``, without skew.
+
+    Returns:
+        Points, shape ``(B, H, W, 3)``, in the unit and dtype of ``depth``; NaN where depth is not
+        finite or not positive.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+
+    Example:
+        >>> camera = torch.tensor([[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
+        >>> depth_to_points(torch.tensor([[[4.0, 0], [4, 4]]]), camera[None])[0, :, :, 0]
+        tensor([[-1., nan],
+                [-1.,  1.]])
+    """
+    check_shapes("depth_to_points", depth=(depth, "B H W"), intrinsics=(intrinsics, "B 3 3"))
+    check_floating("depth_to_points", depth=depth)
+    from kornia.geometry.depth import depth_to_3d_v2
+
+    seen = has_depth(depth)
+    points: Tensor = depth_to_3d_v2(torch.where(seen, depth, 1.0), intrinsics.to(depth))
+    return torch.where(seen[..., None], points, torch.nan)
+
+
+def has_depth(depth: Tensor) -> Tensor:
+    """Return which pixels have a depth: finite and positive, the shape of ``depth``.
+
+    Example:
+        >>> has_depth(torch.tensor([1.0, 0, -1, torch.nan, torch.inf]))
+        tensor([ True, False, False, False, False])
+    """
+    return depth.isfinite() & (depth > 0)
+
+
+def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    """Return a camera matrix, shape ``(3, 3)``, float64.
+
+    Args:
+        fx: Focal length along rows, in pixels, not 0.
+        fy: Focal length along columns, in pixels, not 0.
+        cx: Column of the optical axis; the middle of the first pixel is 0.
+        cy: Row of the optical axis.
+
+    Raises:
+        ConfigError: If a focal length is 0, or a value is not finite.
+
+    Example:
+        >>> make_intrinsics(525, 525, 319.5, 239.5)[0].tolist()
+        [525.0, 0.0, 319.5]
+    """
+    matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    if not bool(matrix.isfinite().all()) or fx == 0 or fy == 0:
+        raise ConfigError(
+            "make_intrinsics: expected finite fx, fy, cx, cy with fx and fy not 0, got "
+            f"{fx}, {fy}, {cx}, {cy}."
+        )
+    return matrix
+
+
+def find_intrinsics(points: Tensor) -> Tensor | None:
+    """Find the camera that an organised cloud was taken with.
+
+    Args:
+        points: One point for each pixel in camera coordinates, shape ``(H, W, 3)``; NaN where there
+            is none.
+
+    Returns:
+        The camera matrix, shape ``(3, 3)``, float64; None where no pinhole camera puts nearly all
+        points within a tenth of a pixel of their places: clouds of rotating scanners, or in world
+        coordinates.
+
+    Raises:
+        ShapeError: If ``points`` has another shape or dtype.
+
+    Example:
+        >>> camera = make_intrinsics(50.0, 50.0, 3.5, 2.5)
+        >>> depth = torch.linspace(1, 2, 48, dtype=torch.float64).view(1, 6, 8)
+        >>> found = find_intrinsics(depth_to_points(depth, camera[None])[0])
+        >>> bool((found - camera).abs().max() < 1e-9)
+        True
+    """
+    check_shapes("find_intrinsics", points=(points, "H W 3"))
+    check_floating("find_intrinsics", points=points)
+    seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
+    rows, columns = (place.double() for place in seen.nonzero().unbind(dim=1))
+    x, y, z = points[seen].double().unbind(dim=1)
+    lines = [_fit_line(x / z, columns), _fit_line(y / z, rows)]
+    if any(line is None for line in lines):
+        return None
+    (fx, cx), (fy, cy) = (line for line in lines if line is not None)
+    return make_intrinsics(fx, fy, cx, cy)
+
+
+def _fit_line(slopes: Tensor, places: Tensor) -> tuple[float, float] | None:
+    """Return the line ``place = focal * slope + middle`` through nearly all, or None."""
+    if len(slopes) < 2:
+        return None
+    mean_slope, mean_place = slopes.mean(), places.mean()
+    spread = ((slopes - mean_slope) ** 2).sum()
+    focal = ((slopes - mean_slope) * (places - mean_place)).sum() / spread
+    middle = mean_place - focal * mean_slope
+    off = (focal * slopes + middle - places).abs() > 0.1
+    if not bool(focal.isfinite()) or float(focal) == 0 or float(off.double().mean()) > 0.01:
+        return None
+    return float(focal), float(middle)
