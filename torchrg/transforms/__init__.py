@@ -10,12 +10,16 @@ from torchrg.transforms.voxels import SampleVoxels, restore_points, sample_voxel
 
 __all__ = [
     "CenterCloud",
+    "DepthConfig",
+    "DepthToCloud",
     "EstimateNormals",
     "GrowRegions",
     "KeepFinite",
     "SampleVoxels",
+    "SegmentDepth",
     "SegmentPlanes",
     "restore_points",
     "sample_voxels",
+    "segment_depth",
     "segment_voxels",
 ]
