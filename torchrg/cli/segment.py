@@ -24,6 +24,7 @@ from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud, Segmentation
+from torchrg.transforms import segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
 
@@ -41,6 +42,9 @@ class Arguments:
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
     """Picture of the planes to write too, a .png file; for several inputs a directory."""
+    voxel: float | None = None
+    """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
+    has the result of its voxel. Default: all points are segmented."""
     preset: str = DEFAULT_PRESET
     """Settings to start from: classic, detmm, paper or consensus."""
     config: Path | None = None
@@ -72,7 +76,7 @@ def run(argv: list[str]) -> int:
     failed = 0
     for source, target, picture in zip(arguments.inputs, outputs, pictures, strict=True):
         try:
-            _segment_file(source, target, picture, settings)
+            _segment_file(source, target, picture, settings, arguments.voxel)
         except TorchrgError as error:
             if len(outputs) == 1:
                 raise
@@ -99,7 +103,7 @@ def _starting_point(argv: list[str]) -> Arguments:
 
 
 def _segment_file(
-    source: Path, target: Path, picture: Path | None, settings: PipelineConfig
+    source: Path, target: Path, picture: Path | None, settings: PipelineConfig, voxel: float | None
 ) -> None:
     """Segment one file, with a progress bar on a terminal."""
     begin = time.perf_counter()
@@ -112,8 +116,12 @@ def _segment_file(
             bar.set_postfix_str(stage)
             bar.update(stage != STAGES[0])
 
-        seg = segment_planes(cloud.points, settings, on_stage=advance)
-    write_cloud(target, cloud, seg, provenance=describe_run(source, settings))
+        if voxel is None:
+            seg = segment_planes(cloud.points, settings, on_stage=advance)
+        else:
+            seg = segment_voxels(cloud.points, voxel, settings, on_stage=advance)
+    provenance = describe_run(source, settings) | ({} if voxel is None else {"voxel": voxel})
+    write_cloud(target, cloud, seg, provenance=provenance)
     if picture is not None:
         draw_segmentation(picture, cloud, seg)
     _report(source, target, cloud, seg, time.perf_counter() - begin)

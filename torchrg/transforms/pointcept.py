@@ -1,7 +1,7 @@
 """Importing this module makes the transforms known to Pointcept.
 
 With ``import torchrg.transforms.pointcept`` at the end of ``pointcept/datasets/__init__.py``, a
-config can name them: ``dict(type="SegmentPlanes", config="classic", keys=dict(plane="superpoint"))``.
+config can name them: ``dict(type="SegmentPlanes", config="classic")``.
 They read and return NumPy arrays there. Where Pointcept is not installed, nothing happens.
 """
 
