@@ -1,5 +1,6 @@
 """Convert one scan, in whatever process: the job function of every engine."""
 
+import contextlib
 import errno
 import os
 import platform
@@ -8,7 +9,7 @@ import traceback
 from dataclasses import dataclass, field
 from typing import Literal
 
-from torchrg.batch.done import RECORD, describe_job, write_record
+from torchrg.batch.done import RECORD, describe_job, read_record, write_record
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.batch.scans import Job
 from torchrg.errors import TorchrgError
@@ -72,11 +73,16 @@ def convert_scan(job: Job) -> ScanReport:
         description = describe_job(job)
         job.folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(job.folder)
+        earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)
         converted = job.source.convert(job.scan, job.folder, job.settings, clock.begin)
         clock.begin("record")
+        for name in earlier["outputs"].keys() - set(converted.files):
+            (job.folder / name).unlink(missing_ok=True)
         write_record(job, description, converted)
     except Exception as error:  # noqa: BLE001 One scan must never end the others.
+        with contextlib.suppress(OSError):
+            job.folder.rmdir()  # If it is empty.
         return ScanReport(
             job.scan.name,
             "failed",

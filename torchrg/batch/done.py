@@ -25,9 +25,12 @@ def describe_job(job: Job) -> dict[str, Any]:
     Raises:
         OSError: If an input cannot be read.
     """
+    settings = dataclasses.asdict(job.settings)
+    # It never changes a result, and lowering it after running out of memory must cost nothing.
+    del settings["chunk_size"]
     return {
         "versions": describe_versions(),
-        "config": dataclasses.asdict(job.settings),
+        "config": settings,
         "source": job.source.describe(),
         "inputs": [
             {"name": _name_below(job.source.root, path), **_fingerprint(path)}

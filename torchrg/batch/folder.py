@@ -1,4 +1,4 @@
-"""A folder of clouds as a source: one result folder for each file that can be read."""
+"""A folder of clouds as a source: one result folder for each cloud."""
 
 import json
 from collections.abc import Callable
@@ -9,60 +9,85 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.batch.scans import Converted, Scan
+from torchrg.batch.scans import Converted, Scan, check_finite
 from torchrg.config import PipelineConfig
-from torchrg.datasets.plane_table import describe_planes
-from torchrg.datasets.scene_list import natural_key
-from torchrg.errors import FormatError
-from torchrg.io import FORMATS, atomic_path, read_cloud
+from torchrg.datasets import (
+    FolderOfClouds,
+    Scene,
+    describe_planes,
+    read_pointcept_scene,
+    write_pointcept_scene,
+)
+from torchrg.errors import ConfigError
+from torchrg.io import atomic_path, read_cloud
 from torchrg.io.counts import estimate_points
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud, Segmentation
 
+COPIED = ("coord", "color", "strength", "segment", "instance")
+"""Arrays of a folder in Pointcept's layout that go along with its results."""
+
 
 @dataclass(frozen=True)
 class FolderSource:
-    """Every readable cloud below a folder.
+    """Every readable cloud below a folder; folders in Pointcept's layout are clouds too.
 
-    Writes ``coord``, ``normal``, ``curvature`` and ``plane`` as ``.npy``, ``color`` too where the
+    Files: ``coord``, ``normal``, ``curvature`` and ``plane`` as ``.npy``, ``color`` too where the
     cloud has colours, and ``planes.json``. Coordinates are the input's own, points that are not
-    finite included.
+    finite included. Folders in Pointcept's layout: see
+    :func:`torchrg.datasets.write_pointcept_scene`.
 
     Args:
         root: The folder.
+        out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
+            no other folder below it can be.
+        superpoint: Whether the planes of folders in Pointcept's layout are written as
+            ``superpoint`` too.
+
+    Raises:
+        ConfigError: If ``out`` is below ``root``.
     """
 
     root: Path
-    bytes_per_point: int = 12 + 12 + 4 + 8
+    out: Path
+    superpoint: bool = False
+    bytes_per_point: int = 12 + 3 + 12 + 4 + 4
+
+    def __post_init__(self) -> None:
+        if self.root in self.out.parents:
+            raise ConfigError(
+                f"{self.out}: expected a directory outside {self.root}, as results would be read "
+                "as clouds next time; choose another."
+            )
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind of the source."""
-        return {"kind": "folder"}
+        """Return kind and options."""
+        return {"kind": "folder", "superpoint": self.superpoint}
 
     def list_scans(self) -> list[Scan]:
-        """Return the files that can be read, hidden ones left out, in natural order.
+        """Return the clouds in natural order.
 
         Raises:
-            FormatError: If there is none, or two would have one result folder.
+            FormatError: If there is none.
+            ConfigError: If results would go in among clouds that are files.
         """
-        if not self.root.is_dir():
-            raise FormatError(f"{self.root}: expected a directory; check the spelling.")
-        scans: dict[str, Scan] = {}
-        for path in sorted(self.root.rglob("*"), key=lambda path: natural_key(path.as_posix())):
-            inside = path.relative_to(self.root)
-            hidden = any(part.startswith(".") for part in inside.parts)
-            if hidden or path.suffix.lower() not in FORMATS or not path.is_file():
-                continue
-            name = inside.with_suffix("").as_posix()
-            if name in scans:
-                raise FormatError(
-                    f"{path}: {scans[name].inputs[0].name} beside it has the same name, and "
-                    "results go by name; move or rename one."
-                )
-            scans[name] = Scan(name, (path,), estimate_points(path))
-        if not scans:
-            raise FormatError(f"{self.root}: expected clouds ({' '.join(FORMATS)}), got none.")
-        return list(scans.values())
+        scenes = FolderOfClouds(self.root).scenes
+        file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
+        if file is not None and self.out == self.root:
+            raise ConfigError(
+                f"{self.out}: expected a directory outside {self.root} for the results of "
+                f"{file.name}; choose another."
+            )
+        return [self._scan(scene) for scene in scenes]
+
+    def _scan(self, scene: Scene) -> Scan:
+        """Return a cloud with its input files."""
+        if not scene.path.is_dir():
+            return Scan(scene.name, (scene.path,), estimate_points(scene.path))
+        # In place, nothing but the coordinates decides what is added.
+        used = COPIED if self.out != self.root else ("coord",)
+        files = tuple(file for file in scene.files if file.stem in used)
+        return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
 
     def convert(
         self, scan: Scan, folder: Path, settings: PipelineConfig, begin: Callable[[str], None]
@@ -73,22 +98,28 @@ class FolderSource:
             FormatError: If it cannot be read or has no finite point, or a result not be written.
         """
         begin("read")
-        cloud = read_cloud(scan.inputs[0])
-        num_bad = len(cloud) - int(cloud.finite.sum())
-        if num_bad == len(cloud):
-            raise FormatError(
-                f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
-            )
+        first = scan.inputs[0]
+        is_file = first.parent.relative_to(self.root).as_posix() != scan.name
+        if is_file:
+            cloud = read_cloud(first)
+        else:
+            sample = read_pointcept_scene(first.parent)
+            cloud = Cloud(sample["coord"].numpy(), source=str(first.parent))
+        warnings = check_finite(cloud)
         seg = segment_planes(cloud.points, settings, on_stage=begin)
         begin("write")
-        files = _write(folder, cloud, seg)
-        warnings = [f"{num_bad:,} points are not finite"] if num_bad else []
-        if len(seg.planes.count) == 0:
-            warnings.append("no plane found")
-        return Converted(len(cloud), len(seg.planes.count), files, warnings=tuple(warnings))
+        if is_file:
+            files = _write(folder, cloud, seg)
+        else:
+            kept = {name: sample[name] for name in COPIED if name in sample}
+            origin = cloud.origin.tolist()
+            files = write_pointcept_scene(
+                folder, kept, seg, superpoint=self.superpoint, origin=origin
+            )
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
 
 
-def _write(folder: Path, cloud: Cloud, seg: Segmentation) -> tuple[str, ...]:
+def _write(folder: Path, cloud: Cloud, seg: Segmentation) -> list[str]:
     """Write the results of a cloud and return the names of the files."""
     arrays: dict[str, NDArray[Any]] = {
         "coord": cloud.coordinates,
@@ -101,7 +132,7 @@ def _write(folder: Path, cloud: Cloud, seg: Segmentation) -> tuple[str, ...]:
     for name, values in arrays.items():
         with atomic_path(folder / f"{name}.npy") as beside:
             np.save(beside, np.ascontiguousarray(values), allow_pickle=False)
+    table = describe_planes(seg.planes, origin=cloud.origin.tolist())
     with atomic_path(folder / "planes.json") as beside:
-        table = describe_planes(seg.planes, origin=cloud.origin.tolist())
-        beside.write_text(json.dumps(table) + "\n", encoding="utf-8")
-    return (*(f"{name}.npy" for name in arrays), "planes.json")
+        beside.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    return [*(f"{name}.npy" for name in arrays), "planes.json"]

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
@@ -30,7 +30,7 @@ def run_local(
     memory_limit: int,
     lock: DirectoryLock | None = None,
     work: Work = convert_scan,
-) -> Iterator[ScanReport | None]:
+) -> Generator[ScanReport | None, None, None]:
     """Convert scans in processes of this machine, the largest first.
 
     A scan starts when a worker is free and the estimates of all that run stay within the limit; one

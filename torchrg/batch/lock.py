@@ -33,8 +33,9 @@ class DirectoryLock:
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     lock = DirectoryLock(Path(folder))
-        ...     lock.release()
+        ...     with DirectoryLock(Path(folder)):
+        ...         print("nobody else writes here")
+        nobody else writes here
     """
 
     def __init__(self, folder: Path, *, patience: float = PATIENCE_SECONDS) -> None:
@@ -58,8 +59,10 @@ class DirectoryLock:
         os.ftruncate(self.descriptor, 0)
         os.pwrite(self.descriptor, f"process {os.getpid()} on {platform.node()}".encode(), 0)
 
-    def release(self) -> None:
-        """Give up this process's hold."""
+    def __enter__(self) -> "DirectoryLock":
+        return self
+
+    def __exit__(self, *error: object) -> None:
         os.close(self.descriptor)
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:

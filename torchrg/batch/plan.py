@@ -68,7 +68,7 @@ def make_plan(
     *,
     force: bool = False,
     threads: int = 1,
-    on_scan: Callable[[], None] = lambda: None,
+    on_scan: Callable[[], object] = lambda: None,
 ) -> Plan:
     """Find out which scans are to be converted.
 

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from torchrg.config import PipelineConfig
+from torchrg.errors import FormatError
+from torchrg.structures import Cloud
 
 
 @dataclass(frozen=True)
@@ -91,3 +93,24 @@ class Job:
     def folder(self) -> Path:
         """Where the results of the scan go."""
         return self.out / self.scan.name
+
+
+def check_finite(cloud: Cloud) -> tuple[str, ...]:
+    """Return a warning if some points of a cloud cannot be used.
+
+    Raises:
+        FormatError: If none can.
+
+    Example:
+        >>> import numpy as np
+        >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]])))
+        ('1 of 2 points are not finite; they stay in place, unlabelled',)
+    """
+    num_bad = len(cloud) - int(cloud.finite.sum())
+    if num_bad == len(cloud):
+        raise FormatError(
+            f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
+        )
+    if not num_bad:
+        return ()
+    return (f"{num_bad:,} of {len(cloud):,} points are not finite; they stay in place, unlabelled",)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 COMMANDS = {
     "segment": "label the planes of scans",
     "normals": "estimate normals and curvature of scans",
+    "convert": "segment every scan of a data set, on one machine or a cluster",
     "score": "compare labels and normals with a truth",
     "sample": "make a synthetic room with its truth",
     "view": "draw a cloud or a result",

@@ -1,0 +1,102 @@
+"""The Ray engine: each scan is a task, and what Ray knows about retries and nodes serves."""
+
+from collections.abc import Generator, Sequence
+from typing import Any
+
+from torchrg._optional import require
+from torchrg.batch.convert import ScanReport, convert_scan
+from torchrg.batch.local import BEAT_SECONDS, ONE_THREAD, Work
+from torchrg.batch.memory import memory_of_scan
+from torchrg.batch.scans import Job
+
+RETRIES = 3
+"""How often Ray tries a scan again whose process or node was lost."""
+OBJECT_STORE_BYTES = 100_000_000
+"""Only jobs and reports pass through Ray's object store, never points."""
+
+
+def run_ray(
+    jobs: Sequence[Job],
+    *,
+    workers: int | None = None,
+    memory_limit: int,
+    address: str | None = None,
+    work: Work = convert_scan,
+) -> Generator[ScanReport | None, None, None]:
+    """Convert scans as Ray tasks, the largest first.
+
+    Each task asks for one CPU and the memory that its scan is estimated to need, at most what the
+    largest node has, and Ray finds it a place. Inputs and outputs are files that every node sees
+    under the same path, and torchrg is installed on each.
+
+    Args:
+        jobs: The scans.
+        workers: Most tasks at a time. Default: as many as Ray has places for.
+        memory_limit: Memory of a cluster that is started here, in bytes.
+        address: Cluster to use. Default: one is started on this machine, and stopped at the end.
+        work: What to do with a job.
+
+    Yields:
+        A report of each scan when it ends, and None while there is none. Closing the iterator
+        cancels the tasks.
+
+    Raises:
+        MissingDependencyError: If Ray is not installed.
+    """
+    ray = require("ray", extra="ray", purpose="convert on a Ray cluster")
+    _connect(ray, address, workers, memory_limit)
+    pending: dict[Any, Job] = {}
+    try:
+        largest = max(int(node["Resources"].get("memory", 0)) for node in ray.nodes())
+        convert = ray.remote(num_cpus=1, max_retries=RETRIES)(_convert)
+        waiting = sorted(jobs, key=lambda job: job.scan.num_points)
+        while waiting or pending:
+            while waiting and (workers is None or len(pending) < workers):
+                job = waiting.pop()
+                memory = min(memory_of_scan(job.scan.num_points), largest)
+                pending[convert.options(memory=memory).remote(work, job)] = job
+            ready, _ = ray.wait(list(pending), num_returns=1, timeout=BEAT_SECONDS)
+            if not ready:
+                yield None
+            for reference in ready:
+                yield _collect(ray, reference, pending.pop(reference))
+    finally:
+        for reference in pending:
+            ray.cancel(reference, force=True)
+        ray.shutdown()
+
+
+def _connect(ray: Any, address: str | None, workers: int | None, memory_limit: int) -> None:  # noqa: ANN401
+    """Connect to a cluster, or start one on this machine."""
+    options: dict[str, Any] = {
+        "logging_level": "error",
+        "log_to_driver": False,
+        "runtime_env": {"env_vars": ONE_THREAD},
+    }
+    if address is None:
+        options |= {
+            "address": "local",
+            "num_cpus": workers,
+            "_memory": memory_limit,
+            "object_store_memory": OBJECT_STORE_BYTES,
+            "include_dashboard": False,
+        }
+    ray.init(**({"address": address} | options))
+
+
+def _convert(work: Work, job: Job) -> ScanReport:
+    """Convert a scan in one thread."""
+    import torch
+
+    torch.set_num_threads(1)
+    return work(job)
+
+
+def _collect(ray: Any, reference: Any, job: Job) -> ScanReport:  # noqa: ANN401
+    """Return the report of a task, of its loss if Ray could not finish it."""
+    try:
+        report: ScanReport = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        text = " ".join(str(error).split())
+        return ScanReport(job.scan.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
+    return report
