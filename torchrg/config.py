@@ -172,6 +172,8 @@ def preset_names() -> list[str]:
 def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
     """Read settings from a preset or a YAML file; what it leaves out has its default.
 
+    A file that begins with ``base: NAME`` leaves out what that preset says instead.
+
     Args:
         name_or_file: A name from :func:`preset_names`, or the path of a ``.yaml`` file.
 
@@ -185,16 +187,18 @@ def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
         >>> load_config("classic").growing.seed_rule
         'curvature'
     """
-    import yaml
-
     path = Path(name_or_file)
     if path.suffix not in (".yaml", ".yml"):
-        path = _preset_folder() / f"{name_or_file}.yaml"
-        if not path.is_file():
-            raise ConfigError(
-                f"load_config: expected preset to be one of {', '.join(preset_names())} or a .yaml "
-                f"file, got {str(name_or_file)!r}."
-            )
+        path = _preset_file(
+            str(name_or_file), expected="load_config: expected a .yaml file, or a preset, one of"
+        )
+    return build_config(PipelineConfig, _read_values(path), where=str(path))
+
+
+def _read_values(path: Path) -> object:
+    """Return the values of a settings file, on top of those of its base if it names one."""
+    import yaml
+
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -202,7 +206,24 @@ def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: expected YAML, got {reason}.") from error
-    return build_config(PipelineConfig, {} if values is None else values, where=str(path))
+    if not isinstance(values, dict) or "base" not in values:
+        return {} if values is None else values
+    base = _preset_file(values.pop("base"), expected=f"{path}: expected base to be one of")
+    return _merged(_read_values(base), values)
+
+
+def _merged(base: Any, values: Any) -> Any:  # noqa: ANN401
+    """Return nested mappings as one; what both have is taken from the second."""
+    if not isinstance(base, dict) or not isinstance(values, dict):
+        return values
+    return base | {key: _merged(base.get(key), value) for key, value in values.items()}
+
+
+def _preset_file(name: object, *, expected: str) -> Path:
+    """Return the file of a preset, or say what was expected."""
+    if name not in preset_names():
+        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}.")
+    return _preset_folder() / f"{name}.yaml"
 
 
 def build_config(kind: type[Settings], values: object, *, where: str) -> Settings:
