@@ -14,6 +14,8 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
 * ``read_pointcept_scene(folder)`` is a sample; ``write_pointcept_scene(folder, sample,
   segmentation, *, superpoint=False, origin=None)`` writes or completes a scene folder, and returns
   the names of the files it wrote.
+* ``RGBDFrames(frames)``, ``RGBDFrames.from_folder(root, layout)``: depth frames with cameras and
+  poses, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any (:class:`RGBDFrame`).
 * ``describe_planes(planes, *, origin=None)`` is the content of ``planes.json``.
 * ``collate_offset(samples)`` joins samples into a ragged batch.
 """
@@ -23,6 +25,8 @@ from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.folder import FolderOfClouds
 from torchrg.datasets.plane_table import describe_planes
 from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
+from torchrg.datasets.rgbd import RGBDFrames
+from torchrg.datasets.rgbd_frame import RGBDFrame
 from torchrg.datasets.rooms import CLASS_ORDERS, Room, RoomReport, Skipped, read_room
 from torchrg.datasets.s3dis import S3DIS
 from torchrg.datasets.scene_list import Scene
@@ -31,6 +35,8 @@ __all__ = [
     "CLASS_ORDERS",
     "S3DIS",
     "FolderOfClouds",
+    "RGBDFrame",
+    "RGBDFrames",
     "Repair",
     "Room",
     "RoomReport",

@@ -1,106 +1,111 @@
 """Depth frames with their cameras, poses and colours as a dataset."""
 
+import os
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchrg._checks import check_shapes
+from torchrg.datasets.rgbd_frame import RGBDFrame
 from torchrg.datasets.rgbd_images import read_color, read_depth
+from torchrg.datasets.rgbd_layouts import LAYOUTS
+from torchrg.datasets.scene_list import Scene
 from torchrg.errors import ConfigError
 
 
-@dataclass(frozen=True, eq=False)
-class RGBDFrame:
-    """Where one frame is, and what its numbers mean.
+class RGBDFrames(Dataset[Any]):
+    """Depth frames, read when they are asked for.
 
-    Args:
-        depth: Depth image: 16-bit gray PNG, or ``.npy`` of shape ``(H, W)``.
-        intrinsics: Camera matrix, shape ``(3, 3)``; the middle of the first pixel is at (0, 0).
-        depth_scale: Stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for metres.
-        color: Colour image registered to the depth, if there is one: PNG or JPEG.
-        pose: Matrix from camera to world coordinates, shape ``(4, 4)``, if it is known.
-        scene: Name of the recording.
-        name: Name of the frame, unique within its scene, fit for a file name.
-        no_depth: Stored value that means "no depth" beside 0, if there is one.
-    """
-
-    depth: Path
-    intrinsics: Tensor
-    depth_scale: float
-    color: Path | None = None
-    pose: Tensor | None = None
-    scene: str = ""
-    name: str = ""
-    no_depth: int | None = None
-
-    def __post_init__(self) -> None:
-        check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
-        if not 0 < self.depth_scale < float("inf"):
-            raise ConfigError(
-                f"RGBDFrame: expected depth_scale > 0, the stored value of one metre, got "
-                f"{self.depth_scale}."
-            )
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """The files that the frame is read from: depth, and colour if there is one."""
-        return (self.depth,) if self.color is None else (self.depth, self.color)
-
-    @property
-    def key(self) -> str:
-        """``scene/name``, or the name alone."""
-        return f"{self.scene}/{self.name}" if self.scene else self.name
-
-
-class RGBDFrames(Dataset[dict[str, Any]]):
-    """Depth frames: a list of :class:`RGBDFrame`, read when they are asked for.
-
-    An item is a dict of
+    A sample has
 
     * ``depth``: float32, shape ``(1, H, W)``, in metres along the optical axis; 0 where there is
       none;
     * ``intrinsics``: float64, shape ``(3, 3)``;
     * ``pose``: float64, shape ``(4, 4)``, camera to world; absent where it is not known;
-    * ``color``: uint8, shape ``(3, H, W)`` (of the colour image's own size); absent without one;
-    * ``scene`` and ``name``: the frame's.
+    * ``color``: uint8, shape ``(3, H, W)``, of the colour image's own size; absent without one;
+    * ``name``: the frame's.
 
-    Frames of one size are batched by torch's own ``default_collate``. What is left of a frame to
-    record (for a hash of its input, say) is in ``dataset.frames[i]``: ``files``, ``depth_scale``.
+    Frames of one size are batched by torch's own ``default_collate``.
 
     Args:
-        frames: The frames; see :mod:`torchrg.datasets.rgbd_layouts` for readers of the folders of
-            TUM, ICL-NUIM, ScanNet and 7-Scenes.
-        transform: Called with each item, for example :class:`torchrg.transforms.SegmentDepth`.
+        frames: The frames, in order.
+        transform: Called with each sample, for example :class:`torchrg.transforms.SegmentDepth`.
+
+    Attributes:
+        frames: The frames.
+        scenes: Name, depth image and all input files of each frame.
+
+    Raises:
+        ConfigError: If two frames have one name.
 
     Example:
         >>> import numpy as np, tempfile
+        >>> from pathlib import Path
         >>> folder = Path(tempfile.mkdtemp())
         >>> np.save(folder / "a.npy", np.full((4, 6), 1500))
         >>> frame = RGBDFrame(folder / "a.npy", torch.eye(3), depth_scale=1000, name="a")
         >>> sample = RGBDFrames([frame])[0]
         >>> sample["depth"].shape, float(sample["depth"][0, 0, 0]), sorted(sample)
-        (torch.Size([1, 4, 6]), 1.5, ['depth', 'intrinsics', 'name', 'scene'])
+        (torch.Size([1, 4, 6]), 1.5, ['depth', 'intrinsics', 'name'])
     """
 
     def __init__(
         self,
         frames: Sequence[RGBDFrame],
         *,
-        transform: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         self.frames = tuple(frames)
         self.transform = transform
+        self.scenes = [Scene(frame.name, frame.depth, frame.files) for frame in self.frames]
+        twice = [name for name, count in Counter(s.name for s in self.scenes).items() if count > 1]
+        if twice:
+            raise ConfigError(
+                f"RGBDFrames: expected frames of different names, got {twice[0]!r} twice."
+            )
+
+    @classmethod
+    def from_folder(
+        cls,
+        root: str | os.PathLike[str],
+        layout: str,
+        *,
+        intrinsics: Tensor | None = None,
+        depth_scale: float | None = None,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> "RGBDFrames":
+        """Find the frames of a folder.
+
+        Args:
+            root: The folder: of one recording, or of several beside each other.
+            layout: A name from :data:`torchrg.datasets.rgbd_layouts.LAYOUTS`: ``tum``,
+                ``icl-nuim``, ``scannet``, ``7-scenes``, or ``images`` for any folder of depth
+                images.
+            intrinsics: Camera matrix, shape ``(3, 3)``. Default: the layout's; ``images`` has none.
+            depth_scale: Stored value of one metre. Default: the layout's; ``images`` has none.
+            transform: Called with each sample.
+
+        Returns:
+            The dataset, its frames in natural order.
+
+        Raises:
+            ConfigError: If there is no such layout, or it needs intrinsics or a scale.
+            FormatError: If there are no such frames in the folder, or a file is damaged.
+        """
+        if layout not in LAYOUTS:
+            names = ", ".join(sorted(LAYOUTS))
+            raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
+        frames = LAYOUTS[layout](root, intrinsics=intrinsics, depth_scale=depth_scale)
+        return cls(frames, transform=transform)
 
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        """Read a frame.
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
+        """Return a sample, transformed.
 
         Raises:
             FormatError: If a file is missing, damaged, or not a depth image.
@@ -110,7 +115,6 @@ class RGBDFrames(Dataset[dict[str, Any]]):
         sample: dict[str, Any] = {
             "depth": depth[None],
             "intrinsics": frame.intrinsics.to(torch.float64),
-            "scene": frame.scene,
             "name": frame.name,
         }
         if frame.pose is not None:
