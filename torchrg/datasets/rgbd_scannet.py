@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchrg.datasets.rgbd_frame import RGBDFrame
 from torchrg.datasets.rgbd_listing import frame_name, image_beside, numbered_images, recordings
+from torchrg.datasets.rgbd_poses import read_matrix
 from torchrg.datasets.scene_list import listed
 from torchrg.transforms.depth_camera import make_intrinsics
 
