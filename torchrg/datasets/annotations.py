@@ -135,15 +135,15 @@ def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
         )
     except arrow.ArrowInvalid:
         return None
-    return [column.to_numpy() for column in table.columns]
+    return [column.to_numpy() for column in table.columns] if table.num_rows else None
 
 
 def _are_points(table: list[NDArray[np.float64]]) -> bool:
     """Whether columns hold coordinates that float32 holds, and colours that fit a byte."""
-    limits = [(-LARGEST, LARGEST)] * 3 + [(-0.5, 255.5)] * 3
+    lows, highs = [-LARGEST] * 3 + [0.0] * 3, [LARGEST] * 3 + [255.0] * 3
     return all(
-        bool(low <= column.min() and column.max() <= high)
-        for column, (low, high) in zip(table, limits, strict=True)
+        bool(low <= np.rint(column.min()) and np.rint(column.max()) <= high)
+        for column, low, high in zip(table, lows, highs, strict=True)
     )
 
 

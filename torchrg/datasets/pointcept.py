@@ -74,7 +74,7 @@ def write_pointcept_scene(
 
     What is there and was not written by this function is never changed: the arrays must have as
     many rows, and the coordinates must be those of the sample. What it wrote itself, as
-    ``planes.json`` says, is replaced. All files are complete before the first one appears.
+    ``planes.json`` says, is replaced or removed. All files are complete before the first appears.
 
     Args:
         folder: The scene, ``OUT/Area_i/<room>``; it is made.
@@ -104,6 +104,8 @@ def write_pointcept_scene(
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FormatError(f"{place}: cannot be made: {error.strerror or error}.") from error
+    for name in owned - set(arrays):
+        (place / f"{name}.npy").unlink(missing_ok=True)
     with ExitStack() as stack:
         # Files take their places in reverse: the claim on them first, the coordinates last.
         beside = [stack.enter_context(atomic_path(place / f"{name}.npy")) for name in new]
@@ -146,8 +148,9 @@ def _short(labels: NDArray[Any]) -> NDArray[Any]:
 def _owned(place: Path) -> set[str]:
     """Return the names of the arrays that torchrg wrote here."""
     try:
-        return set(json.loads((place / TABLE).read_text(encoding="utf-8"))["written"])
-    except FileNotFoundError:
+        written = json.loads((place / TABLE).read_text(encoding="utf-8"))["written"]
+        return set(written) & set(POINT_ARRAYS)
+    except (FileNotFoundError, NotADirectoryError):
         return set()
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise FormatError(

@@ -1,0 +1,61 @@
+"""Ragged batches keep every point, and say where each cloud ends."""
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from torchrg.datasets import collate_offset
+from torchrg.errors import ShapeError
+
+
+def sample_of(count, name):
+    return {
+        "coord": torch.rand(count, 3),
+        "segment": np.arange(count),
+        "origin": torch.zeros(1, 3),
+        "name": name,
+        "scale": 0.5,
+        "area": torch.tensor(count),
+    }
+
+
+def test_points_are_joined_and_names_listed():
+    samples = [sample_of(2, "a"), sample_of(0, "b"), sample_of(3, "c")]
+    batch = collate_offset(samples)
+    assert batch["offset"].tolist() == [2, 2, 5]
+    assert batch["offset"].dtype == torch.int64
+    begin = 0
+    for sample, end in zip(samples, batch["offset"], strict=True):
+        assert torch.equal(batch["coord"][begin:end], sample["coord"])
+        assert batch["segment"][begin:end].tolist() == sample["segment"].tolist()
+        begin = end
+    assert batch["name"] == ["a", "b", "c"]
+    assert batch["origin"].shape == (3, 3)
+    assert batch["scale"].tolist() == [0.5] * 3
+    assert batch["area"].tolist() == [2, 0, 3]
+
+
+def test_batches_join_to_batches():
+    samples = [sample_of(count, "x") for count in (2, 3, 4)]
+    twice = collate_offset([collate_offset(samples[:2]), collate_offset(samples[2:])])
+    assert twice["offset"].tolist() == collate_offset(samples)["offset"].tolist() == [2, 5, 9]
+
+
+def test_other_names_of_the_coordinates():
+    assert collate_offset([{"pos": torch.zeros(4, 3)}], coord="pos")["offset"].tolist() == [4]
+
+
+def test_it_serves_a_data_loader():
+    samples = [sample_of(count, str(count)) for count in (1, 2, 3)]
+    batches = list(DataLoader(samples, batch_size=2, collate_fn=collate_offset))
+    assert [batch["offset"].tolist() for batch in batches] == [[1, 3], [3]]
+
+
+def test_samples_that_differ_are_refused():
+    with pytest.raises(ShapeError, match="got color in only one of samples 0 and 1"):
+        collate_offset([{"coord": torch.zeros(1, 3)}, {"coord": torch.zeros(1, 3), "color": 1}])
+    with pytest.raises(ShapeError, match="expected samples with 'coord', got pos"):
+        collate_offset([{"pos": torch.zeros(1, 3)}])
+    with pytest.raises(ShapeError, match="got none"):
+        collate_offset([])

@@ -1,0 +1,116 @@
+"""A room reads as its objects in natural order, whatever lies beside them."""
+
+import numpy as np
+import pytest
+
+from tests.datasets.s3dis_tree import (
+    BROKEN,
+    digest,
+    rows_of,
+    text_of,
+    write_clean_room,
+    write_objects,
+)
+from torchrg.datasets import CLASS_ORDERS, read_room
+from torchrg.errors import ConfigError, FormatError
+
+pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
+
+
+@pytest.fixture
+def room(tmp_path):
+    return tmp_path / "Area_5" / "office_36"
+
+
+def test_a_room_with_every_defect_reads_exactly(room):
+    """The order of the objects is written out; glob, os.listdir and sorted would all differ."""
+    rows = {name: rows_of(i, 40 + i) for i, name in enumerate("abcdef")}
+    broken = b"\n".join(BROKEN) + b"\n"
+    write_objects(
+        room,
+        {
+            "wall_10.txt": text_of(rows["a"]),
+            "wall_2.txt": text_of(rows["b"], end="\r\n"),
+            "ceiling_1.txt": text_of(rows["c"], color="%.6f") + broken,
+            "stairs_1.txt": text_of(rows["d"]),
+            "chair_1.txt": text_of(rows["e"]),
+            "wall_3.txt": text_of(rows["f"]),
+            "wall_3 (1).txt": text_of(rows["f"]),
+            "wall_2 (2).txt": b"not even numbers",
+            "Icon\r": b"",
+            ".DS_Store": b"\0\1",
+            "._wall_2.txt": b"\0\5\x16\7",
+            "notes.txt": b"hello",
+        },
+    )
+    before = digest(room)
+    found = read_room(room)
+    # ceiling_1, chair_1, stairs_1, wall_2, wall_3, wall_10
+    parts = [np.vstack([rows["c"], list(BROKEN.values())]), *(rows[name] for name in "edbfa")]
+    points = np.vstack(parts)
+    counts = [len(part) for part in parts]
+    assert np.array_equal(found.coord, points[:, :3].astype(np.float32))
+    assert np.array_equal(found.color, points[:, 3:])
+    assert np.array_equal(found.segment, np.repeat([0, 8, 12, 2, 2, 2], counts))
+    assert np.array_equal(found.instance, np.repeat(range(6), counts))
+    assert (found.segment.dtype, found.instance.dtype) == (np.int16, np.int16)
+
+    repairs = [(r.file.name, r.line, r.before) for r in found.report.repairs]
+    assert repairs == [("ceiling_1.txt", 43 + i, line) for i, line in enumerate(BROKEN)]
+    skipped = {s.file.name: s.reason for s in found.report.skipped}
+    assert skipped == {
+        "wall_3 (1).txt": "a copy of wall_3.txt",
+        "wall_2 (2).txt": "a copy of wall_2.txt by its name, but it differs",
+        "Icon\r": "not named CLASS_NUMBER.txt",
+        ".DS_Store": "not named CLASS_NUMBER.txt",
+        "._wall_2.txt": "not named CLASS_NUMBER.txt",
+        "notes.txt": "not named CLASS_NUMBER.txt",
+    }
+    assert [path.name for path in found.report.as_clutter] == ["stairs_1.txt"]
+    assert digest(room) == before
+
+
+def test_a_copy_without_its_original_is_an_object(room):
+    rows = write_clean_room(room, 1, {"wall_3 (1)": 5, "wall_4": 6})
+    found = read_room(room)
+    assert np.array_equal(found.coord, np.vstack(list(rows.values()))[:, :3].astype(np.float32))
+    assert found.report.skipped == ()
+
+
+def test_class_orders_name_the_same_objects(room):
+    write_clean_room(room, 2, {f"{name}_1": 3 for name in CLASS_ORDERS["pointcept"]})
+    names = {
+        order: [classes[i] for i in read_room(room, class_order=order).segment]
+        for order, classes in CLASS_ORDERS.items()
+    }
+    assert names["pointcept"] == names["spt"] == sorted(names["spt"])
+
+
+def test_class_orders_are_those_of_the_two_families():
+    both = ("ceiling", "floor", "wall", "beam", "column", "window", "door")
+    assert CLASS_ORDERS["pointcept"] == (
+        *both, "table", "chair", "sofa", "bookcase", "board", "clutter",
+    )  # fmt: skip
+    assert CLASS_ORDERS["spt"] == (
+        *both, "chair", "table", "bookcase", "sofa", "board", "clutter",
+    )  # fmt: skip
+
+
+def test_a_bad_line_stops_the_room_and_is_named(room):
+    write_objects(room, {"wall_1.txt": b"1 2 3 4 5 6\n1 2 3 4 5\n"})
+    with pytest.raises(FormatError, match=r"wall_1\.txt: line 2: .* got b'1 2 3 4 5'"):
+        read_room(room)
+
+
+def test_rooms_without_objects_are_refused(room):
+    room.mkdir(parents=True)
+    with pytest.raises(FormatError, match="expected a folder Annotations"):
+        read_room(room)
+    write_objects(room, {"notes.txt": b"1 2 3 4 5 6"})
+    with pytest.raises(FormatError, match=r"expected objects as CLASS_NUMBER\.txt"):
+        read_room(room)
+
+
+def test_an_unknown_class_order_is_refused(room):
+    with pytest.raises(ConfigError, match="expected class_order to be one of pointcept, spt"):
+        read_room(room, class_order="kpconv")

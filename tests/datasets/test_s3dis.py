@@ -1,0 +1,156 @@
+"""The data set lists rooms in natural order, keeps a cache, and leaves the release alone."""
+
+import os
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from tests.datasets.s3dis_tree import digest, rows_of, text_of, write_clean_room, write_objects
+from torchrg.datasets import S3DIS, read_room
+from torchrg.datasets import room_cache as room_cache_module
+from torchrg.errors import ConfigError, FormatError
+
+pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
+pytestmark = pytest.mark.filterwarnings("ignore:.*rooms, got:UserWarning")
+
+
+@pytest.fixture
+def root(tmp_path):
+    root = tmp_path / "Stanford3dDataset_v1.2_Aligned_Version"
+    for room, seed in (("office_10", 1), ("office_2", 2), ("WC_1", 3)):
+        write_clean_room(root / "Area_1" / room, seed, {"wall_1": 30, "chair_2": 20})
+    write_objects(
+        root / "Area_3" / "hallway_1",
+        {"floor_1.txt": text_of(rows_of(9, 10)) + b"1 2 3 4 5 \x16\n", "x.md": b""},
+    )
+    (root / "Area_1" / ".DS_Store").write_bytes(b"\0")
+    return root
+
+
+def test_rooms_are_in_natural_order_with_all_their_files(root):
+    data = S3DIS(root, (1, 3), cache=None)
+    names = [scene.name for scene in data.scenes]
+    assert names == ["Area_1/office_2", "Area_1/office_10", "Area_1/WC_1", "Area_3/hallway_1"]
+    assert len(data) == 4
+    folder = root / "Area_1" / "office_2" / "Annotations"
+    assert data.scenes[0].path == folder.parent
+    assert data.scenes[0].files == (folder / "chair_2.txt", folder / "wall_1.txt")
+
+
+def test_a_sample_is_the_room(root):
+    data = S3DIS(root, [3], cache=None)
+    sample, room = data[0], read_room(root / "Area_3" / "hallway_1")
+    assert list(sample) == ["coord", "color", "segment", "instance", "name"]
+    assert sample["name"] == "Area_3/hallway_1"
+    dtypes = [torch.float32, torch.uint8, torch.int64, torch.int64]
+    for i, name in enumerate(("coord", "color", "segment", "instance")):
+        assert sample[name].dtype == dtypes[i]
+        assert np.array_equal(sample[name].numpy(), getattr(room, name))
+    assert data.classes[sample["segment"][0]] == "floor"
+
+
+def test_the_transform_is_called_with_the_sample(root):
+    data = S3DIS(root, [3], cache=None, transform=lambda sample: sample["name"])
+    assert data[0] == "Area_3/hallway_1"
+
+
+def test_data_sets_survive_pickling(root):
+    data = pickle.loads(pickle.dumps(S3DIS(root, [1], cache=None)))
+    assert data[2]["name"] == "Area_1/WC_1"
+
+
+@pytest.mark.parametrize("class_order", ["pointcept", "spt"])
+def test_the_cache_gives_the_same_room_and_report(root, tmp_path, class_order):
+    before = digest(root)
+    cached = S3DIS(root, (1, 3), cache=tmp_path / "cache", class_order=class_order)
+    plain = S3DIS(root, (1, 3), cache=None, class_order=class_order)
+    for _ in range(2):
+        for i in range(4):
+            first, second = cached.read_room(i), plain.read_room(i)
+            assert first.report == second.report
+            for a, b in zip(first[:4], second[:4], strict=True):
+                assert a.dtype == b.dtype
+                assert np.array_equal(a, b)
+    assert cached.read_room(3).report.repairs[0].before == b"1 2 3 4 5 \x16"
+    assert digest(root) == before
+
+
+def test_the_text_is_read_once(root, tmp_path, monkeypatch):
+    S3DIS(root, [1], cache=tmp_path)[0]
+    monkeypatch.setattr(room_cache_module, "read_room", None)
+    S3DIS(root, [1], cache=tmp_path)[0]
+    with pytest.raises(TypeError):
+        S3DIS(root, [1], cache=tmp_path)[1]
+
+
+def test_a_changed_file_is_read_again(root, tmp_path):
+    data = S3DIS(root, [3], cache=tmp_path)
+    assert len(data[0]["coord"]) == 11
+    file = data.scenes[0].files[0]
+    content = file.read_bytes()
+    file.write_bytes(content + b"7 8 9 1 2 3\n")
+    assert data[0]["coord"][11].tolist() == [7, 8, 9]
+    # The same size, another time of change.
+    file.write_bytes(content + b"6 8 9 1 2 3\n")
+    os.utime(file, ns=(1, 1))
+    assert data[0]["coord"][11].tolist() == [6, 8, 9]
+
+
+def test_changing_a_sample_changes_no_cache(root, tmp_path):
+    data = S3DIS(root, [3], cache=tmp_path)
+    data[0]
+    before = data[0]["coord"].clone()
+    data[0]["coord"].zero_()
+    assert torch.equal(data[0]["coord"], before)
+
+
+@pytest.mark.parametrize("damage", [b"", b"\x93NUMPY\1\0", None])
+@pytest.mark.parametrize("name", ["coord.npy", "report.json"])
+def test_a_damaged_cache_is_made_again(root, tmp_path, name, damage):
+    data = S3DIS(root, [3], cache=tmp_path / "cache")
+    before = data[0]["coord"].clone()
+    (file,) = (tmp_path / "cache").rglob(name)
+    file.unlink() if damage is None else file.write_bytes(damage)
+    assert torch.equal(data[0]["coord"], before)
+    assert file.stat().st_size > 10
+    assert not list((tmp_path / "cache").rglob(".*"))
+
+
+def test_a_cut_array_is_never_mapped_beyond_its_end(root, tmp_path):
+    data = S3DIS(root, [3], cache=tmp_path)
+    before = data[0]["coord"].clone()
+    (file,) = tmp_path.rglob("coord.npy")
+    file.write_bytes(file.read_bytes()[:-12])
+    assert torch.equal(data[0]["coord"], before)
+
+
+def test_a_cache_that_cannot_be_written_is_named(root, tmp_path):
+    (tmp_path / "cache").touch()
+    with pytest.raises(FormatError, match=r"cannot be written: .*choose another folder with cache"):
+        S3DIS(root, [3], cache=tmp_path / "cache")[0]
+
+
+def test_a_room_folder_without_annotations_is_named_in_the_warning(root):
+    (root / "Area_3" / "lobby_1").mkdir()
+    with pytest.warns(UserWarning, match=r"expected 23 rooms, got 1 \(lobby_1: no Annotations\)"):
+        assert len(S3DIS(root, [3], cache=None)) == 1
+
+
+def test_a_complete_area_warns_of_nothing(tmp_path):
+    for i in range(23):
+        write_objects(tmp_path / "Area_3" / f"office_{i}", {"wall_1.txt": b"1 2 3 4 5 6\n"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(S3DIS(tmp_path, [3], cache=None)) == 23
+
+
+def test_missing_areas_are_errors_with_the_repair(root):
+    with pytest.raises(FormatError, match="expected a folder Area_2, got none; choose areas"):
+        S3DIS(root)
+    with pytest.raises(FormatError, match=r"got none; pass .*Aligned_Version"):
+        S3DIS(root.parent)
+    with pytest.raises(ConfigError, match="expected areas among 1, 2, 3, 4, 5, 6, got 7"):
+        S3DIS(root, [7])
