@@ -5,7 +5,7 @@ from pathlib import Path
 
 LAYERS = [
     {"errors"},
-    {"_checks", "_optional", "structures"},
+    {"_checks", "_chunks", "_optional", "structures"},
     {"linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

@@ -11,10 +11,15 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
+from torchrg.neighbors.cells import search_cells
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
 _QUERY_CHUNK = 65536
+_MIN_FOR_CELLS = 2000
+"""Points below which a tree is as fast as cells."""
+
+_SAMPLE_SIZE = 1000
 
 
 def search_knn(
@@ -119,14 +124,16 @@ def _search_cloud(
     is_first[1:] = (points[1:] != points[:-1]).any(axis=1)
     starts = np.flatnonzero(is_first)
     counts = np.diff(starts, append=len(points))
-    places = points[starts]
-    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-    for begin in range(0, len(places), _QUERY_CHUNK):
-        stop = min(begin + _QUERY_CHUNK, len(places))
-        distances, found = _query(tree, places[begin:stop], min(k, len(places)))
-        rows = np.arange(starts[begin], starts[begin] + counts[begin:stop].sum())
+    places = points[starts].astype(np.float64)
+
+    def store(
+        queried: NDArray[np.int64], distances: NDArray[np.float64], found: NDArray[np.int64]
+    ) -> None:
+        rows = queried
         if len(places) < len(points):
-            distances, found = _restore_duplicates(distances, found, starts, counts, begin, rows, k)
+            rows, distances, found = _restore_duplicates(
+                queried, distances, found, starts, counts, k
+            )
         if outside is not None:
             too_far = distances > max_distance
             found = np.where(too_far, rows[:, None], found)
@@ -134,6 +141,16 @@ def _search_cloud(
         indices[into] = (found if order is None else order[found]) + first_row
         if outside is not None:
             outside[into] = too_far
+
+    width = min(k, len(places))
+    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+    left = np.arange(len(places))
+    if len(places) >= _MIN_FOR_CELLS:
+        sample = places[:: -(-len(places) // _SAMPLE_SIZE)]
+        left = search_cells(places, k, tree.query(sample, [k])[0][:, 0], store)
+    for begin in range(0, len(left), _QUERY_CHUNK):
+        rows = left[begin : begin + _QUERY_CHUNK]
+        store(rows, *_query(tree, places[rows], width))
 
 
 def _query(
@@ -171,26 +188,26 @@ def _sort_ties(
 
 
 def _restore_duplicates(
+    queried: NDArray[np.int64],
     distances: NDArray[np.float64],
-    places: NDArray[np.int64],
+    found: NDArray[np.int64],
     starts: NDArray[np.int64],
     counts: NDArray[np.int64],
-    first_place: int,
-    rows: NDArray[np.int64],
     k: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Replace places by all their points: the nearest k, the point itself first."""
-    before = np.minimum(np.cumsum(counts[places], axis=1), k)
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    """Replace places by all their points: their rows, and the nearest k, the point itself first."""
+    before = np.minimum(np.cumsum(counts[found], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
-    position = np.arange(len(places) * k) - np.repeat(np.cumsum(taken) - taken, taken)
-    found = (np.repeat(starts[places.ravel()], taken) + position).reshape(len(places), k)
-    far = np.repeat(distances.ravel(), taken).reshape(len(places), k)
-    own_place = np.repeat(np.arange(len(places)), counts[first_place : first_place + len(places)])
-    found, far = found[own_place], far[own_place]
-    rank = rows - starts[first_place + own_place]
+    position = np.arange(len(found) * k) - np.repeat(np.cumsum(taken) - taken, taken)
+    points = (np.repeat(starts[found.ravel()], taken) + position).reshape(len(found), k)
+    far = np.repeat(distances.ravel(), taken).reshape(len(found), k)
+    place = np.repeat(np.arange(len(queried)), counts[queried])
+    rank = np.arange(len(place)) - np.searchsorted(place, place)
+    rows = starts[queried][place] + rank
+    points, far = points[place], far[place]
     later = np.flatnonzero(rank)
     if len(later):
         shift = np.arange(k) <= rank[later, None]
-        found[later] = np.where(shift, np.roll(found[later], 1, axis=1), found[later])
-        found[later, 0] = rows[later]
-    return far, found
+        points[later] = np.where(shift, np.roll(points[later], 1, axis=1), points[later])
+        points[later, 0] = rows[later]
+    return rows, far, points

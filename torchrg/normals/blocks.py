@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrg.robust.chunks import chunks_of, run_chunks
+from torchrg._chunks import chunks_of, run_chunks
 
 
 def each_block(

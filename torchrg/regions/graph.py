@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrg.robust.chunks import chunks_of, run_chunks
+from torchrg._chunks import chunks_of, run_chunks
 
 
 class EdgeLists(NamedTuple):

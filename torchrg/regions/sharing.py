@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.robust.chunks import chunks_of, run_chunks
+from torchrg._chunks import chunks_of, run_chunks
 from torchrg.structures import Neighbors
 
 _BLOCK_SIZE = 256

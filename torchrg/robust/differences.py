@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.robust.chunks import chunks_of, share_chunks
+from torchrg._chunks import chunks_of, share_chunks
 
 _CHUNK_BYTES = 2**21
 _NETWORK = 512

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._chunks import chunks_of, run_chunks
 from torchrg.errors import ConfigError
-from torchrg.robust.chunks import chunks_of, run_chunks
 from torchrg.robust.estimate import Estimate
 from torchrg.robust.flats import find_flats, refine_flat
 from torchrg.robust.frame import Frame, to_lanes
