@@ -137,7 +137,7 @@ class StageClock:
 def _reason(error: Exception) -> str:
     """Return an error as one line that names the file where it can."""
     if _is_out_of_memory(error):
-        return "out of memory; lower chunk_size in the settings, or use a machine with more."
+        return "out of memory; lower --chunk-size, or use a machine with more."
     if isinstance(error, OSError):
         return f"{error.filename or 'a file'}: {error.strerror or error}."
     text = " ".join(str(error).split())

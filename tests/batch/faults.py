@@ -1,0 +1,79 @@
+"""A source whose input files say what shall go wrong, importable by worker processes."""
+
+import errno
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchrg.batch.scans import Converted, Job, Scan
+from torchrg.config import PipelineConfig
+from torchrg.errors import FormatError
+from torchrg.io import atomic_path
+
+
+@dataclass(frozen=True)
+class FaultySource:
+    """Text files, named ``<points>_<anything>``; the text is a behaviour and becomes the result."""
+
+    root: Path
+    bytes_per_point: int = 1
+
+    def describe(self):
+        return {"kind": "faulty"}
+
+    def list_scans(self):
+        paths = sorted(self.root.iterdir())
+        return [Scan(path.stem, (path,), int(path.stem.split("_")[0])) for path in paths]
+
+    def convert(self, scan, folder, settings, begin):
+        begin("read")
+        behavior = scan.inputs[0].read_text()
+        with (self.root.parent / "log").open("a") as log:
+            log.write(f"{scan.name} {os.getpid()}\n")
+        act(behavior, self.root.parent / f"{scan.name}.once")
+        begin("write")
+        with atomic_path(folder / "result.txt") as beside:
+            beside.write_text(behavior)
+            if behavior == "kill while writing":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if behavior == "full":
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if behavior == "slow writing":
+                time.sleep(60)
+        with (self.root.parent / "log").open("a") as log:
+            log.write(f"{scan.name} done\n")
+        return Converted(scan.num_points, 1, ("result.txt",), warnings=(f"was {behavior}",))
+
+
+def act(behavior, once):
+    """Do what a file says, once or always."""
+    if behavior == "kill" or (behavior == "kill once" and not once.exists()):
+        once.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if behavior == "corrupt":
+        raise FormatError("room.txt: line 7: expected six numbers, got five.")
+    if behavior == "bug":
+        raise KeyError("what")
+    if behavior == "memory":
+        raise MemoryError
+    if behavior == "torch memory":
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] can't allocate memory: 1e18 bytes")
+    if behavior == "threads":
+        import torch
+
+        assert torch.get_num_threads() == 1
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+    if behavior.startswith("sleep"):
+        time.sleep(float(behavior.split()[1]))
+
+
+def make_jobs(folder, behaviors):
+    """Return jobs for scans by name, with the behaviour of each."""
+    (folder / "in").mkdir(parents=True, exist_ok=True)
+    for name, behavior in behaviors.items():
+        (folder / "in" / f"{name}.txt").write_text(behavior)
+    source = FaultySource(folder / "in")
+    settings = PipelineConfig()
+    return [Job(source, scan, folder / "out", settings) for scan in source.list_scans()]

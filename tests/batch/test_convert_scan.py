@@ -1,0 +1,70 @@
+"""Converting one scan: what goes wrong is in the report, and files are whole or not there."""
+
+import json
+
+import pytest
+
+from torchrg.batch.convert import convert_scan
+from torchrg.batch.done import RECORD, reason_to_convert
+
+
+def test_the_record_tells_what_was_made_from_what(faults, tmp_path):
+    (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
+    report = convert_scan(job)
+    assert (report.status, report.num_points, report.warnings) == ("converted", 12, ("was plain",))
+    assert set(report.seconds) == {"hash", "read", "write", "record"}
+    assert report.peak_memory > 1e7
+    record = json.loads((job.folder / RECORD).read_text())
+    assert record["inputs"][0]["name"] == "12_a.txt"
+    assert set(record["outputs"]) == {"result.txt"}
+    assert record["warnings"] == ["was plain"]
+    text = json.dumps(record)
+    assert not any(word in text for word in ("seconds", "host", str(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("behavior", "reason", "is_foreseen"),
+    [
+        ("corrupt", "room.txt: line 7: expected six numbers, got five.", True),
+        ("bug", "KeyError: 'what'", False),
+        ("memory", "out of memory; lower --chunk-size", True),
+        ("torch memory", "out of memory; lower --chunk-size", True),
+        ("full", "result.txt: cannot be written: No space left on device.", True),
+    ],
+)
+def test_what_goes_wrong_is_in_the_report(faults, tmp_path, behavior, reason, is_foreseen):
+    (job,) = faults.make_jobs(tmp_path, {"12_a": behavior})
+    report = convert_scan(job)
+    assert report.status == "failed"
+    assert reason in report.reason
+    assert (report.details == "") == is_foreseen
+    assert "Traceback" in report.details or is_foreseen
+    assert report.disk_full == (behavior == "full")
+    assert not job.folder.exists()
+
+
+def test_an_input_that_is_gone_is_named(faults, tmp_path):
+    (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
+    job.scan.inputs[0].unlink()
+    assert convert_scan(job).reason == f"{job.scan.inputs[0]}: No such file or directory."
+
+
+def test_a_failure_leaves_no_record_of_an_earlier_success(faults, tmp_path):
+    (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
+    convert_scan(job)
+    job.scan.inputs[0].write_text("corrupt")
+    assert convert_scan(job).status == "failed"
+    assert reason_to_convert(job) == "new"
+
+
+def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
+    (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
+    convert_scan(job)
+    record = json.loads((job.folder / RECORD).read_text())
+    record["outputs"]["superpoint.npy"] = {"bytes": 0, "sha256": ""}
+    (job.folder / RECORD).write_text(json.dumps(record))
+    for name in ("superpoint.npy", ".result.0123abcd.txt", "theirs.npy"):
+        (job.folder / name).touch()
+    convert_scan(job)
+    names = {path.name for path in job.folder.iterdir()}
+    assert names == {"result.txt", RECORD, "theirs.npy"}

@@ -1,0 +1,87 @@
+"""When a scan counts as done: same input, settings, options, version, and results untouched."""
+
+import json
+import os
+from dataclasses import replace
+
+import pytest
+
+import torchrg
+from torchrg.batch.convert import convert_scan
+from torchrg.batch.done import RECORD, reason_to_convert
+from torchrg.batch.plan import list_jobs, make_plan
+from torchrg.config import load_config
+from torchrg.errors import ConfigError
+
+
+@pytest.fixture
+def job(faults, tmp_path):
+    (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
+    assert reason_to_convert(job) == "new"
+    assert convert_scan(job).status == "converted"
+    return job
+
+
+def test_a_scan_is_done_until_something_changes(job):
+    assert reason_to_convert(job) == ""
+
+
+def test_other_settings_are_noticed_but_not_those_that_change_no_result(job):
+    assert reason_to_convert(replace(job, settings=load_config("classic"))) == "settings changed"
+    assert reason_to_convert(replace(job, settings=replace(job.settings, chunk_size=7))) == ""
+
+
+def test_another_input_is_noticed_even_at_the_same_size_and_time(job):
+    path = job.scan.inputs[0]
+    before = path.stat()
+    path.write_text("PLAIN")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert reason_to_convert(job) == "input changed"
+    path.unlink()
+    assert reason_to_convert(job) == "input cannot be read"
+
+
+def test_another_version_is_noticed(job, monkeypatch):
+    monkeypatch.setattr(torchrg, "__version__", "99.0")
+    assert reason_to_convert(job) == "version changed"
+
+
+def test_results_that_changed_or_are_gone_are_noticed(job):
+    result = job.folder / "result.txt"
+    result.write_text("plaim")
+    assert reason_to_convert(job) == "result.txt changed"
+    result.unlink()
+    assert reason_to_convert(job) == "result.txt missing"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"outputs": 3}', "\x00"])
+def test_a_damaged_record_is_none(job, text):
+    (job.folder / RECORD).write_text(text)
+    assert reason_to_convert(job) == "new"
+
+
+def test_records_hold_no_place_or_time(faults, tmp_path):
+    records = []
+    for folder in ("here", "there"):
+        (job,) = faults.make_jobs(tmp_path / folder, {"12_a": "plain"})
+        convert_scan(job)
+        records.append((job.folder / RECORD).read_bytes())
+    assert records[0] == records[1]
+    assert json.loads(records[0])["points"] == 12
+
+
+def test_the_plan_says_why(faults, tmp_path):
+    jobs = faults.make_jobs(tmp_path, {"12_a": "plain", "13_b": "plain"})
+    convert_scan(jobs[0])
+    plan = make_plan(jobs)
+    assert plan.reasons == {"13_b": "new"}
+    assert [job.scan.name for job in plan.done] == ["12_a"]
+    assert make_plan(jobs, force=True).reasons == {"12_a": "forced", "13_b": "forced"}
+
+
+def test_only_the_scans_that_match_are_listed(faults, tmp_path):
+    source = faults.make_jobs(tmp_path, {"12_a": "plain", "13_b": "plain"})[0].source
+    (job,) = list_jobs(source, tmp_path, load_config(), only="*_b")
+    assert job.scan.name == "13_b"
+    with pytest.raises(ConfigError, match="--only to match a scan, got 'c'; they are 12_a, 13_b"):
+        list_jobs(source, tmp_path, load_config(), only="c")

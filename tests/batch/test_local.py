@@ -1,0 +1,89 @@
+"""The local engine: every scan gets its report, whatever happens to the workers."""
+
+from contextlib import closing
+
+import pytest
+
+from torchrg.batch.local import run_local
+from torchrg.batch.memory import available_memory, memory_of_scan, peak_memory
+
+PLENTY = 10**12
+
+
+def run(jobs, *, workers=2, memory_limit=PLENTY):
+    """Return the reports by name."""
+    reports = [r for r in run_local(jobs, workers=workers, memory_limit=memory_limit) if r]
+    assert len(reports) == len(jobs)
+    return {report.name: report for report in reports}
+
+
+def log_of(folder):
+    """Return the lines that scans wrote: name and process when they began, name and done."""
+    return [tuple(line.split()) for line in (folder / "log").read_text().splitlines()]
+
+
+def test_failures_and_deaths_stop_no_other_scan(faults, tmp_path):
+    jobs = faults.make_jobs(
+        tmp_path,
+        {
+            "9_a": "kill once",
+            "8_b": "corrupt",
+            "7_c": "kill while writing",
+            "6_d": "threads",
+            "5_e": "sleep 0.2",
+        },
+    )
+    reports = run(jobs)
+    assert {name for name, report in reports.items() if report.status == "failed"} == {"8_b", "7_c"}
+    assert "killed by SIGKILL, twice, the second time alone" in reports["7_c"].reason
+    assert [reports[name].attempts for name in ("9_a", "8_b", "7_c", "6_d")] == [2, 1, 2, 1]
+    assert not list((tmp_path / "out" / "7_c").iterdir())
+    # Scans that were lost come again after all others, one at a time.
+    log = log_of(tmp_path)
+    again = [name for name, what in log if what != "done"][len(jobs) :]
+    assert sorted(again) == ["7_c", "9_a"]
+    assert log.index(("5_e", "done")) < log.index(("9_a", "done"))
+
+
+def test_the_largest_begin_first_and_share_the_memory(faults, tmp_path):
+    names = ["1000000_a", "3000000_b", "2000000_c", "900000_d"]
+    jobs = faults.make_jobs(tmp_path, dict.fromkeys(names, "sleep 0.3"))
+    # The largest leaves room for one of the small ones, never for the second.
+    limit = memory_of_scan(3_000_000) + memory_of_scan(1_000_000)
+    run(jobs, memory_limit=limit)
+    log = log_of(tmp_path)
+    assert [log[0][0], log[1][0]] == ["3000000_b", "1000000_a"]
+    running, most = set(), 0
+    for name, what in log:
+        running = running - {name} if what == "done" else running | {name}
+        most = max(most, sum(memory_of_scan(int(n.split("_")[0])) for n in running))
+    assert most <= limit
+
+
+def test_a_scan_beyond_the_limit_runs_alone(faults, tmp_path):
+    jobs = faults.make_jobs(tmp_path, {"9_a": "sleep 0.2", "8_b": "plain"})
+    run(jobs, memory_limit=1)
+    assert [name for name, _ in log_of(tmp_path)] == ["9_a", "9_a", "8_b", "8_b"]
+
+
+def test_closing_stops_workers_and_removes_what_they_were_writing(faults, tmp_path):
+    jobs = faults.make_jobs(tmp_path, {"9_a": "slow writing"})
+    with closing(run_local(jobs, workers=1, memory_limit=PLENTY)) as reports:
+        while not list((tmp_path / "out").rglob(".result.*")):
+            assert next(reports) is None
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+def test_no_jobs_start_no_worker():
+    assert list(run_local([], workers=2, memory_limit=1)) == []
+
+
+def test_memory_is_measured():
+    assert 1e7 < peak_memory() < 1e12
+    assert 1e7 < available_memory() < 1e14
+    assert memory_of_scan(10**6) <= 2e9 + 1.2e9
+
+
+@pytest.mark.parametrize("num_points", [0, 10**5, 10**7])
+def test_the_estimate_stays_within_what_is_promised(num_points):
+    assert memory_of_scan(num_points) <= 2e9 + 1200 * num_points

@@ -1,0 +1,79 @@
+"""A whole batch: a full disk and an interrupt end it, and the next run goes on from there."""
+
+import json
+
+from torchrg.batch.convert import convert_scan
+from torchrg.batch.plan import make_plan
+from torchrg.batch.report import format_report, format_table
+from torchrg.batch.run import run_plan, write_report
+
+
+def run(jobs, on_report=lambda report: None):
+    """Run a plan in this process."""
+    plan = make_plan(jobs)
+    reports = (convert_scan(job) for job in plan.to_convert)
+    return run_plan(plan, reports, engine="local", workers=1, on_report=on_report)
+
+
+def statuses(ending):
+    """Return what became of each scan."""
+    return {scan.name: scan.status for scan in ending.report.scans}
+
+
+def test_a_full_disk_ends_the_batch_and_the_next_run_goes_on(faults, tmp_path):
+    behaviors = {"1_a": "plain", "2_b": "full", "3_c": "plain"}
+    jobs = faults.make_jobs(tmp_path, behaviors)
+    ending = run(jobs)
+    assert ending.disk_full
+    assert statuses(ending) == {"1_a": "converted", "2_b": "failed", "3_c": "not started"}
+    assert "No space left on device" in ending.report.with_status("failed")[0].reason
+    (tmp_path / "in" / "2_b.txt").write_text("plain")
+    ending = run(jobs)
+    assert not ending.disk_full
+    assert statuses(ending) == {"1_a": "kept", "2_b": "converted", "3_c": "converted"}
+
+
+def test_an_interrupt_ends_the_batch_with_what_is_complete(faults, tmp_path):
+    jobs = faults.make_jobs(tmp_path, {"1_a": "plain", "2_b": "plain"})
+
+    def interrupt(report):
+        raise KeyboardInterrupt
+
+    ending = run(jobs, interrupt)
+    assert ending.interrupted
+    assert statuses(ending)["2_b"] == "not started"
+    assert make_plan(jobs).reasons == {"2_b": "new"}
+
+
+def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
+    jobs = faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"})
+    report = run(jobs).report
+    write_report(tmp_path, report)
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert written["scans_by_status"] == {
+        "converted": 1,
+        "kept": 0,
+        "failed": 1,
+        "not started": 0,
+    }
+    assert written["points"] == 9
+    assert set(written["stage_seconds"]) == {"hash", "read", "write", "record"}
+    assert "line 7" in next(s["reason"] for s in written["scans"] if s["name"] == "8_b")
+    assert all(s["host"] for s in written["scans"])
+    table = format_report(report)
+    assert "9_a" in table
+    assert "9_a: was plain" in table
+    kept = run(jobs).report.with_status("kept")[0]
+    assert (kept.num_points, kept.num_regions, kept.warnings) == (9, 1, ("was plain",))
+
+
+def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchrg.batch.report.MOST_ROWS", 1)
+    report = run(faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"})).report
+    table = format_report(report)
+    assert "8_b" in table
+    assert "9_a" not in table
+
+
+def test_an_empty_table_is_its_head():
+    assert format_table(["scan", "points"], []) == "scan  points"
