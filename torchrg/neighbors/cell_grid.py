@@ -81,9 +81,8 @@ def list_candidates(grid: CellGrid, cells: NDArray[np.int64]) -> NDArray[np.int6
     starts, lengths = grid.starts[cells].ravel(), grid.lengths[cells].ravel()
     total = grid.lengths[cells].sum(axis=1)
     before = np.cumsum(lengths) - lengths
-    places = np.full(
-        (len(cells), -(-int(total.max()) // WIDTH_STEP) * WIDTH_STEP), len(grid.rows) - 1
-    )
+    width = -(-int(total.max()) // WIDTH_STEP) * WIDTH_STEP
+    places = np.full((len(cells), width), len(grid.rows) - 1)
     places[np.arange(width) < total[:, None]] = np.arange(total.sum()) + np.repeat(
         starts - before, lengths
     )
