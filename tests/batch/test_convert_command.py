@@ -1,0 +1,154 @@
+"""``torchrg convert``: a folder of rooms from end to end, what it refuses, and what it tells."""
+
+import json
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from torchrg.batch.lock import DirectoryLock
+from torchrg.cli import main
+from torchrg.config import load_config
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+
+
+def convert(*arguments):
+    """Run the command on small rooms."""
+    return main(["convert", *map(str, arguments), "--preset", "classic"])
+
+
+def contents(folder):
+    """Return the bytes of every result file by its path; reports and locks are none."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "report.json" and not path.name.startswith(".")
+    }
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """A folder of two rooms, one of them below another folder."""
+    folder = tmp_path_factory.mktemp("rooms")
+    (folder / "east").mkdir()
+    for name, num_points in (("hall.npz", 3000), ("east/office.npy", 2000)):
+        points = make_room(num_points=num_points, seed=num_points).points
+        if name.endswith("npy"):
+            np.save(folder / name, points)
+        else:
+            np.savez(folder / name, points=points)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def converted(rooms, tmp_path_factory):
+    """The rooms converted by two workers."""
+    out = tmp_path_factory.mktemp("converted") / "out"
+    assert convert("folder", rooms, out, "--workers", 2) == 0
+    return out
+
+
+def test_a_folder_holds_what_the_contract_says(rooms, converted):
+    names = {"coord.npy", "normal.npy", "curvature.npy", "plane.npy", "planes.json"}
+    expected = {
+        f"{room}/{name}" for room in ("hall", "east/office") for name in (*names, "provenance.json")
+    }
+    assert set(contents(converted)) == expected
+    points = np.load(rooms / "hall.npz")["points"]
+    seg = segment_planes(points, load_config("classic"))
+    hall = {name: np.load(converted / "hall" / f"{name}.npy") for name in ("coord", "normal")}
+    assert np.array_equal(hall["coord"], points)
+    assert np.array_equal(hall["normal"], seg.normals.numpy())
+    assert np.array_equal(np.load(converted / "hall" / "plane.npy"), seg.labels.numpy())
+    assert np.array_equal(np.load(converted / "hall" / "curvature.npy"), seg.curvature.numpy())
+    table = json.loads((converted / "hall" / "planes.json").read_text())
+    assert [row["count"] for row in table["planes"]] == seg.planes.count.tolist()
+
+
+def test_one_worker_gives_the_bytes_of_two(rooms, converted, tmp_path):
+    assert convert("folder", rooms, tmp_path / "out", "--workers", 1) == 0
+    assert contents(tmp_path / "out") == contents(converted)
+
+
+def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tmp_path, capsys):
+    shutil.copytree(rooms, tmp_path / "in")
+    shutil.copytree(converted, tmp_path / "out")
+    (tmp_path / "in" / "bad.ply").write_text("ply\nformat")
+    (tmp_path / "out" / "hall" / "plane.npy").write_bytes(b"")
+    command = ("folder", tmp_path / "in", tmp_path / "out")
+    assert convert(*command, "--dry-run") == 0
+    shown = capsys.readouterr().out
+    assert "plane.npy changed" in shown
+    assert "2 scans to convert, 1 done" in shown
+    assert convert(*command) == 3
+    captured = capsys.readouterr()
+    first, last = captured.err.splitlines()
+    assert first.startswith(f"torchrg: bad: {tmp_path / 'in' / 'bad.ply'}: line 2: ")
+    assert "2 of 3 scans are complete" in last
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    status = {scan["name"]: scan["status"] for scan in report["scans"]}
+    assert status == {"bad": "failed", "hall": "converted", "east/office": "kept"}
+    assert all(name in captured.out for name in status)
+    assert contents(tmp_path / "out") == contents(converted)
+
+
+def test_a_dry_run_writes_nothing(rooms, tmp_path, capsys):
+    assert convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*") == 0
+    assert "1 scans to convert" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("torchrg.batch.lock.DirectoryLock.__init__.__kwdefaults__", {"patience": 0})
+    with DirectoryLock(tmp_path):
+        assert convert("folder", rooms, tmp_path) == 2
+    assert "another torchrg convert (process" in capsys.readouterr().err
+    assert not contents(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rooms", "IN", "OUT"], "expected a kind of data set (s3dis, folder"),
+        (["folder", "IN", "OUT", "--workers", "0"], "expected --workers >= 1, got 0"),
+        (["folder", "IN", "OUT", "--limit-memory", "0"], "expected --limit-memory > 0"),
+        (["folder", "IN", "OUT", "--chunk-size", "0"], "expected --chunk-size >= 1"),
+        (["folder", "IN", "OUT", "--ray-address", "auto"], "together with --engine ray"),
+        (["folder", "IN", "OUT", "--engine", "spark"], "engine"),
+        (["folder", "IN", "OUT", "--only", "west/*"], "they are east/office, hall"),
+        (["folder", "IN", "IN/out"], "expected a directory outside"),
+        (["folder", "IN", "IN"], "for the results of office.npy"),
+        (["folder", "NONE", "OUT"], "no such folder"),
+        (["s3dis", "IN", "OUT"], "expected a folder Area_1"),
+        (["folder", "IN", "IN/hall.npz"], "expected a directory outside"),
+        (["folder", "IN", "FILE/out"], "cannot be made: Not a directory"),
+    ],
+)
+def test_mistakes_are_one_line_before_any_work(rooms, tmp_path, capsys, arguments, message):
+    (tmp_path / "f").touch()
+    places = {"IN": rooms, "OUT": tmp_path / "out", "NONE": tmp_path / "no", "FILE": tmp_path / "f"}
+    words = []
+    for word in arguments:
+        first, slash, rest = word.partition("/")
+        words.append(f"{places[first]}{slash}{rest}" if first in places else word)
+    assert convert(*words) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+    assert captured.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
+    assert convert("folder", rooms, tmp_path / "out") == 2
+    assert "GB of free disk for 2 scans" in capsys.readouterr().err
+
+
+def test_help_lists_the_kinds(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["convert", "--help"])
+    assert stop.value.code == 0
+    assert "s3dis" in capsys.readouterr().out
