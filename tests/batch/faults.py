@@ -4,7 +4,7 @@ import errno
 import os
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchrg.batch.scans import Converted, Job, Scan
@@ -18,6 +18,8 @@ class FaultySource:
     """Text files, named ``<points>_<anything>``; the text is a behaviour and becomes the result."""
 
     root: Path
+    settings: PipelineConfig = field(default_factory=PipelineConfig)
+    in_place: bool = False
     bytes_per_point: int = 1
 
     def describe(self):
@@ -27,7 +29,7 @@ class FaultySource:
         paths = sorted(self.root.iterdir())
         return [Scan(path.stem, (path,), int(path.stem.split("_")[0])) for path in paths]
 
-    def convert(self, scan, folder, settings, begin):
+    def convert(self, scan, folder, begin):
         begin("read")
         behavior = scan.inputs[0].read_text()
         with (self.root.parent / "log").open("a") as log:
@@ -75,5 +77,4 @@ def make_jobs(folder, behaviors):
     for name, behavior in behaviors.items():
         (folder / "in" / f"{name}.txt").write_text(behavior)
     source = FaultySource(folder / "in")
-    settings = PipelineConfig()
-    return [Job(source, scan, folder / "out", settings) for scan in source.list_scans()]
+    return [Job(source, scan, folder / "out") for scan in source.list_scans()]

@@ -27,8 +27,12 @@ def test_a_scan_is_done_until_something_changes(job):
 
 
 def test_other_settings_are_noticed_but_not_those_that_change_no_result(job):
-    assert reason_to_convert(replace(job, settings=load_config("classic"))) == "settings changed"
-    assert reason_to_convert(replace(job, settings=replace(job.settings, chunk_size=7))) == ""
+    for settings, reason in (
+        (load_config("classic"), "settings changed"),
+        (replace(job.source.settings, chunk_size=7), ""),
+    ):
+        source = replace(job.source, settings=settings)
+        assert reason_to_convert(replace(job, source=source)) == reason
 
 
 def test_another_input_is_noticed_even_at_the_same_size_and_time(job):
@@ -81,7 +85,7 @@ def test_the_plan_says_why(faults, tmp_path):
 
 def test_only_the_scans_that_match_are_listed(faults, tmp_path):
     source = faults.make_jobs(tmp_path, {"12_a": "plain", "13_b": "plain"})[0].source
-    (job,) = list_jobs(source, tmp_path, load_config(), only="*_b")
+    (job,) = list_jobs(source, tmp_path, only="*_b")
     assert job.scan.name == "13_b"
     with pytest.raises(ConfigError, match="--only to match a scan, got 'c'; they are 12_a, 13_b"):
-        list_jobs(source, tmp_path, load_config(), only="c")
+        list_jobs(source, tmp_path, only="c")

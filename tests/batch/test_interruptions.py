@@ -33,7 +33,7 @@ def rooms(tmp_path_factory):
 def undisturbed(rooms, tmp_path_factory):
     """The bytes of every result, made here and by nothing but the job function."""
     out = tmp_path_factory.mktemp("undisturbed")
-    for job in list_jobs(FolderSource(rooms, out), out, load_config("classic")):
+    for job in list_jobs(FolderSource(rooms, load_config("classic"), out), out):
         assert convert_scan(job).status == "converted"
     assert len(results_of(out)) == 6 * len(NAMES)
     return results_of(out)

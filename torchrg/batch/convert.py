@@ -75,7 +75,7 @@ def convert_scan(job: Job) -> ScanReport:
         remove_leftovers(job.folder)
         earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)
-        converted = job.source.convert(job.scan, job.folder, job.settings, clock.begin)
+        converted = job.source.convert(job.scan, job.folder, clock.begin)
         clock.begin("record")
         for name in earlier["outputs"].keys() - set(converted.files):
             (job.folder / name).unlink(missing_ok=True)

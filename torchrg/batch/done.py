@@ -25,9 +25,9 @@ def describe_job(job: Job) -> dict[str, Any]:
     Raises:
         OSError: If an input cannot be read.
     """
-    settings = dataclasses.asdict(job.settings)
+    settings = dataclasses.asdict(job.source.settings)
     # It never changes a result, and lowering it after running out of memory must cost nothing.
-    del settings["chunk_size"]
+    settings.pop("chunk_size", None)
     return {
         "versions": describe_versions(),
         "config": settings,

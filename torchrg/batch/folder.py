@@ -1,28 +1,24 @@
 """A folder of clouds as a source: one result folder for each cloud."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from torchrg.batch.results import write_results
 from torchrg.batch.scans import Converted, Scan, check_finite
 from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     FolderOfClouds,
     Scene,
-    describe_planes,
     read_pointcept_scene,
     write_pointcept_scene,
 )
 from torchrg.errors import ConfigError
-from torchrg.io import atomic_path, read_cloud
+from torchrg.io import read_cloud
 from torchrg.io.counts import estimate_points
 from torchrg.pipeline import segment_planes
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import Cloud
 
 COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
@@ -39,26 +35,23 @@ class FolderSource:
 
     Args:
         root: The folder.
+        settings: How to segment.
         out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
             no other folder below it can be.
         superpoint: Whether the planes of folders in Pointcept's layout are written as
             ``superpoint`` too.
-
-    Raises:
-        ConfigError: If ``out`` is below ``root``.
     """
 
     root: Path
+    settings: PipelineConfig
     out: Path
     superpoint: bool = False
-    bytes_per_point: int = 12 + 3 + 12 + 4 + 4
+    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4
 
-    def __post_init__(self) -> None:
-        if self.root in self.out.parents:
-            raise ConfigError(
-                f"{self.out}: expected a directory outside {self.root}, as results would be read "
-                "as clouds next time; choose another."
-            )
+    @property
+    def in_place(self) -> bool:
+        """Whether results go into the folders of the clouds."""
+        return self.out == self.root
 
     def describe(self) -> dict[str, Any]:
         """Return kind and options."""
@@ -73,7 +66,7 @@ class FolderSource:
         """
         scenes = FolderOfClouds(self.root).scenes
         file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
-        if file is not None and self.out == self.root:
+        if file is not None and self.in_place:
             raise ConfigError(
                 f"{self.out}: expected a directory outside {self.root} for the results of "
                 f"{file.name}; choose another."
@@ -85,13 +78,11 @@ class FolderSource:
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
         # In place, nothing but the coordinates decides what is added.
-        used = COPIED if self.out != self.root else ("coord",)
+        used = COPIED if not self.in_place else ("coord",)
         files = tuple(file for file in scene.files if file.stem in used)
         return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
 
-    def convert(
-        self, scan: Scan, folder: Path, settings: PipelineConfig, begin: Callable[[str], None]
-    ) -> Converted:
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read, segment and write one cloud.
 
         Raises:
@@ -106,33 +97,15 @@ class FolderSource:
             sample = read_pointcept_scene(first.parent)
             cloud = Cloud(sample["coord"].numpy(), source=str(first.parent))
         warnings = check_finite(cloud)
-        seg = segment_planes(cloud.points, settings, on_stage=begin)
+        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         begin("write")
+        origin = cloud.origin.tolist()
         if is_file:
-            files = _write(folder, cloud, seg)
+            colors = {name: cloud.fields[name] for name in ("color",) if name in cloud.fields}
+            files = write_results(folder, cloud.coordinates, seg, fields=colors, origin=origin)
         else:
             kept = {name: sample[name] for name in COPIED if name in sample}
-            origin = cloud.origin.tolist()
             files = write_pointcept_scene(
                 folder, kept, seg, superpoint=self.superpoint, origin=origin
             )
         return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
-
-
-def _write(folder: Path, cloud: Cloud, seg: Segmentation) -> list[str]:
-    """Write the results of a cloud and return the names of the files."""
-    arrays: dict[str, NDArray[Any]] = {
-        "coord": cloud.coordinates,
-        "normal": seg.normals.numpy(),
-        "curvature": seg.curvature.numpy(),
-        "plane": seg.labels.numpy().astype(np.int32),
-    }
-    if "color" in cloud.fields:
-        arrays["color"] = cloud.fields["color"]
-    for name, values in arrays.items():
-        with atomic_path(folder / f"{name}.npy") as beside:
-            np.save(beside, np.ascontiguousarray(values), allow_pickle=False)
-    table = describe_planes(seg.planes, origin=cloud.origin.tolist())
-    with atomic_path(folder / "planes.json") as beside:
-        beside.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
-    return [*(f"{name}.npy" for name in arrays), "planes.json"]

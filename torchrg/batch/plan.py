@@ -10,7 +10,6 @@ from typing import NamedTuple
 from torchrg.batch.done import reason_to_convert
 from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.scans import Job, Source
-from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 
 
@@ -36,31 +35,33 @@ class Plan(NamedTuple):
         return [job for job in self.jobs if job.scan.name not in self.reasons]
 
 
-def list_jobs(
-    source: Source, out: Path, settings: PipelineConfig, *, only: str | None = None
-) -> list[Job]:
+def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
     """Return a job for each scan of a source.
 
     Args:
         source: The data set.
         out: Where results go.
-        settings: How to segment.
         only: Pattern of the names to convert, as in a shell; ``*`` matches slashes too.
 
     Returns:
         The jobs in natural order.
 
     Raises:
-        ConfigError: If no name matches the pattern.
-        FormatError: If the source has no scans, or a scan would get results inside itself.
+        ConfigError: If no name matches the pattern, or results would go in among the scans.
+        FormatError: If the source has no scans.
     """
+    if source.root in out.parents or (source.root == out and not source.in_place):
+        raise ConfigError(
+            f"{out}: expected a directory outside {source.root}, so that no result is read as a "
+            "scan; choose another."
+        )
     scans = source.list_scans()
     chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
     if not chosen:
         names = ", ".join(scan.name for scan in scans[:5])
         more = f" and {len(scans) - 5:,} more" if len(scans) > 5 else ""
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
-    return [Job(source, scan, out, settings) for scan in chosen]
+    return [Job(source, scan, out) for scan in chosen]
 
 
 def make_plan(

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchrg.batch.scans import Converted, Scan, check_finite
 from torchrg.config import PipelineConfig
@@ -21,16 +21,19 @@ class S3DISSource:
 
     Args:
         root: The folder that holds ``Area_1`` to ``Area_6``.
+        settings: How to segment.
         areas: Numbers of the areas.
         class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
         superpoint: Whether planes are written as ``superpoint`` too.
     """
 
     root: Path
+    settings: PipelineConfig
     areas: tuple[int, ...]
     class_order: str = "pointcept"
     superpoint: bool = False
-    bytes_per_point: int = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
+    in_place: ClassVar[bool] = False
+    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
         """Return kind and options."""
@@ -52,9 +55,7 @@ class S3DISSource:
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
-    def convert(
-        self, scan: Scan, folder: Path, settings: PipelineConfig, begin: Callable[[str], None]
-    ) -> Converted:
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read, segment and write one room.
 
         Raises:
@@ -64,7 +65,7 @@ class S3DISSource:
         room = read_room(self.root / scan.name, class_order=self.class_order)
         cloud = Cloud(room.coord, source=scan.name)
         notes = (*check_finite(cloud), *_notes(room.report))
-        seg = segment_planes(cloud.points, settings, on_stage=begin)
+        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         begin("write")
         sample = {
             "coord": room.coord,

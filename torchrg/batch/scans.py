@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from torchrg.config import PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.structures import Cloud
 
@@ -18,11 +17,13 @@ class Scan:
         name: Folder of its results below the output directory, with forward slashes.
         inputs: The files that it is made of.
         num_points: Its number of points by the headers or sizes of its files.
+        item: What else its source needs to read it; plain values that travel between processes.
     """
 
     name: str
     inputs: tuple[Path, ...]
     num_points: int
+    item: Any = None
 
 
 class Converted(NamedTuple):
@@ -54,28 +55,29 @@ class Source(Protocol):
         """The directory of the data set."""
 
     @property
+    def in_place(self) -> bool:
+        """Whether results may go into :attr:`root` itself."""
+
+    @property
+    def settings(self) -> Any:  # noqa: ANN401
+        """A dataclass of settings of the segmentation."""
+
+    @property
     def bytes_per_point(self) -> int:
         """Space that the results of one point take, to see beforehand whether the disk has it."""
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind of the source and every option that decides results, for JSON."""
+        """Return the kind of the source and what else decides results, for JSON."""
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
 
-    def convert(
-        self,
-        scan: Scan,
-        folder: Path,
-        settings: PipelineConfig,
-        begin: Callable[[str], None],
-    ) -> Converted:
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read a scan, segment it, and write its results, each file whole or not at all.
 
         Args:
             scan: One of :meth:`list_scans`.
             folder: Where its results go; it exists.
-            settings: How to segment.
             begin: To be called with the name of each stage when it starts.
         """
 
@@ -87,7 +89,6 @@ class Job:
     source: Source
     scan: Scan
     out: Path
-    settings: PipelineConfig
 
     @property
     def folder(self) -> Path:

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-import tyro
 from tqdm import tqdm
 
 from torchrg.batch.convert import ScanReport
@@ -25,11 +24,15 @@ from torchrg.cli.console import (
     SOME_FAILED,
     fail,
     parse,
-    settings_asked_for,
     warn,
 )
-from torchrg.cli.convert_arguments import KINDS, Arguments, build_source, check_arguments
-from torchrg.config import PipelineConfig
+from torchrg.cli.convert_arguments import (
+    KINDS,
+    Arguments,
+    build_source,
+    check_arguments,
+    starting_point,
+)
 from torchrg.errors import ConfigError, FormatError
 
 OVERVIEW = f"""usage: torchrg convert {{{",".join(KINDS)}}} ROOT OUT ...
@@ -38,6 +41,7 @@ Normals, curvature and plane labels of every scan of a data set.
 
   s3dis   the rooms of S3DIS as released, into Pointcept's layout
   folder  every cloud below a folder
+  rgbd    depth frames, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any
 
 torchrg convert s3dis --help says more."""
 
@@ -50,15 +54,12 @@ def run(argv: list[str]) -> int:
     kind, *rest = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
-    start = _starting_point(kind, rest)
+    start = starting_point(kind, rest)
     arguments = parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
     check_arguments(arguments)
-    settings = PipelineConfig(
-        arguments.normals, arguments.growing, arguments.chunk_size, arguments.planes
-    )
     out = arguments.out.resolve()
     with _warnings_as_lines():
-        jobs = list_jobs(build_source(arguments), out, settings, only=arguments.only)
+        jobs = list_jobs(build_source(arguments), out, only=arguments.only)
     if arguments.dry_run:
         print(format_plan(_look_at(jobs, arguments)))
         return 0
@@ -68,19 +69,6 @@ def run(argv: list[str]) -> int:
         raise FormatError(f"{out}: cannot be made: {error.strerror or error}.") from error
     with DirectoryLock(out) as lock, _terminate_as_interrupt():
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
-
-
-def _starting_point(kind: str, argv: list[str]) -> Arguments:
-    """Return the arguments' defaults: those of the preset or the file that is asked for."""
-    settings = settings_asked_for(argv)
-    return KINDS[kind](
-        root=tyro.MISSING,
-        out=tyro.MISSING,
-        normals=settings.normals,
-        growing=settings.growing,
-        planes=settings.planes,
-        chunk_size=settings.chunk_size,
-    )
 
 
 def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:

@@ -8,8 +8,10 @@ from typing import Annotated, Literal
 import tyro
 
 from torchrg.batch.folder import FolderSource
+from torchrg.batch.rgbd import RGBDSource
 from torchrg.batch.s3dis import S3DISSource, find_areas
 from torchrg.batch.scans import Source
+from torchrg.cli.console import settings_asked_for
 from torchrg.config import (
     DEFAULT_PRESET,
     GrowingConfig,
@@ -18,6 +20,7 @@ from torchrg.config import (
     PlanesConfig,
 )
 from torchrg.errors import ConfigError
+from torchrg.transforms import DepthConfig
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,12 @@ class Arguments:
     """Convert what is done already, too."""
     dry_run: bool = False
     """Say what would be done and why, and write nothing."""
+
+
+@dataclass(frozen=True)
+class CloudArguments(Arguments):
+    """What data sets of clouds have beside."""
+
     preset: str = DEFAULT_PRESET
     """Settings to start from; see the files in configs/."""
     config: Path | None = None
@@ -57,9 +66,14 @@ class Arguments:
     chunk_size: int = PipelineConfig.chunk_size
     """Points handled at a time; bounds memory, never changes a result."""
 
+    @property
+    def settings(self) -> PipelineConfig:
+        """How to segment."""
+        return PipelineConfig(self.normals, self.growing, self.chunk_size, self.planes)
+
 
 @dataclass(frozen=True)
-class FolderArguments(Arguments):
+class FolderArguments(CloudArguments):
     """Convert every cloud below a folder: normals, curvature, plane labels, table of planes.
 
     Clouds are files (.npz .npy .ply .pcd .las .laz .e57 .xyz .txt) and folders in Pointcept's
@@ -71,7 +85,7 @@ class FolderArguments(Arguments):
 
 
 @dataclass(frozen=True)
-class S3DISArguments(Arguments):
+class S3DISArguments(CloudArguments):
     """Convert S3DIS as it is released into Pointcept's layout, with normals and planes."""
 
     areas: tuple[int, ...] = ()
@@ -82,18 +96,56 @@ class S3DISArguments(Arguments):
     """Write the planes as superpoint.npy too."""
 
 
-KINDS: dict[str, type[Arguments]] = {"s3dis": S3DISArguments, "folder": FolderArguments}
+@dataclass(frozen=True)
+class RGBDArguments(Arguments):
+    """Convert depth frames: normals, curvature and plane labels as images, a table of planes."""
+
+    layout: Literal["tum", "icl-nuim", "scannet", "7-scenes", "images"] = "images"
+    """Shape of the folder; images are all .png and .npy below it, of one camera."""
+    intrinsics: str | None = None
+    """fx,fy,cx,cy of the camera in pixels. Default: those of the layout; images have none."""
+    depth_scale: float | None = None
+    """Stored value of one metre. Default: that of the layout; images have none."""
+    depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
+    """How planes are found in depth images."""
+
+
+KINDS: dict[str, type[Arguments]] = {
+    "s3dis": S3DISArguments,
+    "folder": FolderArguments,
+    "rgbd": RGBDArguments,
+}
 """Arguments by the name of the kind of data set."""
+
+
+def starting_point(kind: str, argv: list[str]) -> Arguments:
+    """Return the arguments' defaults: those of the preset or the file that is asked for."""
+    start = KINDS[kind](root=tyro.MISSING, out=tyro.MISSING)
+    if not isinstance(start, CloudArguments):
+        return start
+    asked = settings_asked_for(argv)
+    return dataclasses.replace(
+        start,
+        normals=asked.normals,
+        growing=asked.growing,
+        planes=asked.planes,
+        chunk_size=asked.chunk_size,
+    )
 
 
 def build_source(arguments: Arguments) -> Source:
     """Return the data set that the arguments mean, its paths absolute."""
     root, out = arguments.root.resolve(), arguments.out.resolve()
-    if isinstance(arguments, S3DISArguments):
-        areas = arguments.areas or find_areas(root)
-        return S3DISSource(root, areas, arguments.class_order, arguments.superpoint)
-    if isinstance(arguments, FolderArguments):
-        return FolderSource(root, out, arguments.superpoint)
+    match arguments:
+        case S3DISArguments():
+            areas = arguments.areas or find_areas(root)
+            order, superpoint = arguments.class_order, arguments.superpoint
+            return S3DISSource(root, arguments.settings, areas, order, superpoint)
+        case FolderArguments():
+            return FolderSource(root, arguments.settings, out, arguments.superpoint)
+        case RGBDArguments():
+            intrinsics, scale = _parse_intrinsics(arguments.intrinsics), arguments.depth_scale
+            return RGBDSource(root, arguments.depth, arguments.layout, intrinsics, scale)
     raise TypeError(type(arguments).__name__)
 
 
@@ -107,7 +159,18 @@ def check_arguments(arguments: Arguments) -> None:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     if arguments.limit_memory is not None and not arguments.limit_memory > 0:
         raise ConfigError(f"expected --limit-memory > 0, in GB, got {arguments.limit_memory}.")
-    if arguments.chunk_size < 1:
+    if isinstance(arguments, CloudArguments) and arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address together with --engine ray.")
+
+
+def _parse_intrinsics(text: str | None) -> tuple[float, float, float, float] | None:
+    """Return four numbers between commas."""
+    if text is None:
+        return None
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(f"expected --intrinsics as fx,fy,cx,cy, got {text!r}.") from None
+    return fx, fy, cx, cy
