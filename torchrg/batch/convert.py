@@ -35,7 +35,7 @@ class ScanReport:
         details: The traceback of a failure that was not foreseen.
         disk_full: Whether it failed because there is no space left.
         host: Machine and process that did it.
-        attempts: How often it was tried.
+        attempts: How often it was tried, as far as the engine tells: Ray does not.
     """
 
     name: str

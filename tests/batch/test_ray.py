@@ -1,0 +1,81 @@
+"""The Ray engine: the same bytes as the local one, and no scan is lost with a node."""
+
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrg.batch.convert import convert_scan
+from torchrg.batch.folder import FolderSource
+from torchrg.batch.plan import list_jobs
+from torchrg.config import load_config
+from torchrg.errors import MissingDependencyError
+from torchrg.scenes import make_room
+
+needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
+
+
+def run_python(*arguments):
+    """Run Python with the modules of this folder at hand, and return what it printed."""
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def results_of(out):
+    """Return the bytes of every result."""
+    return {
+        path.relative_to(out).as_posix(): path.read_bytes()
+        for path in out.rglob("*.*")
+        if path.is_file() and not path.name.startswith(".") and path.name != "report.json"
+    }
+
+
+@needs_ray
+@pytest.mark.slow
+def test_ray_gives_the_bytes_of_one_process(tmp_path):
+    (tmp_path / "in").mkdir()
+    for seed in range(3):
+        np.save(tmp_path / "in" / f"{seed}.npy", make_room(num_points=3000, seed=seed).points)
+    out, here = tmp_path / "out", tmp_path / "here"
+    options = ("--preset", "classic", "--engine", "ray", "--workers", "2")
+    shown = run_python("-m", "torchrg", "convert", "folder", tmp_path / "in", out, *options)
+    assert "3 of 3 scans are complete" in shown
+    for job in list_jobs(FolderSource(tmp_path / "in", load_config("classic"), here), here):
+        convert_scan(job)
+    assert results_of(out) == results_of(here)
+    assert json.loads((out / "report.json").read_text())["engine"] == "ray"
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_lost_node_loses_no_scan(tmp_path):
+    run_python(Path(__file__).with_name("lose_node.py"), tmp_path)
+    reports = json.loads((tmp_path / "reports.json").read_text())
+    status = {report["name"]: report["status"] for report in reports}
+    assert status.pop("8_c") == "failed"
+    assert len(status) == len(reports) - 1 == 7
+    assert set(status.values()) == {"converted"}
+    lines = (tmp_path / "log").read_text().splitlines()
+    begun = Counter(line.split()[0] for line in lines if not line.endswith("done"))
+    assert begun["9_b"] == 2
+    assert max(begun[name] for name in status if name != "9_b") == 2
+
+
+def test_ray_is_asked_for_by_name(monkeypatch):
+    from torchrg.batch.ray_tasks import run_ray
+
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[ray\]'"):
+        next(run_ray([], memory_limit=1))
