@@ -4,10 +4,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from threading import Lock
+from typing import TypeVar
 
 import torch
 
+Result = TypeVar("Result")
+
 _KEPT_BYTES = 31 * 2**20
+_MIN_SHARE = 4096
 
 
 def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
@@ -20,6 +24,30 @@ def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
     return [
         slice(start, min(start + chunk_size, num_rows)) for start in range(0, num_rows, chunk_size)
     ]
+
+
+def fair_chunks(num_rows: int, chunk_size: int) -> list[slice]:
+    """Cut rows as :func:`chunks_of`, smaller if some thread would have none; at least one slice.
+
+    Example:
+        >>> fair_chunks(0, 10)
+        [slice(0, 0, None)]
+    """
+    share = max(_MIN_SHARE, -(-num_rows // torch.get_num_threads()))
+    return chunks_of(num_rows, min(chunk_size, share)) or [slice(0, 0)]
+
+
+def map_chunks(
+    work: Callable[[slice], Result], chunks: Sequence[slice], device: torch.device
+) -> list[Result]:
+    """Return what ``work`` returns for each chunk, in their order; see :func:`run_chunks`."""
+    results: dict[int, Result] = {}
+
+    def keep(chunk: slice) -> None:
+        results[chunk.start] = work(chunk)
+
+    run_chunks(keep, chunks, device)
+    return [results[chunk.start] for chunk in chunks]
 
 
 def run_chunks(
@@ -62,12 +90,18 @@ def share_chunks(
             return
         shared = _Shared(chunks)
         with ThreadPoolExecutor(
-            num_threads, initializer=torch.set_num_threads, initargs=(1,)
+            num_threads, initializer=_begin_thread, initargs=(torch.is_grad_enabled(),)
         ) as pool:
             for _ in pool.map(work, [shared] * num_threads):
                 pass
     finally:
         torch.set_num_threads(setting)
+
+
+def _begin_thread(grad_enabled: bool) -> None:
+    """Give a thread the settings of the one that started it."""
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(grad_enabled)
 
 
 class _Shared(Iterator[slice]):

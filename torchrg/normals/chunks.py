@@ -1,10 +1,11 @@
 """Run an estimator of patches over the points of a cloud, a block at a time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from torchrg._chunks import fair_chunks, map_chunks
 from torchrg.neighbors import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 
@@ -40,20 +41,27 @@ def fit_points(
         >>> fit_points(points, neighbors, fit).normals.abs()[0]
         tensor([0., 0., 1.])
     """
-    num_rows = len(points) if rows is None else len(rows)
-    blocks = []
-    for start in range(0, max(num_rows, 1), chunk_size):
-        block = (
-            slice(start, start + chunk_size) if rows is None else rows[start : start + chunk_size]
-        )
-        indices = neighbors.indices[block]
+
+    def fit_chunk(chunk: slice) -> NormalFit:
+        block = chunk if rows is None else rows[chunk]
         mask = None if neighbors.valid is None else neighbors.valid[block]
-        patches = gather_patches(points, indices)
-        blocks.append(fit(patches, mask, coordinate_resolution(points[block])))
-    normals, curvature, valid, residual_rms = (
-        torch.cat(parts) for parts in list(zip(*blocks, strict=True))[:4]
-    )
-    return NormalFit(normals, curvature, valid, residual_rms)
+        patches = gather_patches(points, neighbors.indices[block])
+        return fit(patches, mask, coordinate_resolution(points[block]))
+
+    chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
+    return join_fits(map_chunks(fit_chunk, chunks, points.device))
+
+
+def join_fits(parts: Sequence[NormalFit]) -> NormalFit:
+    """Return the fits of consecutive points as one, without ``sharp``.
+
+    Example:
+        >>> flat = NormalFit(torch.zeros(2, 3), *torch.zeros(3, 2))
+        >>> join_fits([flat, flat]).curvature
+        tensor([0., 0., 0., 0.])
+    """
+    columns = list(zip(*parts, strict=True))
+    return NormalFit(*(torch.cat(column) for column in columns[:4]))
 
 
 def coordinate_resolution(points: Tensor) -> Tensor:

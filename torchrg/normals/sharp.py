@@ -6,6 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchrg._chunks import fair_chunks, run_chunks
 from torchrg.errors import ConfigError
 from torchrg.linalg import sq_chord_to_deg
 from torchrg.robust.scale import QN_FACTOR, qn_exceeds
@@ -53,18 +54,18 @@ def find_sharp_points(
         raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
     columns = normals.T.contiguous()
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
-    for start in range(0, len(sharp), chunk_size):
-        block = slice(start, start + chunk_size)
+
+    def classify(block: slice) -> None:
         indices = neighbors.indices[block]
         counted = None if neighbors.valid is None else neighbors.valid[block]
         if valid is not None:
             has_normal = valid.index_select(0, indices.reshape(-1)).view(indices.shape)
             counted = has_normal if counted is None else counted & has_normal
         sq_chords = _sq_chords(columns, indices)
-        if rule == "qn":
-            sharp[block] = _qn_exceeds(sq_chords, counted, angle_deg)
-        else:
-            sharp[block] = _percentile_exceeds(sq_chords, counted, angle_deg)
+        exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
+        sharp[block] = exceeds(sq_chords, counted, angle_deg)
+
+    run_chunks(classify, fair_chunks(len(sharp), chunk_size), normals.device)
     return sharp if valid is None else sharp | ~valid
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
+from torchrg._chunks import fair_chunks, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.neighbors import gather_patches
-from torchrg.normals.chunks import coordinate_resolution, fit_points
+from torchrg.normals.chunks import coordinate_resolution, fit_points, join_fits
 from torchrg.normals.irls import fit_normals_irls
 from torchrg.normals.noise import survey_noise
 from torchrg.normals.pca import fit_normals_pca
@@ -28,6 +28,7 @@ def at_all_points(fit: Callable[..., NormalFit], **settings: str) -> Estimator:
         The estimator.
 
     Example:
+        >>> import torch
         >>> estimate = at_all_points(fit_normals_pca)
         >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
         >>> estimate(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
@@ -65,6 +66,7 @@ def estimate_irls(
         The fit.
 
     Example:
+        >>> import torch
         >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
         >>> estimate_irls(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
         tensor(True)
@@ -72,16 +74,14 @@ def estimate_irls(
     known = points.detach()
     planes = at_all_points(fit_normals_pca)(known, neighbors, config, chunk_size)
     noise = survey_noise(known, neighbors, planes, chunk_size=chunk_size).noise
-    blocks = []
-    for start in range(0, max(len(points), 1), chunk_size):
-        block = slice(start, start + chunk_size)
-        blocks.append(
-            fit_normals_irls(
-                gather_patches(points, neighbors.indices[block]),
-                None if neighbors.valid is None else neighbors.valid[block],
-                noise=noise[block],
-                resolution=coordinate_resolution(points[block]),
-            )
+
+    def fit_chunk(chunk: slice) -> NormalFit:
+        return fit_normals_irls(
+            gather_patches(points, neighbors.indices[chunk]),
+            None if neighbors.valid is None else neighbors.valid[chunk],
+            noise=noise[chunk],
+            resolution=coordinate_resolution(points[chunk]),
         )
-    parts = (torch.cat(part) for part in list(zip(*blocks, strict=True))[:4])
-    return NormalFit(*parts)
+
+    chunks = fair_chunks(len(points), chunk_size)
+    return join_fits(map_chunks(fit_chunk, chunks, points.device))
