@@ -1,38 +1,77 @@
-"""Make the figures and tables of the paper again, with every method of torchrg.
+"""Make the tables and figures of the paper again, with every method of torchrg.
 
-    python scripts/reproduce_paper.py normals          # Figures 3 and 4, Table 1
-    python scripts/reproduce_paper.py normals --quick  # the same, small, in minutes
+    python scripts/reproduce_paper.py --out DIR                 # everything
+    python scripts/reproduce_paper.py --out DIR --quick         # the same, small, in minutes
+    python scripts/reproduce_paper.py --out DIR normals times   # some parts
 
-Each result is kept in a file of its own under --out; what is there is not computed again.
+Open DIR/report.html. Each result is kept in a file of its own under DIR; what is there is not
+computed again, so a run that was interrupted goes on where it stopped. Quick results are apart, in
+DIR/quick. Clouds of the paper that are not given are replaced by made ones with known truth.
 """
 
 import argparse
+import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 
+import matplotlib as mpl
 import torch
-from reproduction import normals
-from reproduction.cells import Folder
+from reproduction import criteria, large, normals, readme, segmentation_tables, study, times
+from reproduction.cells import Folder, Record
+from reproduction.clouds import TITLES
+from reproduction.report import write_report
+from reproduction.segmentations import Run
 
-PARTS: dict[str, Callable[[Folder, bool], None]] = {"normals": normals.reproduce}
-"""Parts by name: where results go, whether to be quick."""
+PARTS: dict[str, tuple[Callable[[Run], Record], str]] = {
+    "normals": (normals.reproduce, "Table 1, Figures 3 and 4: errors and times of normals"),
+    "criteria": (criteria.reproduce, "Figure 5: coplanar and connective points"),
+    "study": (study.reproduce, "section II.B: limits of angle and curvature"),
+    "segmentation": (segmentation_tables.reproduce, "Table 2, Figures 7 and 8"),
+    "large": (large.reproduce, "Figure 9: the two large clouds"),
+    "times": (times.reproduce, "Table 3: times"),
+}
+"""Parts by name: what makes them, and what they are."""
 
 
 def main() -> None:
-    """Run the parts that are asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("parts", nargs="+", choices=PARTS, help="what to make")
-    parser.add_argument(
-        "--out", type=Path, default=Path("reproduction"), help="default: %(default)s"
+    """Make the parts that are asked for, and the report of all parts that are there."""
+    arguments = _parse()
+    mpl.use("agg")
+    if arguments.threads is not None:
+        torch.set_num_threads(arguments.threads)
+    folder = Folder(arguments.out / "quick" if arguments.quick else arguments.out)
+    run = Run(folder, arguments.quick, {key: getattr(arguments, key) for key in TITLES})
+    for name in arguments.parts or PARTS:
+        begin = time.perf_counter()
+        print(f"== {name}: {PARTS[name][1]}", flush=True)
+        part = PARTS[name][0](run)
+        folder.write(f"parts/{name}.json", json.dumps(part, indent=1))
+        print(f"== {name}: {time.perf_counter() - begin:.0f} s", flush=True)
+    report = write_report(folder, list(PARTS), quick=arguments.quick)
+    print(f"Look at {folder.path / 'report.html'} (also .md, .json)")
+    if arguments.readme:
+        readme.update(report)
+
+
+def _parse() -> argparse.Namespace:
+    """Return the arguments."""
+    listed = "; ".join(f"{name}: {what}" for name, (_, what) in PARTS.items())
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="fewer and smaller clouds")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch; default: 1")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    for part in arguments.parts:
-        folder = Folder(arguments.out / (f"{part}-quick" if arguments.quick else part))
-        PARTS[part](folder, arguments.quick)
-        print(f"{part}: look at {folder.path}")
+    parser.add_argument(
+        "parts", nargs="*", choices=[*PARTS, []], metavar="part", help=f"{listed}. Default: all"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
+    parser.add_argument("--quick", action="store_true", help="small clouds, a few minutes")
+    parser.add_argument("--threads", type=int, help="threads of torch; default: as torch decides")
+    parser.add_argument(
+        "--readme", action="store_true", help="put the main numbers into the README"
+    )
+    for key, title in TITLES.items():
+        parser.add_argument(f"--{key}", type=Path, metavar="PATH", help=f"the paper's {title}")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -1,47 +1,124 @@
-"""The script that makes the paper's figures again: small, resumed, complete."""
+"""The script that makes the paper's tables and figures again: small, resumed, complete."""
 
 import json
+import re
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from torchrg.scenes import make_room
+
 SCRIPTS = Path(__file__).parents[1] / "scripts"
-VARIANTS = ("pca", "paper", "consensus")
+VARIANTS = ("pca", "irls", "jet", "detmm", "paper", "consensus")
+
+pytest.importorskip("matplotlib").use("agg")
+
+
+@pytest.fixture(autouse=True)
+def _scripts_on_the_path(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
 
 
 @pytest.fixture
 def normals(monkeypatch):
     """The part ``normals`` with a grid that takes seconds."""
-    pytest.importorskip("matplotlib").use("agg")
-    monkeypatch.syspath_prepend(SCRIPTS)
-    from reproduction import normals
+    from reproduction import normal_figures, normals
 
-    small = normals.Grid(("cuboid", "dodecahedron"), (0.0, 0.25), (400,), VARIANTS)
+    small = (normals.Grid(60, ("cuboid", "dodecahedron"), (0.25,), VARIANTS),)
     monkeypatch.setattr(normals, "QUICK", small)
-    monkeypatch.setattr(normals, "FULL", small)
+    monkeypatch.setattr(normals, "_DRAWN_POINTS", 500)
+    monkeypatch.setattr(normals, "_warm_up", lambda variant: None)
+    monkeypatch.setattr(normal_figures, "_WIDTH", 60)
     return normals
 
 
-def test_part_writes_figures_tables_and_records(normals, tmp_path, capsys):
+@pytest.fixture
+def small(monkeypatch, normals):
+    """Everything small: clouds of a thousand points, pictures of some pixels."""
+    from reproduction import clouds, pictures, segmentations, study
+
+    room = make_room(600)
+    made = {key: (lambda: room, "a small room") for key in clouds.TITLES}
+    monkeypatch.setattr(clouds, "_QUICK", made)
+    monkeypatch.setattr(pictures, "_WIDTH", 60)
+    monkeypatch.setattr(segmentations, "_WARM_UP", 50)
+    monkeypatch.setattr(study, "ANGLES_DEG", (2.0, 5.0, 8.0))
+    return clouds
+
+
+@pytest.fixture
+def run(small, tmp_path):
     from reproduction.cells import Folder
+    from reproduction.segmentations import Run
 
-    normals.reproduce(Folder(tmp_path), quick=True)
-    records = json.loads((tmp_path / "normals.json").read_text())
-    assert len(records) == 2 * 2 * 3
-    assert {"shape", "noise_percent", "num_points", "variant", "seconds"} <= set(records[0])
-    assert {"msae", "rms", "median", "under_10_deg", "sharp_msae"} <= set(records[0]["score"])
-    assert {"commit", "torch", "processor", "threads"} <= set(records[0]["made_with"])
-    table = (tmp_path / "normals.md").read_text()
-    assert "| cuboid | 0.25 % |" in table
-    for name in ("figure3.png", "figure4.png", "figure4_all.png"):
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-    assert capsys.readouterr().out.count("MSAE") == len(records)
+    return Run(Folder(tmp_path), quick=True)
 
 
-def test_interrupted_run_goes_on_where_it_stopped(normals, tmp_path, monkeypatch):
-    from reproduction.cells import Folder
+def call_script(monkeypatch, *arguments):
+    import reproduce_paper
 
+    monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *map(str, arguments)])
+    reproduce_paper.main()
+
+
+def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch, capsys):
+    from reproduction import readme
+
+    call_script(monkeypatch, "--out", tmp_path, "--quick")
+    folder = tmp_path / "quick"
+    report = json.loads((folder / "report.json").read_text())
+    names = ["normals", "criteria", "study", "segmentation", "large", "times"]
+    assert list(report["parts"]) == names
+    page, text = (folder / "report.html").read_text(), (folder / "report.md").read_text()
+    for number in ("Table 1", "Table 2", "Table 3", *(f"Figure {n}" for n in (3, 4, 5, 7, 8, 9))):
+        assert number in page
+        assert number in text
+    files = set(re.findall(r"src='([^']*)'", page))
+    assert len(files) >= 14
+    assert files == set(re.findall(r"!\[[^]]*\]\(([^)]*)\)", text))
+    for file in files:
+        assert (folder / file).read_bytes().startswith(b"\x89PNG"), file
+    assert "paper: DetMM" in page
+    assert "9.84 min" in page
+    assert {"commit", "torch", "processor", "threads"} <= {
+        word.split()[0] for word in report["made_with"].split("; ")
+    }
+    # The README's section can be made from it.
+    section = readme.to_section(readme.take_results(report))
+    assert "small clouds" in section
+    assert section.count("\n| ---") == 2
+    full = readme.take_results({**report, "quick": False})
+    assert readme.to_section(full).count("\n| ---") == 3
+    shown = capsys.readouterr().out
+    assert all(f"== {name}: " in shown for name in names)
+
+    # A second call computes nothing again.
+    def refuse(*arguments, **settings):
+        raise AssertionError("computed twice")
+
+    from reproduction import normals, segmentations
+
+    monkeypatch.setattr(normals, "_measure", refuse)
+    for name in ("segment_planes", "score_labels", "score_clusters", "score_normals"):
+        monkeypatch.setattr(segmentations, name, refuse)
+    call_script(monkeypatch, "--out", tmp_path, "--quick")
+    assert json.loads((folder / "report.json").read_text()) == report
+
+
+def test_part_alone_makes_a_report_of_itself(small, tmp_path, monkeypatch):
+    call_script(monkeypatch, "--out", tmp_path, "--quick", "criteria")
+    report = json.loads((tmp_path / "quick" / "report.json").read_text())
+    assert list(report["parts"]) == ["criteria"]
+    assert "Figure 5" in (tmp_path / "quick" / "report.html").read_text()
+
+
+def test_interrupted_run_goes_on_where_it_stopped(normals, run, monkeypatch):
+    grid = normals.Grid(60, ("cuboid", "dodecahedron"), (0.0, 0.25), ("pca", "paper"))
+    monkeypatch.setattr(normals, "QUICK", (grid,))
+    monkeypatch.setattr(normals, "_blocks", lambda run, records: [])
     measured = []
     measure = normals._measure
 
@@ -53,11 +130,28 @@ def test_interrupted_run_goes_on_where_it_stopped(normals, tmp_path, monkeypatch
 
     monkeypatch.setattr(normals, "_measure", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        normals.reproduce(Folder(tmp_path), quick=True)
-    assert len(list((tmp_path / "cells").iterdir())) == 5
+        normals.reproduce(run)
+    assert len(list((run.folder.path / "cells").iterdir())) == 5
     monkeypatch.setattr(normals, "_measure", lambda *cell: measured.append(cell) or measure(*cell))
-    normals.reproduce(Folder(tmp_path), quick=True)
-    assert len(measured) == len(set(measured)) == 12
+    normals.reproduce(run)
+    assert len(measured) == len(set(measured)) == 2 * 2 * 2
+
+
+def test_record_without_its_file_is_made_again(run):
+    made = []
+    target = run.folder.place("picture.png")
+
+    def work():
+        made.append(1)
+        target.write_text("x")
+        return {"value": 1}
+
+    for _ in range(2):
+        run.folder.cell("a", work, needs=target)
+    assert len(made) == 1
+    target.unlink()
+    run.folder.cell("a", work, needs=target)
+    assert len(made) == 2
 
 
 def test_points_at_edges_are_those_whose_neighbors_lie_on_another_face(normals):
@@ -66,3 +160,137 @@ def test_points_at_edges_are_those_whose_neighbors_lie_on_another_face(normals):
     near = normals.search_knn(scene.points, normals.K).indices.long()
     other = (scene.labels[near] != scene.labels[:, None]).any(dim=1)
     assert torch.equal(at_edges, other)
+
+
+@pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
+def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run, preset):
+    from reproduction.segmentations import read_segmented, regrow
+
+    kept = read_segmented(run, "hallway", preset).labels
+    # Another angle by less than rounding: grown again instead of read.
+    assert torch.equal(regrow(run, "hallway", preset, 5.0 + 1e-12, 0.95), kept)
+    assert not torch.equal(regrow(run, "hallway", preset, 0.01, 0.95), kept)
+
+
+def test_outcome_of_each_point():
+    from reproduction.pictures import outcomes_of
+
+    truth = torch.tensor([7, 7, 7, 7, 7, 7, 7, 3, 3, 5, 5, -1])
+    labels = torch.tensor([0, 0, 0, 0, 2, 2, -1, 0, 0, 4, 4, 4])
+    right, part, other, none = range(4)
+    expected = [right] * 4 + [part] * 2 + [none] + [other] * 2 + [right] * 2 + [other]
+    assert outcomes_of(labels, truth).tolist() == expected
+    assert outcomes_of(torch.full((4,), -1), truth[:4]).tolist() == [none] * 4
+
+
+def test_file_of_the_paper_is_used_where_it_is_given(small, tmp_path):
+    from reproduction.clouds import load_cloud
+
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points[3] = np.nan
+    np.savez(tmp_path / "hall.npz", points=points, labels=np.arange(500))
+    cloud = load_cloud("hallway", tmp_path / "hall.npz", quick=False)
+    assert (len(cloud.points), cloud.is_papers) == (499, True)
+    assert cloud.labels.tolist() == [*range(3), *range(4, 500)]
+    assert load_cloud("hallway", None, quick=True).name != cloud.name
+
+
+def test_quick_run_takes_the_middle_of_a_file(small, tmp_path, monkeypatch):
+    from reproduction.clouds import load_cloud
+
+    monkeypatch.setattr(small, "QUICK_POINTS", 100)
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    np.savez(tmp_path / "hall.npz", points=points)
+    cloud = load_cloud("hallway", tmp_path / "hall.npz", quick=True)
+    middle = np.median(points, axis=0)
+    reached = np.linalg.norm(cloud.points.numpy() - middle, axis=1).max()
+    assert len(cloud.points) == 100
+    # torch's median of an even number is the lower of two, hence not exactly the hundredth.
+    assert reached <= np.sort(np.linalg.norm(points - middle, axis=1))[105]
+
+
+def scored(f1, recall):
+    """Records of the four methods with such scores."""
+    rest = {"pairs": 6, "faces": 26, "recall_iou50": 0.2}
+    names = ("classic", "detmm", "paper", "consensus")
+    return {
+        name: {"labels": {"f1": a, "recall": b, **rest}}
+        for name, a, b in zip(names, f1, recall, strict=True)
+    }
+
+
+def test_trends_hold_only_where_the_numbers_say_so():
+    from reproduction.segmentation_tables import trend_claims
+
+    good = trend_claims("hallway", scored((60, 80, 95, 97), (80, 85, 90, 95)), "a hall")
+    assert [claim["holds"] for claim in good] == [True, True, True]
+    bad = trend_claims("hallway", scored((60, 97, 95, 97), (90, 85, 90, 95)), "a hall")
+    assert [claim["holds"] for claim in bad] == [False, False, True]
+    assert "classic RG 60.0, DetMM 97.0, paper 95.0" in bad[0]["numbers"]
+    assert "of 26 faces" in bad[0]["why"]
+
+
+def test_ratio_is_the_papers_time_over_ours_per_point():
+    from reproduction.times import ratio, speed_claim
+
+    record = {"cloud": "cory", "preset": "paper", "points": 1_097_901, "total": 9.84}
+    assert ratio(record) == pytest.approx(60)
+    assert speed_claim([record])["holds"]
+    half = {**record, "points": 1_097_901 / 2}
+    assert ratio(half) == pytest.approx(30)
+    assert not speed_claim([{**half, "points": 548_950}])["holds"]
+    assert ratio({**record, "preset": "consensus"}) is None
+
+
+def test_best_numbers_are_bold():
+    from reproduction.sections import mark_best
+
+    assert mark_best([3.0, 1.0, None, 3.0], ".1f", higher=True) == [
+        "**3.0**",
+        "1.0",
+        "-",
+        "**3.0**",
+    ]
+    assert mark_best([3.0, 1.0], ".1f", higher=False) == ["3.0", "**1.0**"]
+    assert mark_best([3.0, 1.0], ".1f", higher=None) == ["3.0", "1.0"]
+    assert mark_best([3.0, None], ".1f", higher=True) == ["3.0", "-"]
+
+
+def test_page_escapes_words_and_shows_failed_claims():
+    from reproduction import sections
+    from reproduction.rendering import to_html, to_markdown
+
+    blocks = [
+        sections.claim("F1 < 5", False, "F1: 6."),
+        sections.table("", ["a", "b"], [["x & y", "**1**"]]),
+    ]
+    part = sections.section("Part", blocks, None)
+    report = {"title": "T", "intro": "I", "made_with": "M", "parts": {"part": part}}
+    page = to_html(report)
+    assert "<td>x &amp; y</td><td><b>1</b></td>" in page
+    assert "class='claim fails'><b>Does not come out:</b> F1 &lt; 5 F1: 6." in page
+    assert "> **Does not come out:** F1 < 5 F1: 6." in to_markdown(report)
+
+
+def test_results_in_the_readme_are_what_the_script_makes():
+    from reproduction import readme
+
+    text = readme.README.read_text(encoding="utf-8")
+    results = json.loads(readme.RESULTS.read_text(encoding="utf-8"))
+    assert readme.insert(text, results) == text
+    assert f"{readme.BEGIN}\n{readme.to_section(results)}\n{readme.END}" in text
+
+
+def test_readme_is_updated_between_the_markers_only(tmp_path, monkeypatch):
+    from reproduction import readme
+
+    results = json.loads(readme.RESULTS.read_text(encoding="utf-8"))
+    text = f"before\n{readme.BEGIN}\nold\n{readme.END}\nafter\n"
+    made = readme.insert(text, results)
+    assert made.startswith(f"before\n{readme.BEGIN}\nFrom the report")
+    assert made.endswith(f"\n{readme.END}\nafter\n")
+    assert "old" not in made
+    with pytest.raises(ValueError, match="expected a README with"):
+        readme.insert("no markers", results)
+    with pytest.raises(ValueError, match=r"got none of .*'large'"):
+        readme.take_results({"parts": {"normals": {}, "times": {}, "segmentation": {}}})

@@ -21,7 +21,7 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class Folder:
-    """Where the results of a part are kept.
+    """Where results are kept.
 
     Args:
         path: The folder; it is made when the first result comes.
@@ -29,13 +29,18 @@ class Folder:
 
     path: Path
 
-    def cell(self, name: str, work: Callable[[], Record]) -> Record:
+    def cell(self, name: str, work: Callable[[], Record], *, needs: Path | None = None) -> Record:
         """Return the record of that name, computed now if it is not there yet.
 
         A run that was interrupted goes on where it stopped, as records appear whole or not at all.
+
+        Args:
+            name: Of the record.
+            work: Computes it.
+            needs: A file that ``work`` writes beside it, without which the record is of no use.
         """
         path = self.path / "cells" / f"{name}.json"
-        if path.exists():
+        if path.exists() and (needs is None or needs.exists()):
             record: Record = json.loads(path.read_text())
             return record
         record = {**work(), "made_with": surroundings()}
@@ -45,10 +50,14 @@ class Folder:
 
     def write(self, name: Path | str, text: str) -> None:
         """Write a text file, whole or not at all."""
+        with atomic_path(self.place(name)) as path:
+            path.write_text(text, encoding="utf-8")
+
+    def place(self, name: Path | str) -> Path:
+        """Return the path of a file, its folder made."""
         target = self.path / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(target) as path:
-            path.write_text(text, encoding="utf-8")
+        return target
 
 
 def surroundings() -> Record:
@@ -64,6 +73,7 @@ def surroundings() -> Record:
     return {
         "torchrg": __version__,
         "commit": git.stdout.strip() or "unknown",
+        "python": platform.python_version(),
         "torch": torch.__version__,
         "numpy": np.__version__,
         "scipy": scipy.__version__,
@@ -71,6 +81,17 @@ def surroundings() -> Record:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
     }
+
+
+def describe_surroundings(records: list[Record]) -> str:
+    """Return how records were made, in one line; several values where they differ."""
+    made = [record["made_with"] for record in records]
+    values = {
+        name: ", ".join(dict.fromkeys(str(one[name]) for one in made))
+        for name in surroundings()
+        if all(name in one for one in made)
+    }
+    return "; ".join(f"{name} {value}" for name, value in values.items())
 
 
 def _processor() -> str:

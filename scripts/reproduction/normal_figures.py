@@ -1,13 +1,15 @@
 """Figures of normal errors, and of sharp feature points."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
-import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib import ticker
+from torch import Tensor
 
 from reproduction.cells import Record
+from reproduction.plotting import settings
+from torchrg.report import color_normals, color_sharp, render_cloud, tile_pictures, write_png
 from torchrg.scenes import Scene
 
 STYLES = {
@@ -24,41 +26,22 @@ STYLES = {
 }
 """Label, colour, marker and line of each estimator."""
 
-SHARP, REGULAR = "#d62728", "#1b5e20"
-
-SETTINGS = {
-    "font.family": "serif",
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.linewidth": 0.6,
-    "axes.grid": True,
-    "grid.linewidth": 0.3,
-    "grid.color": "#dddddd",
-    "lines.linewidth": 1.1,
-    "lines.markersize": 4,
-    "legend.frameon": False,
-    "savefig.dpi": 200,
-}
+_WIDTH = 700
 
 
-def draw_errors(folder: Path, records: list[Record]) -> None:
-    """Draw MSAE against noise: ``figure4.png``, and all shapes in ``figure4_all.png``.
+def draw_errors(path: Path, records: list[Record], shapes: Sequence[str]) -> None:
+    """Draw MSAE against noise, a panel for each shape.
 
     Args:
-        folder: Where the pictures go.
-        records: What was measured.
+        path: The picture to write.
+        records: What was measured, of one number of points.
+        shapes: What to draw.
     """
-    size = max(record["num_points"] for record in records)
-    records = [record for record in records if record["num_points"] == size]
-    shapes = list(dict.fromkeys(record["shape"] for record in records))
-    with mpl.rc_context(SETTINGS):
-        _draw_grid(
-            folder / "figure4.png", records, [s for s in shapes if s in ("cuboid", "dodecahedron")]
-        )
-        _draw_grid(folder / "figure4_all.png", records, shapes)
+    with settings():
+        _draw_grid(path, records, shapes)
 
 
-def _draw_grid(path: Path, records: list[Record], shapes: list[str]) -> None:
+def _draw_grid(path: Path, records: list[Record], shapes: Sequence[str]) -> None:
     """Draw one panel for each shape."""
     columns = min(len(shapes), 4)
     rows = -(-len(shapes) // columns)
@@ -104,51 +87,23 @@ def _draw_panel(axis: plt.Axes, records: list[Record]) -> None:
     axis.set_xticks(range(len(noises)), [f"{noise:g}" for noise in noises])
 
 
-def draw_sharp_points(folder: Path, clouds: list[tuple[str, Scene, object]]) -> None:
-    """Draw true normals and sharp feature points of shapes: ``figure3.png``.
+def draw_sharp_points(path: Path, clouds: list[tuple[str, Scene, Tensor]]) -> None:
+    """Draw true normals, and below them the sharp feature points, of shapes.
 
     Args:
-        folder: Where the picture goes.
+        path: The picture to write.
         clouds: Name, cloud with truth, and mask of sharp points of each shape.
     """
-    with mpl.rc_context(SETTINGS):
-        figure = plt.figure(figsize=(1.7 * len(clouds), 3.6), layout="constrained")
-        for column, (name, scene, sharp) in enumerate(clouds):
-            points, normals = scene.points.numpy(), scene.normals.numpy()
-            mask = np.asarray(sharp)
-            for row, colors in enumerate(
-                ((normals + 1) / 2, np.where(mask[:, None], *_rgb(SHARP, REGULAR)))
-            ):
-                axis = figure.add_subplot(
-                    2, len(clouds), row * len(clouds) + column + 1, projection="3d"
-                )
-                _draw_cloud(axis, points, normals, colors)
-                if row == 0:
-                    axis.set_title(name.replace("_", " "))
-        figure.savefig(folder / "figure3.png")
-        plt.close(figure)
-
-
-def _rgb(*colors: str) -> tuple[np.ndarray, ...]:
-    return tuple(np.array(mpl.colors.to_rgb(color)) for color in colors)
-
-
-def _draw_cloud(
-    axis: plt.Axes, points: np.ndarray, normals: np.ndarray, colors: np.ndarray
-) -> None:
-    """Draw the points that look at the reader, shaded a little."""
-    elevation, azimuth = np.radians(25), np.radians(-55)
-    to_reader = np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
-    facing = normals @ to_reader
-    seen = facing > 0
-    shaded = colors[seen] * (0.65 + 0.35 * facing[seen, None])
-    axis.scatter(*points[seen].T, c=shaded, s=3, linewidths=0, depthshade=False)
-    axis.view_init(np.degrees(elevation), np.degrees(azimuth))
-    axis.set_box_aspect(np.ptp(points, axis=0), zoom=1.15)
-    axis.set_axis_off()
+    pictures = [
+        render_cloud(
+            scene.points, paint, normals=scene.normals, view="outside", width=_WIDTH, height=_WIDTH
+        )
+        for paints in (
+            [color_normals(scene.normals) for _, scene, _ in clouds],
+            [color_sharp(sharp) for _, _, sharp in clouds],
+        )
+        for paint, (_, scene, _) in zip(paints, clouds, strict=True)
+    ]
+    names = [name.replace("_", " ") for name, _, _ in clouds]
+    titles = [*names, *("" for _ in names)]
+    write_png(path, tile_pictures(pictures, titles=titles, columns=len(clouds)))

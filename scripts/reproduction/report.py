@@ -1,0 +1,58 @@
+"""The report: one page of all parts that are there, as HTML, Markdown and JSON."""
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from reproduction.cells import Folder, Record, describe_surroundings
+from reproduction.rendering import to_html, to_markdown
+
+TITLE = "Indoor point cloud segmentation: the paper's evaluation, made again"
+INTRO = (
+    "Every number here was made by scripts/reproduce_paper.py of torchrg. The paper is: Indoor "
+    "Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate Normal "
+    "Estimation. Methods: classic (PCA normals, region growing as in PCL), DetMM (normals of all "
+    "points by DetMM, then the same growth), paper (its method), consensus (the default of "
+    "torchrg, not in the paper). Where a trend of the paper does not come out, it says so in red."
+)
+
+
+def write_report(folder: Folder, names: Sequence[str], *, quick: bool) -> Record:
+    """Write ``report.html``, ``report.md`` and ``report.json`` of the parts in a folder.
+
+    Args:
+        folder: Where parts and pictures are.
+        names: Parts in the order of the report; those that are not there are left out.
+        quick: Whether they are of small clouds.
+
+    Returns:
+        The report, as in ``report.json``.
+    """
+    parts: Record = {}
+    for name in names:
+        path = folder.path / "parts" / f"{name}.json"
+        if path.exists():
+            parts[name] = json.loads(path.read_text())
+    made = list(_find_made(parts))
+    report = {
+        "title": TITLE + (" (quick: small clouds)" if quick else ""),
+        "intro": INTRO,
+        "quick": quick,
+        "made_with": describe_surroundings(made) if made else "",
+        "parts": parts,
+    }
+    folder.write("report.json", json.dumps(report, indent=1))
+    folder.write("report.md", to_markdown(report))
+    folder.write("report.html", to_html(report))
+    return report
+
+
+def _find_made(value: Any) -> Iterator[Record]:  # noqa: ANN401
+    """Yield every record inside that says how it was made."""
+    if isinstance(value, dict):
+        if "made_with" in value:
+            yield value
+        value = list(value.values())
+    if isinstance(value, list):
+        for inner in value:
+            yield from _find_made(inner)

@@ -1,0 +1,229 @@
+"""Segmentations of the clouds, each computed once and kept with its times and scores."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from reproduction.cells import Folder, Record
+from reproduction.clouds import EvalCloud, load_cloud
+from torchrg import Cloud, load_config, read_cloud, search_knn, segment_planes, write_cloud
+from torchrg.metrics import score_clusters, score_labels, score_normals
+from torchrg.regions import grow_regions
+from torchrg.scenes import make_room
+from torchrg.structures import Neighbors
+
+METHODS = {
+    "classic": "classic RG",
+    "detmm": "DetMM",
+    "paper": "paper",
+    "consensus": "consensus",
+}
+"""Presets that are compared, and their names in tables."""
+
+SAMPLE_SIZE = 4000
+"""Points of a cluster whose pairs the internal indices take all; see ``score_clusters``."""
+
+_WARM_UP = 2000
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """What a segmentation gave, read back from its file.
+
+    Attributes:
+        labels: Shape ``(N,)``, int64.
+        normals: Shape ``(N, 3)``.
+        curvature: Shape ``(N,)``.
+        valid: Shape ``(N,)``, bool.
+        sharp: Shape ``(N,)``, bool.
+    """
+
+    labels: Tensor
+    normals: Tensor
+    curvature: Tensor
+    valid: Tensor
+    sharp: Tensor
+
+
+@dataclass(frozen=True)
+class Run:
+    """One call of the script.
+
+    Args:
+        folder: Where results go.
+        quick: Whether small clouds will do.
+        paths: The paper's own clouds, by key.
+    """
+
+    folder: Folder
+    quick: bool
+    paths: Mapping[str, Path | None] = field(default_factory=dict)
+    _clouds: dict[str, "LoadedCloud"] = field(default_factory=dict)
+    _warm: set[str] = field(default_factory=set)
+
+    def cloud(self, key: str) -> "LoadedCloud":
+        """Return a cloud, loaded once."""
+        if key not in self._clouds:
+            # Neighbours of a million points are large: those of other clouds are let go.
+            for other in self._clouds.values():
+                other.__dict__.pop("neighbors", None)
+            cloud = load_cloud(key, self.paths.get(key), quick=self.quick)
+            self._clouds[key] = LoadedCloud(cloud)
+        return self._clouds[key]
+
+    def warm_up(self, preset: str) -> None:
+        """Segment a small cloud first, so that no time includes the loading of code."""
+        if preset not in self._warm:
+            segment_planes(make_room(_WARM_UP).points, load_config(preset))
+            self._warm.add(preset)
+
+
+@dataclass(frozen=True)
+class LoadedCloud:
+    """A cloud, and its neighbours once they are asked for."""
+
+    cloud: EvalCloud
+
+    @cached_property
+    def neighbors(self) -> Neighbors:
+        """The neighbours that all presets use."""
+        return search_knn(self.cloud.points, load_config().normals.k)
+
+
+def segment(run: Run, key: str, preset: str) -> Record:
+    """Segment a cloud, and return the seconds of each stage.
+
+    Args:
+        run: The call.
+        key: Of the cloud.
+        preset: A key of :data:`METHODS`.
+
+    Returns:
+        The record, with ``seconds`` by stage and their sum ``total``.
+    """
+    cloud = run.cloud(key).cloud
+    target = _result_path(run, key, preset)
+
+    def work() -> Record:
+        run.warm_up(preset)
+        print(f"{cloud.name}, {preset}:", end="", flush=True)
+        begins: dict[str, float] = {}
+
+        def note(stage: str) -> None:
+            begins[stage] = time.perf_counter()
+            print(f" {stage}", end="", flush=True)
+
+        seg = segment_planes(cloud.points, load_config(preset), on_stage=note)
+        names, times = list(begins), list(begins.values())
+        seconds = {
+            name: end - begin
+            for name, begin, end in zip(names, times[:-1], times[1:], strict=False)
+        }
+        total = times[-1] - times[0]
+        print(f", {total:.1f} s", flush=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_cloud(target, Cloud(cloud.points.numpy()), seg)
+        return {
+            "cloud": key,
+            "preset": preset,
+            "points": len(cloud.points),
+            "seconds": seconds,
+            "total": total,
+            "sharp_fraction": float(seg.sharp.double().mean()),
+        }
+
+    return run.folder.cell(f"segment-{cloud.name}-{preset}", work, needs=target)
+
+
+def read_segmented(run: Run, key: str, preset: str) -> Segmented:
+    """Return a segmentation, computed first if it is not there yet."""
+    segment(run, key, preset)
+    fields = read_cloud(_result_path(run, key, preset)).fields
+    names = ("labels", "normals", "curvature", "valid", "sharp")
+    return Segmented(*(torch.from_numpy(fields[name]) for name in names))
+
+
+def score(run: Run, key: str, preset: str, *, internal: bool) -> Record:
+    """Score a segmentation by all indices that its cloud allows.
+
+    Args:
+        run: The call.
+        key: Of the cloud.
+        preset: A key of :data:`METHODS`.
+        internal: Whether to add CP, SP, DBI and DVI, of faces and of distinct directions.
+
+    Returns:
+        The record: ``labels`` and ``normals`` where there is a truth, ``clusters`` and
+        ``directions`` if asked for, and ``regions`` and ``share_labeled``.
+    """
+    cloud = run.cloud(key).cloud
+
+    def work() -> Record:
+        found = read_segmented(run, key, preset)
+        record = {"cloud": key, "preset": preset, **count_regions(found.labels)}
+        if cloud.labels is not None:
+            record["labels"] = score_labels(found.labels, cloud.labels)._asdict()
+        if cloud.normals is not None:
+            valid = found.valid
+            record["normals"] = score_normals(found.normals, cloud.normals, valid=valid)._asdict()
+        if internal:
+            for name, distinct in (("clusters", False), ("directions", True)):
+                record[name] = score_clusters(
+                    found.normals,
+                    found.labels,
+                    distinct_directions=distinct,
+                    sample_size=SAMPLE_SIZE,
+                )._asdict()
+        return record
+
+    kind = "indices" if internal else "external"
+    return run.folder.cell(f"{kind}-{cloud.name}-{preset}", work)
+
+
+def regrow(
+    run: Run, key: str, preset: str, max_angle_deg: float, curvature_quantile: float
+) -> Tensor:
+    """Return the labels that the normals of a preset give with other limits of growth.
+
+    Args:
+        run: The call.
+        key: Of the cloud.
+        preset: Normals and all other settings are those of this preset.
+        max_angle_deg: The limit of the angle.
+        curvature_quantile: The limit of the curvature.
+
+    Returns:
+        Labels, shape ``(N,)``, int64.
+    """
+    loaded = run.cloud(key)
+    growing = load_config(preset).growing
+    found = read_segmented(run, key, preset)
+    if (max_angle_deg, curvature_quantile) == (growing.max_angle_deg, growing.curvature_quantile):
+        return found.labels
+    settings = replace(growing, max_angle_deg=max_angle_deg, curvature_quantile=curvature_quantile)
+    return grow_regions(
+        loaded.cloud.points,
+        found.normals,
+        found.curvature,
+        loaded.neighbors,
+        settings,
+        valid=found.valid,
+    )
+
+
+def count_regions(labels: Tensor) -> Record:
+    """Return how many regions there are, and the share of points that lie in one."""
+    return {
+        "regions": int(labels.max()) + 1,
+        "share_labeled": float((labels >= 0).double().mean()),
+    }
+
+
+def _result_path(run: Run, key: str, preset: str) -> Path:
+    name = run.cloud(key).cloud.name
+    return run.folder.path / "segmentations" / f"{name}-{preset}.npz"
