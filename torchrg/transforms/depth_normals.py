@@ -6,13 +6,15 @@ import torch
 from torch import Tensor
 
 from torchrg.transforms.depth_noise import noise_by_radius
-from torchrg.transforms.depth_windows import WindowPlanes, fit_windows, least_in_windows
+from torchrg.transforms.depth_windows import WindowPlanes, fit_windows, least_in_windows, moved
 
 RADII = (16, 8, 4, 2)
 """Radii of the windows, the largest first."""
 
 _FLAT = 1.35
 _OWN_REACH = 3.5
+_SAME_NOISE = 2.0
+_LEAST_QUARTERS = 0.7
 
 
 class PixelPlanes(NamedTuple):
@@ -46,11 +48,12 @@ def fit_pixels(
 
     In inverse depth ``w = 1 / z`` a plane of space is a plane over the image [1],
     ``w = (n_x x + n_y y + n_z) / d`` with the ray ``(x, y, 1)``, and the noise of a triangulating
-    sensor is the same everywhere, so that plain least squares is right, and a window is flat when
-    it deviates from its plane by at most 1.35 times the noise. A window across a step or an edge is
-    not. For each radius, the largest first, a pixel takes the window around itself if that is
-    flat; else the flattest window that holds it; in both cases only if the pixel itself is within
-    3.5 times the noise of the plane [2]. Pixels in no flat window take the smallest around them.
+    sensor is the same everywhere, so that plain least squares is right. A window is flat when it
+    deviates from its plane by at most 1.35 times the noise, and hardly more than its four quarters
+    do from planes of their own; one across a step or an edge is not. For each radius, the largest
+    first, a pixel takes the window around itself if that is flat; else the flattest window that
+    holds it [2]; in both cases only if the pixel itself is within 3.5 times the noise of the plane.
+    Pixels in no flat window take the smallest around them.
 
     Args:
         inverse: Inverse depth, shape ``(H, W)``, float64; anything finite where not seen.
@@ -66,8 +69,8 @@ def fit_pixels(
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban
         scene reconstruction. CVPR, 2010.
-        [2] M. Kuwahara et al. Processing of RI-angiocardiographic images. 1976: the window of least
-        variance among those that hold a pixel.
+        [2] M. Kuwahara et al. Processing of RI-angiocardiographic images. Digital Processing of
+        Biomedical Images, 1976.
 
     Example:
         >>> u, v = torch.arange(40.0).double() - 20, torch.arange(30.0).double()[:, None] - 15
@@ -86,6 +89,12 @@ def fit_pixels(
     for size in RADII:
         around, level = windows[size], levels[size]
         relative = torch.where(seen, around.deviation / level, torch.inf)
+        if size // 2 in windows:
+            quarters = _deviation_of_quarters(windows[size // 2].deviation, size // 2)
+            # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
+            usual = torch.maximum(quarters * (level / levels[size // 2]), _LEAST_QUARTERS * level)
+            same = around.deviation <= (1 + _SAME_NOISE / (2 * size + 1)) * usual
+            relative = torch.where(same, relative, torch.inf)
         least, places = least_in_windows(relative, size)
         for planes, ratio, beside in (
             (around, relative, False),
@@ -98,3 +107,13 @@ def fit_pixels(
             edge |= new & beside
             flat |= new
     return PixelPlanes(chosen, radius, flat, edge, levels[RADII[0]])
+
+
+def _deviation_of_quarters(deviation: Tensor, reach: int) -> Tensor:
+    """Return the root mean square deviation of the four windows around a place; inf without any."""
+    squares, count = torch.zeros_like(deviation), torch.zeros_like(deviation)
+    for step in ((-reach, -reach), (-reach, reach), (reach, -reach), (reach, reach)):
+        part = moved(deviation, step, fill=torch.inf)
+        squares += torch.where(part.isfinite(), part * part, 0.0)
+        count += part.isfinite()
+    return torch.where(count > 0, squares / count, torch.inf).sqrt()

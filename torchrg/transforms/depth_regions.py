@@ -17,6 +17,7 @@ from torchrg.regions.segments import Segments
 from torchrg.structures import UNLABELED, Neighbors
 from torchrg.transforms.depth_config import DepthConfig
 from torchrg.transforms.depth_normals import PixelPlanes
+from torchrg.transforms.depth_windows import moved
 
 AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Steps in rows and columns to the pixels around one, the nearest first."""
@@ -26,7 +27,7 @@ _CURVED = 3.0
 
 
 class InverseCloud(NamedTuple):
-    """A depth image as a cloud where planes stay planes and noise is one and the same.
+    """A depth image as a cloud where planes stay planes and noise is the same near and far.
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
     the median depth ``c``: a projective map of space.
@@ -44,6 +45,20 @@ class InverseCloud(NamedTuple):
     seen: Tensor
 
 
+class PixelRegions(NamedTuple):
+    """Regions of a depth image.
+
+    Attributes:
+        labels: Shape ``(H * W,)``: 0 to M-1 by descending size, or :data:`torchrg.UNLABELED`.
+        normals: Unit normals of their planes towards the camera, in space, shape ``(M, 3)``.
+        curved: Whether a region is thicker than noise can make it, shape ``(M,)``, bool.
+    """
+
+    labels: Tensor
+    normals: Tensor
+    curved: Tensor
+
+
 def grow_pixels(
     cloud: InverseCloud,
     pixels: PixelPlanes,
@@ -51,7 +66,7 @@ def grow_pixels(
     u: Tensor,
     v: Tensor,
     config: DepthConfig,
-) -> Tensor:
+) -> PixelRegions:
     """Grow regions over a depth image, and give border pixels and parts of one face to them.
 
     Two pixels side by side are neighbours if both have a flat window, their normals are within the
@@ -69,7 +84,7 @@ def grow_pixels(
         config: Settings.
 
     Returns:
-        Labels, shape ``(H * W,)``: 0 to M-1 by descending size, or :data:`torchrg.UNLABELED`.
+        The regions.
     """
     rows = _rows_around(pixels.flat)
     joined = torch.stack([_joins(pixels, normals, u, v, step, config) for step in AROUND], dim=-1)
@@ -91,31 +106,19 @@ def grow_pixels(
         valid=pixels.flat.flatten(),
         canonical=True,
     )
+    if not bool((labels >= 0).any()):
+        return PixelRegions(labels, normals.new_empty(0, 3), pixels.flat.new_empty(0))
     image = cloud.seen.view(pixels.flat.shape)
     beside = torch.stack([image & moved(image, step, fill=False) for step in AROUND], dim=-1)
     touching = Neighbors(rows, _with_self(beside))
     for _ in range(_NUM_ROUNDS):
-        if not bool((labels >= 0).any()):
-            break
         labels = _absorb(cloud, labels, touching, config)
         labels = _merge(cloud, labels, touching, config)
-    return labels
-
-
-def moved(image: Tensor, step: tuple[int, int], *, fill: float) -> Tensor:
-    """Return for each pixel the value of the one a step away, ``fill`` outside, ``(H, W, *)``.
-
-    Example:
-        >>> moved(torch.tensor([[1, 2, 3]]), (0, 1), fill=0)
-        tensor([[2, 3, 0]])
-    """
-    result = torch.full_like(image, fill)
-    target, source = [], []
-    for length, way in zip(image.shape, step, strict=False):
-        target.append(slice(max(0, -way), length - max(0, way)))
-        source.append(slice(max(0, way), length - max(0, -way)))
-    result[tuple(target)] = image[tuple(source)]
-    return result
+    _, fit, _, curved = _planes_of(cloud, labels)
+    distance = (fit.normal * fit.center).sum(dim=1)
+    away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
+    away = torch.where(fit.normal[:, 2:] < 0, -away, away)
+    return PixelRegions(labels, -away / away.norm(dim=1, keepdim=True), curved)
 
 
 def _joins(

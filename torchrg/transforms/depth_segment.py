@@ -75,9 +75,15 @@ def segment_depth(
     normals, distance = _normals(pixels, fx, fy)
     valid = seen & (pixels.radius > 0)
     cloud = _inverse_cloud(inverse, seen, pixels, u / fx, v / fy, (fx, fy))
-    labels = grow_pixels(cloud, pixels, normals, u, v, config)
+    regions = grow_pixels(cloud, pixels, normals, u, v, config)
+    labels = regions.labels
     curvature = torch.where(valid, _curvature(pixels, inverse, distance, u, v, (fx, fy)), 0.0)
-    normals = torch.where(valid[..., None], normals, 0.0)
+    normals = torch.where(valid[..., None], normals, 0.0).view(-1, 3)
+    # A window at a border that is not flat has no normal of its own; the region has.
+    borders = (~pixels.flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    borders = borders[~regions.curved[labels[borders]]]
+    normals[borders] = regions.normals[labels[borders]]
+    valid.view(-1)[borders] = True
 
     points = depth_to_points(depth[None].double(), intrinsics[None].double())[0]
     if pose is not None:
@@ -85,14 +91,14 @@ def segment_depth(
         points = points @ pose[:3, :3].T + pose[:3, 3]
         normals = normals @ pose[:3, :3].T
     rows = seen.flatten().nonzero().squeeze(1)
-    planes = summarize_planes(points.view(-1, 3)[rows], normals.view(-1, 3)[rows], labels[rows])
+    planes = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
     return Segmentation(
         labels.view(depth.shape),
-        normals.to(depth.dtype),
+        normals.view(*depth.shape, 3).to(depth.dtype),
         curvature.to(depth.dtype),
         pixels.edge,
         valid,
-        planes,
+        planes._replace(curved=regions.curved),
     )
 
 

@@ -120,3 +120,19 @@ def least_in_windows(image: Tensor, radius: int) -> tuple[Tensor, Tensor]:
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
         place = place[chosen.flatten()]
     return -best[0, 0], place.view(image.shape)
+
+
+def moved(image: Tensor, step: tuple[int, int], *, fill: float) -> Tensor:
+    """Return for each pixel the value of the one a step away, ``fill`` outside, ``(H, W, *)``.
+
+    Example:
+        >>> moved(torch.tensor([[1, 2, 3]]), (0, 1), fill=0)
+        tensor([[2, 3, 0]])
+    """
+    result = torch.full_like(image, fill)
+    target, source = [], []
+    for length, way in zip(image.shape, step, strict=False):
+        target.append(slice(max(0, -way), length - max(0, way)))
+        source.append(slice(max(0, way), length - max(0, -way)))
+    result[tuple(target)] = image[tuple(source)]
+    return result
