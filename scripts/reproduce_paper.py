@@ -11,6 +11,7 @@ DIR/quick. Clouds of the paper that are not given are replaced by made ones with
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from reproduction import criteria, large, normals, readme, segmentation_tables, 
 from reproduction.cells import Folder, Record
 from reproduction.clouds import TITLES
 from reproduction.report import write_report
-from reproduction.segmentations import Run
+from reproduction.runs import Run
 
 PARTS: dict[str, tuple[Callable[[Run], Record], str]] = {
     "normals": (normals.reproduce, "Table 1, Figures 3 and 4: errors and times of normals"),
@@ -75,4 +76,7 @@ def _parse() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit("Interrupted; the same command goes on from here.")

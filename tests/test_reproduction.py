@@ -38,13 +38,13 @@ def normals(monkeypatch):
 @pytest.fixture
 def small(monkeypatch, normals):
     """Everything small: clouds of a thousand points, pictures of some pixels."""
-    from reproduction import clouds, pictures, segmentations, study
+    from reproduction import clouds, pictures, runs, study
 
     room = make_room(600)
     made = {key: (lambda: room, "a small room") for key in clouds.TITLES}
     monkeypatch.setattr(clouds, "_QUICK", made)
     monkeypatch.setattr(pictures, "_WIDTH", 60)
-    monkeypatch.setattr(segmentations, "_WARM_UP", 50)
+    monkeypatch.setattr(runs, "_WARM_UP", 50)
     monkeypatch.setattr(study, "ANGLES_DEG", (2.0, 5.0, 8.0))
     return clouds
 
@@ -52,7 +52,7 @@ def small(monkeypatch, normals):
 @pytest.fixture
 def run(small, tmp_path):
     from reproduction.cells import Folder
-    from reproduction.segmentations import Run
+    from reproduction.runs import Run
 
     return Run(Folder(tmp_path), quick=True)
 
@@ -81,7 +81,7 @@ def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch, capsys):
     assert files == set(re.findall(r"!\[[^]]*\]\(([^)]*)\)", text))
     for file in files:
         assert (folder / file).read_bytes().startswith(b"\x89PNG"), file
-    assert "paper: DetMM" in page
+    assert "printed: proposed" in page
     assert "9.84 min" in page
     assert {"commit", "torch", "processor", "threads"} <= {
         word.split()[0] for word in report["made_with"].split("; ")
@@ -104,7 +104,7 @@ def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(normals, "_measure", refuse)
     for name in ("segment_planes", "score_labels", "score_clusters", "score_normals"):
         monkeypatch.setattr(segmentations, name, refuse)
-    call_script(monkeypatch, "--out", tmp_path, "--quick")
+    call_script(monkeypatch, "--out", tmp_path, "--quick", "normals", "segmentation", "times")
     assert json.loads((folder / "report.json").read_text()) == report
 
 
@@ -220,7 +220,7 @@ def scored(f1, recall):
 
 
 def test_trends_hold_only_where_the_numbers_say_so():
-    from reproduction.segmentation_tables import trend_claims
+    from reproduction.trends import trend_claims
 
     good = trend_claims("hallway", scored((60, 80, 95, 97), (80, 85, 90, 95)), "a hall")
     assert [claim["holds"] for claim in good] == [True, True, True]
@@ -254,6 +254,7 @@ def test_best_numbers_are_bold():
     assert mark_best([3.0, 1.0], ".1f", higher=False) == ["3.0", "**1.0**"]
     assert mark_best([3.0, 1.0], ".1f", higher=None) == ["3.0", "1.0"]
     assert mark_best([3.0, None], ".1f", higher=True) == ["3.0", "-"]
+    assert mark_best([3.0, 3.0], ".1f", higher=True) == ["3.0", "3.0"]
 
 
 def test_page_escapes_words_and_shows_failed_claims():

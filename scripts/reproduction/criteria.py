@@ -9,8 +9,8 @@ from torch import Tensor
 
 from reproduction.cells import Record
 from reproduction.plotting import settings
+from reproduction.runs import Run
 from reproduction.sections import figure, section, text
-from reproduction.segmentations import Run
 from torchrg import estimate_normals, load_config, search_knn
 from torchrg.neighbors import gather_patches
 from torchrg.regions.criteria import coplanarity_limits, patch_radii, plane_residuals

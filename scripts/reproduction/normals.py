@@ -18,8 +18,8 @@ from reproduction.normal_tables import (
     values,
     where,
 )
+from reproduction.runs import Run
 from reproduction.sections import Block, figure, section, text
-from reproduction.segmentations import Run
 from torchrg.config import NormalsConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_normals
@@ -32,7 +32,7 @@ EDGE_DEG = 20.0
 """A point is at an edge if the true normal of a neighbour differs by more than this."""
 
 
-_NUM_DRAWN, _DRAWN_POINTS = 6, 35_000
+_NUM_DRAWN, _DRAWN_POINTS = 6, 100_000
 
 
 class Grid(NamedTuple):

@@ -38,7 +38,7 @@ def section(title: str, blocks: Sequence[Block], records: Any) -> dict[str, Any]
 
 
 def mark_best(values: Sequence[float | None], form: str, *, higher: bool | None) -> list[str]:
-    """Return printed numbers, the best ones bold, and a dash for those that are missing.
+    """Return printed numbers, the best bold unless all are equal, and a dash for missing ones.
 
     Example:
         >>> mark_best([1.0, None, 2.0], ".1f", higher=True)
@@ -46,7 +46,7 @@ def mark_best(values: Sequence[float | None], form: str, *, higher: bool | None)
     """
     shown = ["-" if value is None else format(value, form) for value in values]
     known = [value for value in values if value is not None]
-    if higher is None or len(known) < 2:
+    if higher is None or len(set(shown) - {"-"}) < 2:
         return shown
     best = format(max(known) if higher else min(known), form)
     return [f"**{word}**" if word == best else word for word in shown]

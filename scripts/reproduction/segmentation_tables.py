@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from reproduction.cells import Record
 from reproduction.paper_numbers import INDEX_NAMES, INDICES
 from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side, outcomes_of
-from reproduction.sections import Block, claim, figure, mark_best, section, table, text
-from reproduction.segmentations import METHODS, SAMPLE_SIZE, Run, read_segmented, score
+from reproduction.runs import Run
+from reproduction.sections import Block, figure, mark_best, section, table, text
+from reproduction.segmentations import METHODS, SAMPLE_SIZE, read_segmented, score
+from reproduction.trends import INTERNAL, internal_claim, trend_claims
 from torchrg.metrics import METRICS
 
 CLOUDS = {"tutorial": "Figure 7", "hallway": "Figure 8"}
@@ -28,7 +30,8 @@ MORE = {
 """What stands below the paper's indices: they say nothing about regions and faces without a
 partner."""
 
-_UNITS = {"cp": "CP", "sp": "SP", "dbi": "DBI", "dvi": "DVI"}
+PRINTED = {"classic": "[28]", "detmm": "[38]", "paper": "proposed"}
+"""Names of the methods in the paper's Table 2."""
 
 
 def reproduce(run: Run) -> Record:
@@ -57,7 +60,7 @@ def reproduce(run: Run) -> Record:
         cloud = run.cloud(key).cloud
         found = {preset: score(run, key, preset, internal=True) for preset in METHODS}
         records += list(found.values())
-        blocks.append(index_table(key, cloud.origin, found))
+        blocks += [index_table(key, cloud.origin, found), internal_claim(key, found)]
         if cloud.labels is not None:
             blocks += trend_claims(key, found, cloud.origin)
         blocks += draw_figures(run, key, number, METHODS)
@@ -85,7 +88,12 @@ def draw_figures(run: Run, key: str, number: str, presets: Sequence[str]) -> lis
     return [
         figure(file, words),
         figure(file2, f"What became of each point of {cloud.origin}."),
-        table("Share of the points of that figure", ["method", *meanings], shares),
+        table(
+            "Share of the points of that figure",
+            ["method", *meanings],
+            shares,
+            "A face that shadows cut into pieces is often found in pieces.",
+        ),
     ]
 
 
@@ -94,12 +102,12 @@ def index_table(key: str, origin: str, found: dict[str, Record]) -> Block:
     papers = INDICES[key]
     rows = []
     for place, name in enumerate(INDEX_NAMES):
-        part = "clusters" if name in _UNITS else "labels"
+        part = "clusters" if name in INTERNAL else "labels"
         higher = METRICS[part][name].higher_is_better
         form = ".4f" if part == "clusters" else ".1f"
         theirs = [papers[preset][place] for preset in papers]
         ours = [_index(record, part, name) for record in found.values()]
-        title = _UNITS.get(name, name.capitalize())
+        title = INTERNAL.get(name, name.capitalize())
         rows.append(
             [
                 f"{title} {'↑' if higher else '↓'}",
@@ -107,13 +115,13 @@ def index_table(key: str, origin: str, found: dict[str, Record]) -> Block:
                 *mark_best(ours, form, higher=higher),
             ]
         )
-    for name, title in _UNITS.items():
+    for name, title in INTERNAL.items():
         higher = METRICS["clusters"][name].higher_is_better
         ours = [_index(record, "directions", name) for record in found.values()]
         row = [f"{title} of directions {'↑' if higher else '↓'}", *[""] * len(papers)]
         rows.append(row + mark_best(ours, ".4f", higher=higher))
     rows += more_rows(found, len(papers))
-    head = [f"**{key}**", *(f"paper: {METHODS[preset]}" for preset in papers), *METHODS.values()]
+    head = [f"**{key}**", *(f"printed: {PRINTED[preset]}" for preset in papers), *METHODS.values()]
     note = (
         f"Left, the paper's printed numbers; right, ours on {origin}. Clusters of more than "
         f"{SAMPLE_SIZE:,} points enter DBI by a subsample of that size."
@@ -132,50 +140,6 @@ def more_rows(found: dict[str, Record], empty: int = 0) -> list[list[str]]:
             higher = METRICS["labels"][name].higher_is_better
             rows.append([title, *[""] * empty, *mark_best(values, form, higher=higher)])
     return rows
-
-
-def trend_claims(key: str, found: dict[str, Record], origin: str) -> list[Block]:
-    """Return whether the paper's trends come out on a cloud with truth."""
-    f1 = {preset: found[preset]["labels"]["f1"] for preset in METHODS}
-    recall = {preset: found[preset]["labels"]["recall"] for preset in METHODS}
-    ordered = f1["classic"] < f1["detmm"] < f1["paper"]
-    iou = {preset: found[preset]["labels"]["recall_iou50"] for preset in METHODS}
-    pairs = {preset: found[preset]["labels"]["pairs"] for preset in METHODS}
-    faces = found["classic"]["labels"]["faces"]
-    why = (
-        ""
-        if ordered
-        else (
-            f"F1 is a mean over matched pairs only, and these are {_listed(pairs, 'd')} of "
-            f"{faces} faces; the share of faces found at IoU 0.5 is {_listed(iou, '.3f')}. The "
-            "picture of errors below shows which points are lost, and to what."
-        )
-    )
-    blocks = [
-        claim(
-            f"F1 rises from classic over DetMM to the paper's method ({origin}).",
-            ordered,
-            f"F1: {_listed(f1, '.1f')}.",
-            why,
-        )
-    ]
-    blocks += [
-        claim(
-            f"Recall of {METHODS[preset]} is above that of classic ({origin}).",
-            recall[preset] > recall["classic"],
-            f"Recall: {recall[preset]:.1f} against {recall['classic']:.1f}.",
-            ""
-            if recall[preset] > recall["classic"]
-            else f"Pairs: {pairs[preset]} against {pairs['classic']} of {faces} faces; the hard "
-            "faces that only one method finds count in its mean alone.",
-        )
-        for preset in ("paper", "consensus")
-    ]
-    return blocks
-
-
-def _listed(values: dict[str, float], form: str) -> str:
-    return ", ".join(f"{METHODS[preset]} {format(value, form)}" for preset, value in values.items())
 
 
 def _index(record: Record, part: str, name: str) -> float | None:

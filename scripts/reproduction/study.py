@@ -10,8 +10,9 @@ from torch import Tensor
 from reproduction.cells import Record
 from reproduction.pictures import draw_side_by_side
 from reproduction.plotting import settings
+from reproduction.runs import Run
 from reproduction.sections import Block, claim, figure, section, table, text
-from reproduction.segmentations import METHODS, Run, count_regions, regrow
+from reproduction.segmentations import METHODS, count_regions, regrow
 from torchrg.metrics import adjusted_rand_index, contingency_table, score_labels
 
 ANGLES_DEG = tuple(float(angle) for angle in range(2, 11))
@@ -99,22 +100,29 @@ def _claims(records: list[Record]) -> list[Block]:
                 f"(at {least['angle']:g} degrees).",
             )
         )
-    mine = {r["angle"]: r["quantiles"][0] for r in records if r["preset"] == "paper"}
-    blocks.append(
-        claim(
-            "The paper's method labels less at 2 degrees than at 5, and joins more at 8.",
-            mine[2.0]["share_labeled"] < mine[5.0]["share_labeled"]
-            and mine[8.0]["largest"] > mine[5.0]["largest"],
-            "Points labelled at 2, 5 and 8 degrees: "
-            + ", ".join(f"{100 * mine[a]['share_labeled']:.1f} %" for a in DRAWN_DEG)
-            + "; points in the largest region: "
-            + ", ".join(f"{100 * mine[a]['largest']:.1f} %" for a in DRAWN_DEG)
-            + "; regions: "
-            + ", ".join(f"{mine[a]['regions']}" for a in DRAWN_DEG)
-            + ".",
-        )
-    )
+    blocks += [_join_claim(records, preset) for preset in ("classic", "paper")]
     return blocks
+
+
+def _join_claim(records: list[Record], preset: str) -> Block:
+    """Return whether a method joins too little at the least angle drawn, too much at the most."""
+    mine = {r["angle"]: r["quantiles"][0] for r in records if r["preset"] == preset}
+    low, middle, high = (mine[angle] for angle in DRAWN_DEG)
+    listed = {
+        "points labelled": [
+            f"{100 * found['share_labeled']:.1f} %" for found in (low, middle, high)
+        ],
+        "points in the largest region": [
+            f"{100 * found['largest']:.1f} %" for found in (low, middle, high)
+        ],
+        "regions": [str(found["regions"]) for found in (low, middle, high)],
+    }
+    numbers = "; ".join(f"{name} {', '.join(values)}" for name, values in listed.items())
+    return claim(
+        f"Fewer points are labelled at 2 degrees than at 5, and more are joined at 8 ({preset}).",
+        low["share_labeled"] < middle["share_labeled"] and high["largest"] > middle["largest"],
+        f"At 2, 5 and 8 degrees: {numbers}.",
+    )
 
 
 def _table(records: list[Record]) -> Block:

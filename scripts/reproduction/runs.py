@@ -1,0 +1,59 @@
+"""One call of the script: its clouds, loaded once, and where its results go."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from reproduction.cells import Folder
+from reproduction.clouds import EvalCloud, load_cloud
+from torchrg import load_config, search_knn, segment_planes
+from torchrg.scenes import make_room
+from torchrg.structures import Neighbors
+
+_WARM_UP = 2000
+
+
+@dataclass(frozen=True)
+class Run:
+    """One call of the script.
+
+    Args:
+        folder: Where results go.
+        quick: Whether small clouds will do.
+        paths: The paper's own clouds, by key.
+    """
+
+    folder: Folder
+    quick: bool
+    paths: Mapping[str, Path | None] = field(default_factory=dict)
+    _clouds: dict[str, "LoadedCloud"] = field(default_factory=dict)
+    _warm: set[str] = field(default_factory=set)
+
+    def cloud(self, key: str) -> "LoadedCloud":
+        """Return a cloud, loaded once."""
+        if key not in self._clouds:
+            # Neighbours of a million points are large: those of other clouds are let go.
+            for other in self._clouds.values():
+                other.__dict__.pop("neighbors", None)
+            cloud = load_cloud(key, self.paths.get(key), quick=self.quick)
+            self._clouds[key] = LoadedCloud(cloud)
+        return self._clouds[key]
+
+    def warm_up(self, preset: str) -> None:
+        """Segment a small cloud first, so that no time includes the loading of code."""
+        if preset not in self._warm:
+            segment_planes(make_room(_WARM_UP).points, load_config(preset))
+            self._warm.add(preset)
+
+
+@dataclass(frozen=True)
+class LoadedCloud:
+    """A cloud, and its neighbours once they are asked for."""
+
+    cloud: EvalCloud
+
+    @cached_property
+    def neighbors(self) -> Neighbors:
+        """The neighbours that all presets use."""
+        return search_knn(self.cloud.points, load_config().normals.k)
