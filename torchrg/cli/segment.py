@@ -11,6 +11,7 @@ import tyro
 from tqdm import tqdm
 
 from torchrg.batch.provenance import describe_run
+from torchrg.cli import depth
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, settings_asked_for, warn
 from torchrg.cli.picture import draw_segmentation, picture_paths
 from torchrg.config import (
@@ -37,7 +38,8 @@ class Arguments:
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
+    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt. Depth images (.png) and
+    organised clouds with --image have flags of their own: see segment --image --help."""
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
@@ -63,6 +65,8 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
+    if depth.asks_for_images(argv):
+        return depth.run(argv)
     arguments = parse(Arguments, argv, prog="torchrg segment", default=_starting_point(argv))
     settings = PipelineConfig(
         arguments.normals, arguments.growing, arguments.chunk_size, arguments.planes
