@@ -144,7 +144,7 @@ def test_mistakes_are_one_line_before_any_work(rooms, tmp_path, capsys, argument
 def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
     assert convert("folder", rooms, tmp_path / "out") == 2
-    assert "GB of free disk for 2 scans" in capsys.readouterr().err
+    assert "MB of free disk for 2 scans" in capsys.readouterr().err
 
 
 def test_help_lists_the_kinds(capsys):

@@ -1,6 +1,8 @@
 """What each kind of data set becomes, scan by scan, without any engine."""
 
 import json
+import resource
+import signal
 
 import numpy as np
 import pytest
@@ -107,6 +109,26 @@ def test_far_clouds_keep_their_coordinates_and_planes_are_in_them(tmp_path):
     floor = json.loads((out / "planes.json").read_text())["planes"][0]
     assert floor["offset"] == pytest.approx(3.0, abs=1e-4)
     assert floor["centroid"][:2] == pytest.approx([500_000.475, 4_000_000.475], abs=0.2)
+
+
+def test_a_short_write_of_an_array_is_a_full_disk(tmp_path):
+    (tmp_path / "in").mkdir()
+    np.save(tmp_path / "in" / "a.npy", grid())
+    (job,) = list_jobs(FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out"), tmp_path / "out")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        report = convert_scan(job)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert report.disk_full
+    assert (
+        report.reason == f"{job.folder / 'coord.npy'}: cannot be written: No space left on device."
+    )
+    assert not job.folder.exists()
+    assert convert_scan(job).status == "converted"
 
 
 def test_points_that_are_not_finite_stay_and_are_told(tmp_path):

@@ -115,8 +115,8 @@ def check_space(plan: Plan) -> None:
     free = shutil.disk_usage(_existing(out)).free
     if needed > free:
         raise FormatError(
-            f"{out}: expected about {needed / 1e9:,.1f} GB of free disk for "
-            f"{len(plan.to_convert):,} scans, got {free / 1e9:,.1f} GB; make room, choose another "
+            f"{out}: expected about {needed / 1e6:,.1f} MB of free disk for "
+            f"{len(plan.to_convert):,} scans, got {free / 1e6:,.1f} MB; make room, choose another "
             "directory, or convert fewer with --only."
         )
 

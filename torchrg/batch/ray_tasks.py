@@ -47,7 +47,9 @@ def run_ray(
     _connect(ray, address, workers, memory_limit)
     pending: dict[Any, Job] = {}
     try:
-        largest = max(int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"])
+        largest = max(
+            int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]
+        )
         convert = ray.remote(num_cpus=1, max_retries=RETRIES)(_convert)
         waiting = sorted(jobs, key=lambda job: job.scan.num_points)
         while waiting or pending:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from torchrg._optional import require
 from torchrg.batch.scans import Converted, Scan, check_finite
 from torchrg.config import PipelineConfig
 from torchrg.datasets import S3DIS, RoomReport, Scene, read_room, write_pointcept_scene
@@ -48,10 +49,12 @@ class S3DISSource:
 
         Raises:
             FormatError: If an area is missing, or a room has no objects.
+            MissingDependencyError: If what reads rooms is not installed.
 
         Warns:
             UserWarning: If an area has not as many rooms as the release.
         """
+        require("pyarrow", extra="s3dis", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 

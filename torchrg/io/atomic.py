@@ -1,5 +1,6 @@
 """Files that appear whole or not at all."""
 
+import errno
 import os
 import re
 import secrets
@@ -48,10 +49,18 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(stream.fileno())
         beside.replace(target)
     except OSError as error:
-        reason = error.strerror or error
-        raise FormatError(f"{path}: cannot be written: {reason}.") from error
+        known = _with_number(error)
+        reason = known.strerror or known
+        raise FormatError(f"{path}: cannot be written: {reason}.") from known
     finally:
         beside.unlink(missing_ok=True)
+
+
+def _with_number(error: OSError) -> OSError:
+    """Return NumPy's error of a short write, which comes without its number, as a full disk's."""
+    if error.errno is None and "requested and" in str(error):
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    return error
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -3,7 +3,7 @@
 import struct
 import zipfile
 from pathlib import Path
-from typing import IO
+from typing import IO, BinaryIO
 
 from numpy.lib import format as npy_format
 
@@ -42,7 +42,7 @@ def estimate_points(path: Path) -> int:
         return 0
 
 
-def _count(path: Path, stream: IO[bytes], size: int) -> int:
+def _count(path: Path, stream: BinaryIO, size: int) -> int:
     """Return the number of points by format."""
     suffix = path.suffix.lower()
     if suffix == ".npy":
