@@ -1,14 +1,19 @@
 """``torchrg convert``: a folder of rooms from end to end, what it refuses, and what it tells."""
 
+import io
 import json
 import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
+from torchrg.batch.convert import ScanReport
 from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.plan import make_plan
 from torchrg.cli import main
+from torchrg.cli.convert import _Progress
 from torchrg.config import load_config
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
@@ -67,8 +72,10 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
     assert [row["count"] for row in table["planes"]] == seg.planes.count.tolist()
 
 
-def test_one_worker_gives_the_bytes_of_two(rooms, converted, tmp_path):
-    assert convert("folder", rooms, tmp_path / "out", "--workers", 1) == 0
+def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, capsys):
+    options = ("--workers", 1, "--limit-memory", 0.1)
+    assert convert("folder", rooms, tmp_path / "out", *options) == 0
+    assert capsys.readouterr().err.count("may need more memory than 0.1 GB; it runs alone") == 2
     assert contents(tmp_path / "out") == contents(converted)
 
 
@@ -145,6 +152,20 @@ def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, capsys, mo
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
     assert convert("folder", rooms, tmp_path / "out") == 2
     assert "MB of free disk for 2 scans" in capsys.readouterr().err
+
+
+def test_progress_is_scans_points_a_second_and_time_left(faults, tmp_path):
+    jobs = faults.make_jobs(tmp_path, {"900_a": "plain", "100_b": "plain"})
+    shown = io.StringIO()
+    with tqdm(total=1000, unit="pt", file=shown, ncols=80) as bar:
+        progress = _Progress(bar, make_plan(jobs))
+        progress(None)
+        progress(ScanReport("900_a", "failed"))
+        bar.refresh()
+    last = shown.getvalue().splitlines()[-1]
+    assert "1/2 scans, 1 failed:  90%" in last
+    assert "900/1000" in last
+    assert "pt/s]" in last
 
 
 def test_help_lists_the_kinds(capsys):

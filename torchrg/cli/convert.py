@@ -97,7 +97,8 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
     total = sum(job.scan.num_points for job in jobs)
-    with tqdm(total=total, unit="pt", unit_scale=True, disable=None) as bar:
+    # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
+    with tqdm(total=total, unit="pt", unit_scale=True, smoothing=0, disable=None) as bar:
         progress = _Progress(bar, plan)
         ending = run_plan(
             plan, reports, engine=arguments.engine, workers=workers, on_report=progress
