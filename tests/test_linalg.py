@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.linalg import covariance, eigh3, sq_chord_to_deg, unsigned_angle_deg
+from torchrg.linalg import (
+    covariance,
+    eigh3,
+    smallest_eigenvector3,
+    sq_chord_to_deg,
+    unsigned_angle_deg,
+)
 
 EIGEN_TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-14}
 
@@ -39,11 +45,52 @@ def test_repeated_eigenvalues_give_orthonormal_vectors(dtype, diagonal):
     assert (vectors.mT @ vectors - torch.eye(3, dtype=dtype)).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("unit", [1e-18, 1.0, 1e18])
+def test_smallest_eigenvector_agrees_with_lapack(rng, dtype, unit):
+    matrices = random_symmetric(rng, torch.float64).to(dtype) * unit
+    tolerance = max(EIGEN_TOLERANCE[dtype], 1e-8)
+    values, vectors = smallest_eigenvector3(matrices)
+    assert (values >= 0).all()
+    expected, _ = torch.linalg.eigh(matrices.double())
+    largest = expected[:, 2:]
+    assert ((values.double() - expected) / largest).abs().max() < tolerance
+    residual = (matrices.double() @ vectors.double()[..., None]).squeeze(-1)
+    residual -= vectors.double() * expected[:, :1]
+    assert (residual.abs().amax(dim=1) / largest[:, 0]).max() < 4 * tolerance
+    assert (vectors.double().norm(dim=1) - 1).abs().max() < 4 * EIGEN_TOLERANCE[dtype]
+
+
+def test_normal_of_a_thin_neighborhood_is_right_to_rounding(rng):
+    sides = torch.tensor([1.0, 0.5, 1e-4], dtype=torch.float64)
+    turn = torch.linalg.qr(torch.randn(500, 3, 3, generator=rng, dtype=torch.float64))[0]
+    matrices = (turn * sides**2) @ turn.mT
+    values, vectors = smallest_eigenvector3(matrices)
+    off = torch.linalg.cross(vectors, turn[..., 2]).norm(dim=1)
+    assert off.max() < 1e-14
+    assert (values[:, 0] / sides[2] ** 2 - 1).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "diagonal", [(0.0, 0, 0), (1, 1, 1), (1, 1, 2), (1, 1.001, 2), (1, 2, 2), (0, 0, 5), (0, 5, 5)]
+)
+def test_smallest_eigenvector_of_repeated_eigenvalues_is_one_of_theirs(dtype, diagonal):
+    rotation = torch.linalg.qr(torch.tensor([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]).double())[0]
+    matrix = (rotation @ torch.diag(torch.tensor(diagonal).double()) @ rotation.mT).to(dtype)
+    values, vector = smallest_eigenvector3(matrix)
+    assert torch.allclose(values.double(), torch.tensor(diagonal).double().sort().values, atol=1e-3)
+    assert torch.allclose(matrix @ vector, values[0] * vector, atol=1e-3)
+
+
 def test_eigenvectors_do_not_depend_on_the_batch(rng):
     matrices = random_symmetric(rng, torch.float32, count=257)
     values, vectors = eigh3(matrices)
     for start in (0, 1, 3, 100):
         part_values, part_vectors = eigh3(matrices[start : start + 77])
+        assert torch.equal(part_values, values[start : start + 77])
+        assert torch.equal(part_vectors, vectors[start : start + 77])
+    values, vectors = smallest_eigenvector3(matrices)
+    for start in (0, 1, 3, 100):
+        part_values, part_vectors = smallest_eigenvector3(matrices[start : start + 77])
         assert torch.equal(part_values, values[start : start + 77])
         assert torch.equal(part_vectors, vectors[start : start + 77])
 

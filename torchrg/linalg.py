@@ -14,6 +14,8 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes
 
 _JACOBI_SWEEPS = 5
+_NEWTON_STEPS = 8
+_NEARLY_EQUAL = 1e-9
 _ASIN_DEGREE = 10
 
 
@@ -135,6 +137,71 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     values, order = torch.sort(values, dim=-1)
     vectors = vectors.gather(-1, order[..., None, :].expand_as(vectors))
     return values * safe.squeeze(-1), vectors
+
+
+def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return eigenvalues and the first eigenvector of positive semi-definite 3x3 matrices.
+
+    A third of the time of :func:`eigh3`, and more accurate for matrices of thin neighbourhoods: the
+    smallest root of the characteristic polynomial by Newton's method from 0, which it approaches
+    from one side, then a column of the adjugate of :math:`A - \lambda I`, both in double
+    precision. Where the first two eigenvalues are equal to rounding, :func:`eigh3` answers.
+
+    Args:
+        matrices: Symmetric matrices without negative eigenvalues beyond rounding, shape
+            ``(*, 3, 3)``; only the upper triangle is read.
+
+    Returns:
+        Eigenvalues in ascending order ``(*, 3)``, not negative, right to 1e-8 of the largest or to
+        rounding, and unit eigenvectors of the first ``(*, 3)``. Signs are arbitrary.
+
+    Raises:
+        ShapeError: If the shape or dtype is not as above.
+
+    Example:
+        >>> values, normals = smallest_eigenvector3(torch.diag(torch.tensor([3.0, 1.0, 2.0])))
+        >>> values, normals.abs()
+        (tensor([1., 2., 3.]), tensor([0., 1., 0.]))
+    """
+    check_shapes("smallest_eigenvector3", matrices=(matrices, "* 3 3"))
+    check_floating("smallest_eigenvector3", matrices=matrices)
+    scale = matrices.abs().amax(dim=(-2, -1))
+    safe = torch.where(scale > 0, scale, 1.0)
+    upper = [matrices[..., i, j] for i in range(3) for j in range(i, 3)]
+    xx, xy, xz, yy, yz, zz = torch.stack(upper).double() / safe
+    trace = xx + yy + zz
+    minors = xx * yy - xy * xy + (xx * zz - xz * xz) + (yy * zz - yz * yz)
+    determinant = zz * (xx * yy - xy * xy) - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
+    root = torch.zeros_like(trace)
+    for _ in range(_NEWTON_STEPS):
+        value = ((root - trace) * root + minors) * root - determinant
+        slope = (3 * root - 2 * trace) * root + minors
+        root = root - value / slope
+    root = torch.where(root.isfinite(), root, 0.0)
+    x, y, z = xx - root, yy - root, zz - root
+    diagonal = [y * z - yz * yz, x * z - xz * xz, x * y - xy * xy]
+    a01, a02, a12 = xz * yz - xy * z, xy * yz - xz * y, xy * xz - x * yz
+    use, best = diagonal[1] > diagonal[0], torch.maximum(diagonal[0], diagonal[1])
+    vector = [
+        torch.where(use, b, a) for a, b in ((diagonal[0], a01), (a01, diagonal[1]), (a02, a12))
+    ]
+    use, best = diagonal[2] > best, torch.maximum(best, diagonal[2])
+    vector = [torch.where(use, b, a) for a, b in zip(vector, (a02, a12, diagonal[2]), strict=True)]
+    length = (vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]).sqrt()
+    u, v, w = (part / length for part in vector)
+    # Where Newton's steps were still on their way, the quotient is right to second order.
+    smallest = u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz
+    smallest = smallest.clamp(min=0)
+    rest = trace - smallest
+    spread = (rest * rest - 4 * (minors - smallest * rest)).clamp(min=0).sqrt()
+    ordered = torch.stack([smallest, (rest - spread) / 2, (rest + spread) / 2], dim=-1)
+    values = (ordered * safe[..., None]).to(matrices.dtype)
+    vectors = torch.stack([u, v, w], dim=-1).to(matrices.dtype)
+    equal = best < _NEARLY_EQUAL
+    if bool(equal.any()):
+        exact_values, exact_vectors = eigh3(matrices[equal])
+        values[equal], vectors[equal] = exact_values, exact_vectors[..., 0]
+    return values, vectors
 
 
 def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int) -> None:

@@ -7,7 +7,7 @@ arithmetic run at the speed of the cache, and give the same bits for any number 
 import torch
 from torch import Tensor
 
-from torchrg.linalg import eigh3
+from torchrg.linalg import smallest_eigenvector3
 
 Columns = tuple[Tensor, Tensor, Tensor]
 
@@ -70,6 +70,5 @@ def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tenso
     xx, xy, xz = (sx * x).sum(dim=1), (sx * y).sum(dim=1), (sx * z).sum(dim=1)
     yy, yz, zz = (sy * y).sum(dim=1), (sy * z).sum(dim=1), (sz * z).sum(dim=1)
     rows = [torch.stack(row, dim=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
-    values, vectors = eigh3(torch.stack(rows, dim=-2))
-    normals = vectors[..., 0].contiguous()
+    values, normals = smallest_eigenvector3(torch.stack(rows, dim=-2))
     return normals, (normals * torch.stack(means, dim=-1)).sum(dim=-1), values
