@@ -195,12 +195,12 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     rest = trace - smallest
     spread = (rest * rest - 4 * (minors - smallest * rest)).clamp(min=0).sqrt()
     ordered = torch.stack([smallest, (rest - spread) / 2, (rest + spread) / 2], dim=-1)
-    values = (ordered * safe[..., None]).to(matrices.dtype)
+    values = (ordered.clamp(min=0) * safe[..., None]).to(matrices.dtype)
     vectors = torch.stack([u, v, w], dim=-1).to(matrices.dtype)
     equal = best < _NEARLY_EQUAL
     if bool(equal.any()):
         exact_values, exact_vectors = eigh3(matrices[equal])
-        values[equal], vectors[equal] = exact_values, exact_vectors[..., 0]
+        values[equal], vectors[equal] = exact_values.clamp(min=0), exact_vectors[..., 0]
     return values, vectors
 
 
