@@ -132,7 +132,7 @@ def moved(image: Tensor, step: tuple[int, int], *, fill: float) -> Tensor:
     result = torch.full_like(image, fill)
     target, source = [], []
     for length, way in zip(image.shape, step, strict=False):
-        target.append(slice(max(0, -way), length - max(0, way)))
-        source.append(slice(max(0, way), length - max(0, -way)))
+        target.append(slice(max(0, -way), max(0, length - max(0, way))))
+        source.append(slice(max(0, way), max(0, length - max(0, -way))))
     result[tuple(target)] = image[tuple(source)]
     return result

@@ -1,0 +1,234 @@
+"""Depth frames from the folders of public data sets."""
+
+import math
+
+import kornia_rs
+import numpy as np
+import pytest
+import torch
+
+from torchrg.datasets import RGBDFrame, RGBDFrames
+from torchrg.datasets.rgbd_images import read_color, read_depth
+from torchrg.errors import ConfigError, FormatError, ShapeError
+from torchrg.report import write_png
+from torchrg.transforms import DepthToCloud
+
+HALF = math.sqrt(0.5)
+# A quarter turn about z, as x y z w, and as a matrix.
+QUARTER = f"0 0 {HALF} {HALF}"
+TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+POSE_ROWS = "0 -1 0 0.5\n1 0 0 0.25\n0 0 1 2\n0 0 0 1\n"
+
+
+def write_depth(path, value, shape=(4, 6)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = torch.full(shape, value)
+    image[0, 0] = 0
+    write_png(path, image)
+
+
+def write_color(path, value=7):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.full((4, 6, 3), value, dtype=np.uint8)
+    if path.suffix == ".jpg":
+        kornia_rs.io.write_image_jpeg(str(path), image, "rgb", 95)
+    else:
+        write_png(path, image)
+
+
+def write_text(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def expected_pose():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = TURN, torch.tensor([0.5, 0.25, 2.0])
+    return pose
+
+
+@pytest.fixture
+def tum(tmp_path):
+    root = tmp_path / "rgbd_dataset_freiburg3_desk"
+    for name, value in (("2.0", 10000), ("1.0", 5000)):
+        write_depth(root / "depth" / f"{name}.png", value)
+        write_color(root / "rgb" / f"{name}5.png", value // 1000)
+    write_text(root / "depth.txt", "# depth\n2.0 depth/2.0.png\n1.0 depth/1.0.png\n")
+    write_text(root / "rgb.txt", "# color\n1.015 rgb/1.05.png\n2.3 rgb/2.05.png\n")
+    far = f"1.5 9 9 9 {QUARTER}\n"
+    write_text(root / "groundtruth.txt", f"#\n{far}1.01 0.5 0.25 2 {QUARTER}\n")
+    return root
+
+
+def test_tum_frames_are_matched_in_time(tum):
+    for root in (tum, tum.parent):
+        data = RGBDFrames.from_folder(root, "tum")
+        assert [scene.name.split("/")[-1] for scene in data.scenes] == ["1.0", "2.0"]
+        first, second = data
+        assert first["depth"].shape == (1, 4, 6)
+        assert first["depth"].dtype == torch.float32
+        assert first["depth"][0, 0, :2].tolist() == [0, 1]
+        assert second["depth"][0, 1, 1] == 2
+        assert first["intrinsics"].diagonal().tolist() == [535.4, 539.2, 1]
+        assert first["color"][:, 0, 0].tolist() == [5, 5, 5]
+        torch.testing.assert_close(first["pose"], expected_pose())
+        assert "color" not in second
+        assert "pose" not in second
+    names = [path.name for path in data.scenes[0].files]
+    assert names == ["1.0.png", "1.05.png", "depth.txt", "rgb.txt", "groundtruth.txt"]
+
+
+def test_the_camera_of_tum_is_not_guessed(tum):
+    other = tum.rename(tum.parent / "desk")
+    with pytest.raises(ConfigError, match="desk: expected intrinsics, as the name says none of"):
+        RGBDFrames.from_folder(other, "tum")
+    camera = torch.eye(3)
+    data = RGBDFrames.from_folder(other, "tum", intrinsics=camera, depth_scale=1000)
+    assert data[0]["depth"].max() == 5
+    assert data[0]["intrinsics"].dtype == torch.float64
+
+
+def test_icl_nuim_frames_are_matched_by_number(tmp_path):
+    root = tmp_path / "living_room_traj0"
+    for number in (0, 2, 10):
+        write_depth(root / "depth" / f"{number}.png", 5000 + number)
+        write_color(root / "rgb" / f"{number}.png")
+    write_text(root / "livingRoom0.gt.freiburg", f"2 0.5 0.25 2 {QUARTER}\n10 0 0 0 0 0 0 1\n")
+    data = RGBDFrames.from_folder(root, "icl-nuim")
+    assert [scene.name for scene in data.scenes] == [f"living_room_traj0/{n}" for n in (0, 2, 10)]
+    assert data[0]["intrinsics"].diagonal().tolist() == [481.2, -480, 1]
+    assert "pose" not in data[0]
+    torch.testing.assert_close(data[1]["pose"], expected_pose())
+    assert torch.equal(data[2]["pose"], torch.eye(4).double())
+
+
+def test_scannet_frames_have_files_of_their_own(tmp_path):
+    for scene in ("scene0000_00", "scene0000_01"):
+        root = tmp_path / scene
+        for number in (0, 1):
+            write_depth(root / "depth" / f"{number}.png", 1500)
+            write_color(root / "color" / f"{number}.jpg")
+        write_text(root / "pose" / "0.txt", POSE_ROWS)
+        write_text(root / "pose" / "1.txt", "-inf -inf -inf -inf\n" * 4)
+        write_text(root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n" * 2)
+    data = RGBDFrames.from_folder(tmp_path, "scannet")
+    assert len(data) == 4
+    assert data.scenes[2].name == "scene0000_01/0"
+    assert data[0]["depth"].max() == 1.5
+    torch.testing.assert_close(data[0]["pose"], expected_pose())
+    assert "pose" not in data[1]
+    assert data[0]["intrinsics"][0].tolist() == [577, 0, 318]
+    assert [path.name for path in data.scenes[0].files] == [
+        "0.png",
+        "0.jpg",
+        "intrinsic_depth.txt",
+        "0.txt",
+    ]
+
+
+def test_seven_scenes_mark_missing_depth(tmp_path):
+    root = tmp_path / "seq-01"
+    write_depth(root / "frame-000000.depth.png", 65535)
+    write_depth(root / "frame-000001.depth.png", 2500)
+    write_color(root / "frame-000001.color.png")
+    write_text(root / "frame-000001.pose.txt", POSE_ROWS)
+    data = RGBDFrames.from_folder(tmp_path, "7-scenes")
+    assert [scene.name for scene in data.scenes] == [
+        "seq-01/frame-000000",
+        "seq-01/frame-000001",
+    ]
+    assert not data[0]["depth"].any()
+    assert data[1]["depth"].max() == 2.5
+    assert data[1]["color"].shape == (3, 4, 6)
+    torch.testing.assert_close(data[1]["pose"], expected_pose())
+
+
+def test_any_folder_of_images_needs_its_camera(tmp_path):
+    write_depth(tmp_path / "b" / "10.png", 300)
+    np.save(tmp_path / "b" / "9.npy", np.full((4, 6), 1.25, dtype=np.float32))
+    for given, missing in (
+        ({"intrinsics": torch.eye(3)}, "depth_scale"),
+        ({"depth_scale": 1.0}, "intrinsics"),
+    ):
+        with pytest.raises(ConfigError, match=f"expected {missing}, which depth images do not"):
+            RGBDFrames.from_folder(tmp_path, "images", **given)
+    data = RGBDFrames.from_folder(tmp_path, "images", intrinsics=torch.eye(3), depth_scale=1)
+    assert [scene.name for scene in data.scenes] == ["b/9", "b/10"]
+    assert data[0]["depth"].unique().tolist() == [1.25]
+
+
+def test_frames_of_one_size_are_batched_and_transformed(tum):
+    camera = torch.eye(3)
+    data = RGBDFrames.from_folder(tum, "tum", intrinsics=camera, transform=DepthToCloud())
+    assert data[0]["coord"].shape == (23, 3)
+    plain = [RGBDFrame(frame.depth, camera, 5000.0, frame.name) for frame in data.frames]
+    loader = torch.utils.data.DataLoader(RGBDFrames(plain), batch_size=2, num_workers=2)
+    batch = next(iter(loader))
+    assert batch["depth"].shape == (2, 1, 4, 6)
+    assert batch["name"] == [frame.name for frame in data.frames]
+
+
+def test_depth_without_meaning_is_zero(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[np.nan, np.inf, -1, 0, 2]]))
+    assert read_depth(tmp_path / "a.npy", depth_scale=1).tolist() == [[0, 0, 0, 0, 2]]
+
+
+def test_wrong_files_are_refused(tmp_path, tum):
+    write_color(tmp_path / "color.png")
+    write_text(tmp_path / "text.png", "no image")
+    write_text(tmp_path / "text.npy", "no array")
+    np.save(tmp_path / "flat.npy", np.zeros(3))
+    for name, message in (
+        ("color.png", "expected a gray PNG of 16 bits, got shape"),
+        ("text.png", "expected a PNG image, got "),
+        ("text.npy", "expected an array of numbers, got "),
+        ("flat.npy", r"expected depth of shape \(H, W\), got \(3,\)"),
+        ("missing.png", "cannot be read: No such file"),
+        ("missing.npy", "cannot be read: No such file"),
+        ("depth.jpg", r"expected a depth image that ends in one of .png .npy, got '.jpg'"),
+    ):
+        with pytest.raises(FormatError, match=f"{name}: {message}"):
+            read_depth(tmp_path / name, depth_scale=1000)
+    with pytest.raises(ConfigError, match="expected depth_scale > 0"):
+        read_depth(tmp_path / "color.png", depth_scale=0)
+    with pytest.raises(FormatError, match=r"text.png: expected a PNG or JPEG image"):
+        read_color(tmp_path / "text.png")
+    for name, text, message in (
+        ("depth.txt", "1.0 a b\n", "expected a time and a file name in each row"),
+        ("depth.txt", "one a\n", "expected numbers"),
+        ("groundtruth.txt", "1 2 3\n", "expected time tx ty tz qx qy qz qw in each row"),
+    ):
+        before = (tum / name).read_text()
+        (tum / name).write_text(text)
+        with pytest.raises(FormatError, match=f"{name}: {message}"):
+            RGBDFrames.from_folder(tum, "tum")
+        (tum / name).write_text(before)
+
+
+def test_wrong_folders_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="expected layout to be one of 7-scenes, icl-nuim"):
+        RGBDFrames.from_folder(tmp_path, "nyu")
+    for layout in ("tum", "icl-nuim", "scannet", "7-scenes"):
+        with pytest.raises(FormatError, match=r"expected recordings with .* got none"):
+            RGBDFrames.from_folder(tmp_path, layout)
+        with pytest.raises(FormatError, match="no such folder"):
+            RGBDFrames.from_folder(tmp_path / "missing", layout)
+    camera = torch.eye(3)
+    with pytest.raises(FormatError, match="expected depth images"):
+        RGBDFrames.from_folder(tmp_path, "images", intrinsics=camera, depth_scale=1)
+    (tmp_path / "depth").mkdir()
+    with pytest.raises(FormatError, match=r"intrinsic_depth.txt: cannot be read"):
+        RGBDFrames.from_folder(tmp_path, "scannet")
+    write_text(tmp_path / "intrinsic" / "intrinsic_depth.txt", "1 2 3\n")
+    with pytest.raises(FormatError, match="expected 4 rows of 4 numbers, got 1 rows"):
+        RGBDFrames.from_folder(tmp_path, "scannet")
+
+
+def test_wrong_frames_are_refused(tmp_path):
+    path = tmp_path / "a.png"
+    with pytest.raises(ShapeError, match=r"RGBDFrame: expected intrinsics of shape \(3, 3\)"):
+        RGBDFrame(path, torch.eye(4), 1000.0)
+    with pytest.raises(ConfigError, match="expected depth_scale > 0, the stored value of one"):
+        RGBDFrame(path, torch.eye(3), 0.0)
+    with pytest.raises(ConfigError, match="expected frames of different names, got 'a' twice"):
+        RGBDFrames([RGBDFrame(path, torch.eye(3), 1.0, "a")] * 2)
