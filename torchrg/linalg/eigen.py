@@ -1,13 +1,5 @@
-"""Linear algebra of many tiny matrices, and the only numerical tolerances of the library.
+"""Eigenvectors of many symmetric 3x3 matrices."""
 
-Everything that can decide a label is built from ``+ - * /`` and ``sqrt`` alone: these are exact to
-the last bit wherever an element stands in a tensor, so results do not depend on chunk size or on
-the number of threads. Vectorised ``acos`` or ``cos`` do not promise that.
-"""
-
-import math
-
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,82 +8,7 @@ from torchrg._checks import check_floating, check_shapes
 _JACOBI_SWEEPS = 5
 _NEWTON_STEPS = 8
 _NEARLY_EQUAL = 1e-9
-_ASIN_DEGREE = 10
-
-
-def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
-    """Return the singular value, relative to the largest, at which a direction counts as flat.
-
-    Args:
-        num_values: Number of points (or rows) that went into the matrix.
-        dtype: Working precision.
-
-    Returns:
-        ``max(num_values, 3) * eps``.
-
-    Example:
-        >>> rank_tolerance(50, torch.float64) < 1e-13
-        True
-    """
-    return max(num_values, 3) * torch.finfo(dtype).eps
-
-
-def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
-
-    Two passes about the first point of each patch: accurate far from the origin.
-
-    Args:
-        patches: Points, shape ``(*, K, P)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything. Default:
-            all.
-
-    Returns:
-        The mean ``(*, P)`` and the covariance ``(*, P, P)``. A patch without points has zeros.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-
-    Example:
-        >>> mean, matrix = covariance(torch.tensor([[0.0, 0, 1], [2, 0, 1], [0, 4, 1], [2, 4, 1]]))
-        >>> mean, matrix.diagonal()
-        (tensor([1., 2., 1.]), tensor([1., 4., 0.]))
-    """
-    check_shapes("covariance", patches=(patches, "* K P"), mask=(mask, "* K"))
-    check_floating("covariance", patches=patches)
-    columns = patches.unbind(dim=-1)
-    if mask is None:
-        first = [column[..., :1] for column in columns]
-        shifted = [column - start for column, start in zip(columns, first, strict=True)]
-        count: Tensor | int = patches.shape[-2]
-    else:
-        # Any counted point serves as the local origin: the one with the largest mask value.
-        anchor = mask.to(torch.uint8).argmax(dim=-1, keepdim=True)
-        first = [column.gather(-1, anchor) for column in columns]
-        shifted = [
-            torch.where(mask, column - start, 0.0)
-            for column, start in zip(columns, first, strict=True)
-        ]
-        count = mask.sum(dim=-1, keepdim=True).clamp(min=1)
-    means = [column.sum(dim=-1, keepdim=True) / count for column in shifted]
-    centered = [column - mean for column, mean in zip(shifted, means, strict=True)]
-    if mask is not None:
-        centered = [torch.where(mask, column, 0.0) for column in centered]
-    total = count if isinstance(count, int) else count.squeeze(-1)
-    size = len(columns)
-    entries = {
-        (i, j): (centered[i] * centered[j]).sum(dim=-1) / total
-        for i in range(size)
-        for j in range(i + 1)
-    }
-    rows = [
-        torch.stack([entries[max(i, j), min(i, j)] for j in range(size)], dim=-1)
-        for i in range(size)
-    ]
-    center = torch.cat([start + mean for start, mean in zip(first, means, strict=True)], dim=-1)
-    if mask is not None:
-        center = torch.where(mask.any(dim=-1, keepdim=True), center, 0.0)
-    return center, torch.stack(rows, dim=-2)
+"""Share of the squared largest eigenvalue below which the adjugate has no direction."""
 
 
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -224,59 +141,3 @@ def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int
         vip, viq = v[i][p], v[i][q]
         v[i][p] = c * vip - s * viq
         v[i][q] = s * vip + c * viq
-
-
-def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:
-    r"""Return the angle between directions without sign, in [0, 90] degrees, eq. (8).
-
-    From the chord, ``2 asin(min(|a - b|, |a + b|) / 2)``: accurate for small angles, where the
-    arc cosine of a float32 product is wrong by up to 0.02 degrees.
-
-    Args:
-        a: Unit vectors, shape ``(*, 3)``.
-        b: Unit vectors, shape broadcastable to that of ``a``.
-
-    Returns:
-        Angles, shape ``(*)``.
-
-    Example:
-        >>> a = torch.tensor([[1.0, 0, 0], [1, 0, 0]])
-        >>> unsigned_angle_deg(a, torch.tensor([[0.0, 1, 0], [-1, 0, 0]])).tolist()
-        [90.0, 0.0]
-    """
-    dot = (a * b).sum(dim=-1, keepdim=True)
-    chord = a - torch.where(dot < 0, -b, b)
-    return sq_chord_to_deg((chord * chord).sum(dim=-1))
-
-
-def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
-    """Return the angle, in degrees, under which a chord of the unit sphere is seen.
-
-    Args:
-        sq_chord: Squared length of the chord, in [0, 2].
-
-    Returns:
-        Angles in [0, 90], same shape, right to 1e-7 (float32) or 1e-8 degrees (float64).
-
-    Example:
-        >>> sq_chord_to_deg(torch.tensor([0.0, 1.0, 2.0]))
-        tensor([ 0.0000, 60.0000, 90.0000])
-    """
-    # asin(x) / x as a polynomial of x^2 on [0, 1/2], where x is half the chord.
-    sq_half = (sq_chord / 4).clamp(max=0.5)
-    result = torch.full_like(sq_half, _ASIN_SERIES[-1])
-    for coefficient in _ASIN_SERIES[-2::-1]:
-        result = result.mul_(sq_half).add_(coefficient)
-    return result.mul_(sq_half.sqrt_()).mul_(math.degrees(2.0)).clamp_(max=90.0)
-
-
-def _asin_series(degree: int) -> list[float]:
-    """Return the Chebyshev approximation of asin(sqrt(s)) / sqrt(s) on [0, 1/2], lowest first."""
-    nodes = 0.25 - 0.25 * np.cos((np.arange(200) + 0.5) * np.pi / 200)
-    values = np.arcsin(np.sqrt(nodes)) / np.sqrt(nodes)
-    fit = np.polynomial.Chebyshev.fit(nodes, values, degree, domain=[0, 0.5])
-    coefficients = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1], window=[-1, 1]).coef
-    return [float(c) for c in coefficients]
-
-
-_ASIN_SERIES = _asin_series(_ASIN_DEGREE)
