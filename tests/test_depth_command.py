@@ -1,0 +1,117 @@
+"""``torchrg segment`` of depth images and of organised clouds."""
+
+import json
+
+import kornia_rs
+import numpy as np
+import pytest
+import torch
+
+from torchrg.cli import main
+from torchrg.io import read_cloud, write_cloud
+from torchrg.report import write_png
+from torchrg.structures import Cloud
+from torchrg.transforms import segment_depth
+from torchrg.transforms.depth_camera import depth_to_points, make_intrinsics
+
+CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]
+INTRINSICS = make_intrinsics(50.0, 50.0, 39.5, 29.5)
+
+
+@pytest.fixture
+def depth():
+    """A wall with a step and a hole, in metres."""
+    depth = torch.full((60, 80), 2.0)
+    depth[:, 50:] = 2.5
+    depth[:4, :5] = 0
+    return depth
+
+
+@pytest.fixture
+def frame(tmp_path, depth):
+    path = tmp_path / "frame.png"
+    write_png(path, (depth * 1000).round().int())
+    return path
+
+
+def test_a_depth_image_becomes_labels_and_a_picture(tmp_path, frame, depth, capsys):
+    out = tmp_path / "labels.png"
+    assert main(["segment", str(frame), *CAMERA, "--out", str(out)]) == 0
+    labels = kornia_rs.io.read_image_png_u16(str(out), "mono")[..., 0].astype(int) - 1
+    expected = segment_depth(depth, INTRINSICS).labels.numpy()
+    np.testing.assert_array_equal(labels, expected)
+    assert sorted(np.unique(labels)) == [-1, 0, 1]
+    picture = kornia_rs.io.read_image_png_u8(str(tmp_path / "labels_planes.png"), "rgb")
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 3
+    assert not picture[0, 0].any()
+    assert "80 x 60 pixels, 4,780 with depth, 2 planes, 100.0 %" in capsys.readouterr().out
+
+
+def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth):
+    for suffix in (".npz", ".pcd"):
+        out = tmp_path / f"cloud{suffix}"
+        assert main(["segment", str(frame), *CAMERA, "--out", str(out)]) == 0
+        cloud = read_cloud(out)
+        points = depth_to_points(depth[None].double(), INTRINSICS[None])[0].view(-1, 3)
+        np.testing.assert_allclose(cloud.coordinates, points.float(), rtol=1e-6)
+        expected = segment_depth(depth, INTRINSICS).labels.flatten()
+        np.testing.assert_array_equal(cloud.fields["labels"], expected)
+    assert cloud.grid_shape == (60, 80)
+    with np.load(tmp_path / "cloud.npz") as result:
+        np.testing.assert_allclose(result["plane_offset"], [2.0, 2.5], rtol=1e-6)
+        provenance = json.loads(str(result["provenance"]))
+    assert provenance["intrinsics"] == "50,50,39.5,29.5"
+    assert provenance["config"]["depth"]["min_size"] == 100
+
+
+@pytest.mark.parametrize("focal", [50.0, 500.0])
+def test_organised_clouds_keep_their_grid(tmp_path, depth, focal):
+    camera = make_intrinsics(focal, focal, 39.5, 29.5)
+    points = depth_to_points(depth[None], camera[None])[0].view(-1, 3)
+    source, out = tmp_path / "scan.pcd", tmp_path / "out.pcd"
+    write_cloud(source, Cloud(points.numpy(), grid_shape=(60, 80)))
+    # A narrow cloud is moved to an origin of its own; its planes stay where they are.
+    assert read_cloud(source).origin.any() == (focal == 500)
+    assert main(["segment", str(source), "--image", "--threads", "1", "--out", str(out)]) == 0
+    cloud = read_cloud(out)
+    assert cloud.grid_shape == (60, 80)
+    np.testing.assert_array_equal(cloud.coordinates, points)
+    expected = segment_depth(depth, camera).labels.flatten()
+    np.testing.assert_array_equal(cloud.fields["labels"], expected)
+    result = tmp_path / "out.npz"
+    assert main(["segment", str(source), "--image", "--threads", "1", "--out", str(result)]) == 0
+    with np.load(result) as arrays:
+        np.testing.assert_allclose(arrays["plane_offset"], [2.0, 2.5], rtol=1e-5)
+
+
+def test_several_images_go_into_a_folder(tmp_path, frame):
+    other, out = tmp_path / "other.png", tmp_path / "out"
+    other.write_bytes(frame.read_bytes())
+    inputs = [str(frame), str(other)]
+    assert main(["segment", *inputs, *CAMERA, "--out", str(out)]) == 0
+    names = ["frame.png", "frame_planes.png", "other.png", "other_planes.png"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    other.write_text("no image")
+    assert main(["segment", *inputs, *CAMERA, "--out", str(out)]) == 3
+
+
+def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
+    points = depth_to_points(depth[None], INTRINSICS[None])[0]
+    write_cloud(tmp_path / "list.pcd", Cloud(points.view(-1, 3).numpy()))
+    turned = (points + 1).view(-1, 3).numpy()
+    write_cloud(tmp_path / "turned.pcd", Cloud(turned, grid_shape=(60, 80)))
+    out = ["--out", str(tmp_path / "a.png")]
+    for arguments, message in (
+        ([str(frame), *out], "frame.png: expected --intrinsics fx,fy,cx,cy, which depth images"),
+        ([str(frame), *CAMERA[:2], *out], "frame.png: expected --depth-scale, which depth images"),
+        ([str(frame), "--intrinsics", "1,2,3", *CAMERA[2:], *out], "four numbers without blanks"),
+        ([str(frame), str(frame), *CAMERA, *out], "expected a directory for 2 inputs"),
+        ([str(frame), *CAMERA[:4], "--threads", "0", *out], "expected --threads >= 1, got 0"),
+        ([str(tmp_path / "list.pcd"), "--image", *out], "expected an organised cloud"),
+        ([str(tmp_path / "turned.pcd"), "--image", *out], "expected points of a pinhole camera"),
+    ):
+        assert main(["segment", *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "a.png").exists()
