@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance, eigh3
 from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, qn
+from torchrg.robust.bisquare import Target
 from torchrg.robust.mcd import Starts
 
 
@@ -186,21 +187,35 @@ class DetMM(nn.Module):
     Args:
         quantile: Quantile of the chi-square distribution at which inliers end.
         starts: Which deterministic starts.
+        tuned_for: What the efficiency is that of, ``"shape"`` or ``"location"``.
 
     Example:
         >>> DetMM()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
         tensor(True)
     """
 
-    def __init__(self, *, quantile: float = 0.975, starts: Starts = "robustbase") -> None:
+    def __init__(
+        self,
+        *,
+        quantile: float = 0.975,
+        starts: Starts = "robustbase",
+        tuned_for: Target = "shape",
+    ) -> None:
         super().__init__()
         self.quantile = quantile
         self.starts: Starts = starts
+        self.tuned_for: Target = tuned_for
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
-        return fit_detmm(patches, mask, quantile=self.quantile, starts=self.starts)
+        return fit_detmm(
+            patches,
+            mask,
+            quantile=self.quantile,
+            starts=self.starts,
+            tuned_for=self.tuned_for,
+        )
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        return f"quantile={self.quantile}, starts={self.starts!r}"
+        return f"quantile={self.quantile}, starts={self.starts!r}, tuned_for={self.tuned_for!r}"
