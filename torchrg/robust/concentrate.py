@@ -10,6 +10,8 @@ from torchrg.robust.scatter import determinant, fit_ellipsoid, sq_distances
 
 MAX_STEPS = 100
 _MAX_COMPARED = 16
+_DIGITS = 24
+"""Points whose membership one number holds exactly, as a binary digit each."""
 
 
 class Concentrated(NamedTuple):
@@ -39,7 +41,7 @@ def concentrate(
 
     A step takes mean and scatter of the set and keeps the ``size`` points nearest to them; the
     determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Starts that have arrived
-    leave the batch.
+    leave the batch, and so do those whose set another one has.
 
     Args:
         columns: P coordinates of shape ``(K, M)``.
@@ -53,46 +55,56 @@ def concentrate(
         The final sets and their determinants.
     """
     num_points, num_starts, num_lanes = initial.shape
-    points = [column.repeat(1, num_starts) for column in columns]
-    floors = floor.repeat(num_starts)
+    shape = (num_starts, num_lanes)
     members = initial.reshape(num_points, -1)
+    final = torch.zeros_like(members)
+    best = torch.full_like(floor, torch.inf, dtype=torch.float64).repeat(num_starts)
+    places = torch.arange(num_starts * num_lanes, device=floor.device)
+    distinct = _first_of_equal(members, places, shape)
+    places, members = places[distinct], members.index_select(1, distinct)
+    points, floors = take_lanes(columns, places % num_lanes), floor[places % num_lanes]
     ellipsoid = fit_ellipsoid(points, members, initial_size, floors)
     members = smallest_points(sq_distances(ellipsoid, initial_size - 1), size)
-    final = torch.empty_like(members)
-    best = torch.full_like(floors, torch.inf, dtype=torch.float64)
-    places, previous = torch.arange(len(floors), device=floor.device), best
+    moving, previous = _first_of_equal(members, places, shape), best[places]
     for step in range(max_steps + 1):
+        points, members = take_lanes(points, moving), members.index_select(1, moving)
+        floors, places, previous = floors[moving], places[moving], previous[moving]
         ellipsoid = fit_ellipsoid(points, members, size, floors)
         value = determinant(ellipsoid, size - 1)
         candidate = smallest_points(sq_distances(ellipsoid, size - 1), size)
         # Rounding may let the determinant grow, or two sets of tied points follow each other.
         settled = (sum_points(candidate * members) >= size) | ~(value < previous)
-        if step == 0:
-            repeats = _repeats(ellipsoid.means, value, num_starts, num_lanes)
-            value = torch.where(repeats, torch.inf, value)
-            settled |= repeats
-        if step == max_steps:
-            settled |= True
+        settled |= step == max_steps
         done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
         final.index_copy_(1, places[done], members.index_select(1, done))
         best[places[done]] = value[done]
         if len(moving) == 0:
             break
-        points, members = take_lanes(points, moving), candidate.index_select(1, moving)
-        floors, places, previous = floors[moving], places[moving], value[moving]
-    shape = (num_starts, num_lanes)
+        members, previous = candidate, value
     return Concentrated(final.reshape(num_points, *shape), best.reshape(shape), size)
 
 
-def _repeats(means: list[Tensor], value: Tensor, num_starts: int, num_lanes: int) -> Tensor:
-    """Starts whose set has exactly the determinant and the mean of an earlier start's set."""
-    keys = torch.stack([value, *(mean.double() for mean in means)]).reshape(
-        -1, num_starts, num_lanes
-    )
-    repeats = torch.zeros(num_starts, num_lanes, dtype=torch.bool, device=value.device)
-    if num_starts > _MAX_COMPARED:
-        return repeats.reshape(-1)
+def _first_of_equal(members: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Choose of equal sets of one lane the first.
+
+    Args:
+        members: Sets, 1 for a point in it and 0 for another, shape ``(K, n)``.
+        places: Where each is among starts and lanes, shape ``(n,)``.
+        shape: Number of starts and of lanes.
+
+    Returns:
+        The chosen of the n sets, ascending.
+    """
+    num_starts, num_lanes = shape
+    if not 1 < num_starts <= _MAX_COMPARED:
+        return torch.arange(len(places), device=places.device)
+    digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
+    parts = (members * digits.to(members.dtype)[:, None]).split(_DIGITS)
+    numbers = members.new_zeros(len(parts), num_starts * num_lanes)
+    numbers[:, places] = torch.stack([sum_points(part) for part in parts])
+    numbers = numbers.reshape(-1, num_starts, num_lanes)
+    first = torch.ones(shape, dtype=torch.bool, device=members.device)
     for start in range(1, num_starts):
-        same = (keys[:, :start] == keys[:, start : start + 1]).all(dim=0)
-        repeats[start] = same.any(dim=0)
-    return repeats.reshape(-1)
+        same = (numbers[:, :start] == numbers[:, start : start + 1]).all(dim=0)
+        first[start] = ~same.any(dim=0)
+    return torch.nonzero(first.reshape(-1)[places]).squeeze(1)
