@@ -222,12 +222,17 @@ def scored(f1, recall):
 def test_trends_hold_only_where_the_numbers_say_so():
     from reproduction.trends import trend_claims
 
-    good = trend_claims("hallway", scored((60, 80, 95, 97), (80, 85, 90, 95)), "a hall")
+    classic = {"faces": {"0": [80.0, 5000], "1": [60.0, 100], "2": [10.0, 2000]}}
+    others = {"faces": {"0": [90.0, 5000], "1": [20.0, 100], "3": [10.0, 2000]}}
+    faces = {"classic": classic, "paper": others, "consensus": others}
+    good = trend_claims(scored((60, 80, 95, 97), (80, 85, 90, 95)), faces, "a hall")
     assert [claim["holds"] for claim in good] == [True, True, True]
-    bad = trend_claims("hallway", scored((60, 97, 95, 97), (90, 85, 90, 95)), "a hall")
+    bad = trend_claims(scored((60, 97, 95, 97), (90, 85, 90, 95)), faces, "a hall")
     assert [claim["holds"] for claim in bad] == [False, False, True]
     assert "classic RG 60.0, DetMM 97.0, paper 95.0" in bad[0]["numbers"]
     assert "of 26 faces" in bad[0]["why"]
+    assert "90.0 against 80.0 on 1 faces of 1,000 points and more" in bad[1]["why"]
+    assert "20.0 against 60.0 on 1 faces of fewer" in bad[1]["why"]
 
 
 def test_ratio_is_the_papers_time_over_ours_per_point():

@@ -5,7 +5,7 @@ from reproduction.pictures import draw_side_by_side
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, section, table, text
 from reproduction.segmentation_tables import draw_figures, more_rows
-from reproduction.segmentations import METHODS, count_regions, regrow, score
+from reproduction.segmentations import METHODS, count_regions, face_recalls, regrow, score
 from reproduction.trends import trend_claims
 from torchrg.metrics import score_labels
 
@@ -39,7 +39,11 @@ def reproduce(run: Run) -> Record:
                 rows.insert(0, [name.capitalize(), *values])
         blocks.append(table(f"**{key}**, {cloud.origin}", [key, *METHODS.values()], rows))
         if cloud.labels is not None:
-            blocks += trend_claims(key, found, cloud.origin)
+            blocks += trend_claims(
+                found,
+                {preset: face_recalls(run, key, preset) for preset in METHODS},
+                cloud.origin,
+            )
         blocks += draw_figures(run, key, "Figure 9", tuple(METHODS))
         angles, made = _angles(run, key)
         blocks += angles

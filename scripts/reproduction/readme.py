@@ -104,7 +104,7 @@ def take_results(report: Record) -> Record:
             ],
         },
         "claims": [
-            {"text": block["text"], "numbers": block["numbers"]}
+            {name: block[name] for name in ("text", "numbers", "why")}
             for part in parts.values()
             for block in part["blocks"]
             if block["kind"] == "claim" and not block["holds"]
@@ -118,7 +118,10 @@ def to_section(results: Record) -> str:
     Times of small clouds are those of fixed costs, and stay out.
     """
     made = "small clouds: `--quick`" if results["quick"] else "full size"
-    fails = "\n".join(f"* {claim['text']} {claim['numbers']}" for claim in results["claims"])
+    fails = "\n".join(
+        " ".join(filter(None, ["*", claim["text"], claim["numbers"], claim["why"]]))
+        for claim in results["claims"]
+    )
     parts = [
         f"From the report of `scripts/reproduce_paper.py` ({made}): {results['made_with']}.",
         _scores(results["scores"]),

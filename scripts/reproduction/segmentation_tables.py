@@ -7,7 +7,7 @@ from reproduction.paper_numbers import INDEX_NAMES, INDICES
 from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side, outcomes_of
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
-from reproduction.segmentations import METHODS, SAMPLE_SIZE, read_segmented, score
+from reproduction.segmentations import METHODS, SAMPLE_SIZE, face_recalls, read_segmented, score
 from reproduction.trends import INTERNAL, internal_claim, trend_claims
 from torchrg.metrics import METRICS
 
@@ -62,7 +62,11 @@ def reproduce(run: Run) -> Record:
         records += list(found.values())
         blocks += [index_table(key, cloud.origin, found), internal_claim(key, found)]
         if cloud.labels is not None:
-            blocks += trend_claims(key, found, cloud.origin)
+            blocks += trend_claims(
+                found,
+                {preset: face_recalls(run, key, preset) for preset in METHODS},
+                cloud.origin,
+            )
         blocks += draw_figures(run, key, number, METHODS)
     return section("Table 2, Figures 7 and 8: segmentation", blocks, records)
 
