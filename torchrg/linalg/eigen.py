@@ -6,7 +6,7 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes
 
 _JACOBI_SWEEPS = 5
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = 10
 _NEARLY_EQUAL = 1e-9
 """Share of the squared largest eigenvalue below which the adjugate has no direction."""
 
@@ -62,7 +62,8 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     A third of the time of :func:`eigh3`, and more accurate for matrices of thin neighbourhoods: the
     smallest root of the characteristic polynomial by Newton's method from 0, which it approaches
     from one side, then a column of the adjugate of :math:`A - \lambda I`, both in double
-    precision. Where the first two eigenvalues are equal to rounding, :func:`eigh3` answers.
+    precision. Where the first two eigenvalues are equal to rounding, it is any vector across the
+    third eigenvector.
 
     Args:
         matrices: Symmetric matrices without negative eigenvalues beyond rounding, shape
@@ -89,36 +90,63 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     trace = xx + yy + zz
     minors = xx * yy - xy * xy + (xx * zz - xz * xz) + (yy * zz - yz * yz)
     determinant = zz * (xx * yy - xy * xy) - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
-    root = torch.zeros_like(trace)
-    for _ in range(_NEWTON_STEPS):
-        value = ((root - trace) * root + minors) * root - determinant
-        slope = (3 * root - 2 * trace) * root + minors
-        root = root - value / slope
-    root = torch.where(root.isfinite(), root, 0.0)
-    x, y, z = xx - root, yy - root, zz - root
-    diagonal = [y * z - yz * yz, x * z - xz * xz, x * y - xy * xy]
-    a01, a02, a12 = xz * yz - xy * z, xy * yz - xz * y, xy * xz - x * yz
-    use, best = diagonal[1] > diagonal[0], torch.maximum(diagonal[0], diagonal[1])
-    vector = [
-        torch.where(use, b, a) for a, b in ((diagonal[0], a01), (a01, diagonal[1]), (a02, a12))
-    ]
-    use, best = diagonal[2] > best, torch.maximum(best, diagonal[2])
-    vector = [torch.where(use, b, a) for a, b in zip(vector, (a02, a12, diagonal[2]), strict=True)]
-    length = (vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]).sqrt()
-    u, v, w = (part / length for part in vector)
+    root = _smallest_root(trace, minors, determinant)
+    u, v, w = _kernel((xx - root, yy - root, zz - root), (yz, xz, xy))
     # Where Newton's steps were still on their way, the quotient is right to second order.
     smallest = u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz
     smallest = smallest.clamp(min=0)
     rest = trace - smallest
     spread = (rest * rest - 4 * (minors - smallest * rest)).clamp(min=0).sqrt()
     ordered = torch.stack([smallest, (rest - spread) / 2, (rest + spread) / 2], dim=-1)
-    values = (ordered.clamp(min=0) * safe[..., None]).to(matrices.dtype)
-    vectors = torch.stack([u, v, w], dim=-1).to(matrices.dtype)
-    equal = best < _NEARLY_EQUAL
-    if bool(equal.any()):
-        exact_values, exact_vectors = eigh3(matrices[equal])
-        values[equal], vectors[equal] = exact_values.clamp(min=0), exact_vectors[..., 0]
-    return values, vectors
+    values = ordered.clamp(min=0) * safe[..., None]
+    return values.to(matrices.dtype), torch.stack([u, v, w], dim=-1).to(matrices.dtype)
+
+
+def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor:
+    """Return the smallest root of a characteristic polynomial without negative roots."""
+    root = torch.zeros_like(trace)
+    for _ in range(_NEWTON_STEPS):
+        value = ((root - trace) * root + minors) * root - determinant
+        slope = (3 * root - 2 * trace) * root + minors
+        root = root - value / slope
+    return torch.where(root.isfinite(), root, 0.0)
+
+
+def _kernel(
+    diagonal: tuple[Tensor, Tensor, Tensor], beside: tuple[Tensor, Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return unit vectors that singular semi-definite matrices take to zero.
+
+    Args:
+        diagonal: Entries (0, 0), (1, 1), (2, 2).
+        beside: Entries (1, 2), (0, 2), (0, 1): those that miss coordinate 0, 1, 2.
+    """
+    x, y, z = diagonal
+    yz, xz, xy = beside
+    # Any column of the adjugate will do; that with the largest diagonal entry is the longest.
+    a, b, c = y * z - yz * yz, x * z - xz * xz, x * y - xy * xy
+    ab, ac, bc = xz * yz - xy * z, xy * yz - xz * y, xy * xz - x * yz
+    use, best = b > a, torch.maximum(a, b)
+    u, v, w = torch.where(use, ab, a), torch.where(use, b, ab), torch.where(use, bc, ac)
+    use, best = c > best, torch.maximum(best, c)
+    u, v, w = torch.where(use, ac, u), torch.where(use, bc, v), torch.where(use, c, w)
+    length = (u * u + v * v + w * w).sqrt()
+    u, v, w = u / length, v / length, w / length
+    rank_one = best < _NEARLY_EQUAL
+    if bool(rank_one.any()):
+        rows = torch.stack([*diagonal, *beside], dim=-1)[rank_one][:, [0, 5, 4, 5, 1, 3, 4, 3, 2]]
+        u[rank_one], v[rank_one], w[rank_one] = _across(rows.reshape(-1, 3, 3)).unbind(dim=-1)
+    return u, v, w
+
+
+def _across(matrices: Tensor) -> Tensor:
+    """Return a unit vector across the direction of rank-one matrices ``(n, 3, 3)``."""
+    largest = matrices.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    along = matrices[torch.arange(len(matrices), device=matrices.device), largest]
+    axis = torch.nn.functional.one_hot(along.abs().argmin(dim=-1), 3).to(along.dtype)
+    across = torch.linalg.cross(along, axis)
+    length = (across * across).sum(dim=-1, keepdim=True).sqrt()
+    return torch.where(length > 0, across / length, axis)
 
 
 def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int) -> None:
