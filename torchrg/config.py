@@ -73,6 +73,10 @@ class GrowingConfig:
     coplanarity_floor: float = 0.005
     """Least value of that Qn, as a fraction of the distance to the farthest neighbour: exact and
     quantised surfaces, where most residuals are equal, have Qn = 0."""
+    plane_reach: float | None = None
+    """Two points join only if each is within this many times the other's residual of the other's
+    plane: faces never join across a thin plate. Takes the place of eq. 11 but where a fit is exact
+    (residual below ``coplanarity_floor``). Needs the residuals of the normals. None: not tested."""
     signed_normals: bool = False
     """Whether opposite normals differ by 180 degrees instead of 0, so that the two faces of a thin
     wall never join. For normals that are oriented."""
@@ -106,7 +110,7 @@ class GrowingConfig:
         within = self.connectivity is None or 0 <= self.connectivity <= 1
         _require(self, "connectivity", "in [0, 1] or none", within)
         _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
-        for name in ("max_distance", "max_color_distance"):
+        for name in ("max_distance", "max_color_distance", "plane_reach"):
             value = getattr(self, name)
             _require(self, name, ">= 0 or none", value is None or value >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)

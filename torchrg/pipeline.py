@@ -73,6 +73,7 @@ def segment_planes(
         neighbors,
         config.growing,
         valid=fit.valid,
+        residual_rms=fit.residual_rms,
         canonical=True,
         chunk_size=config.chunk_size,
     )

@@ -16,9 +16,9 @@ SAME_DEG = 0.02
 SWAPPED = 3
 
 
-def each_method(slow=(), marks=None):
+def each_method(slow=()):
     """Parametrise by method; the long tests of some only run with --run-slow."""
-    marks = {**dict.fromkeys(slow, pytest.mark.slow), **(marks or {})}
+    marks = dict.fromkeys(slow, pytest.mark.slow)
     names = [pytest.param(name, marks=marks.get(name, ())) for name in sorted(ESTIMATORS)]
     return pytest.mark.parametrize("method", names)
 
@@ -26,7 +26,6 @@ def each_method(slow=(), marks=None):
 methods = each_method()
 # Its hundreds of small steps take a second however few the points.
 methods_but_slow_irls = each_method(["irls"])
-padding = pytest.mark.xfail(reason="the survey of noise counts neighbours that do not count")
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +141,7 @@ def test_points_that_are_not_finite_take_no_part(corner, fits, method):
         assert not fit.normals[row].any()
 
 
-@each_method(marks={"consensus": padding, "irls": [padding, pytest.mark.slow]})
+@methods_but_slow_irls
 def test_neighbors_outside_the_radius_do_not_count(corner, method):
     # The columns beyond the most neighbours of any point hold nothing that counts.
     points = corner[0][:70]

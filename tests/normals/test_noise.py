@@ -35,3 +35,9 @@ def test_noise_is_as_long_as_the_unit():
     points = make_shape("cube", 2000, 0.004, seed=2).points
     scale = 2.0**-13
     assert torch.allclose(survey(points * scale).noise, survey(points).noise * scale, rtol=1e-4)
+
+
+def test_noise_of_points_given_twice_is_that_of_the_points():
+    points = make_shape("cube", 3000, 0.004, seed=2).points
+    found = float(survey(torch.cat([points, points])).noise.median())
+    assert found == pytest.approx(float(survey(points, 25).noise.median()), rel=0.1)

@@ -23,6 +23,8 @@ def segment(
     coplanarity=True,
     coplanarity_scope="all",
     coplanarity_floor=0.005,
+    plane_reach=None,
+    residual_rms=None,
     min_size=50,
 ):
     """Return a label for each point; all arguments are lists, points in order of preference.
@@ -35,6 +37,12 @@ def segment(
     sigma_th = ascending[int(curvature_quantile * (len(ascending) - 1))] if ascending else 0.0
     available = {i for i in range(num_points) if valid[i]}
     regions = []
+
+    def reach(i):
+        radius = max(math.dist(points[i], points[j]) for j in knn[i])
+        is_exact = residual_rms[i] <= coplanarity_floor * radius
+        return math.inf if is_exact else plane_reach * residual_rms[i]
+
     while available:
         p_min = min(available, key=lambda i: (curvature[i], i))
         seeds, region = [p_min], [p_min]
@@ -46,7 +54,7 @@ def segment(
                 for j in neighbors
             ]
             gamma = [residual(points, normals, seed, j) for j in neighbors]
-            if not coplanarity:
+            if not coplanarity or (plane_reach is not None and reach(seed) < math.inf):
                 gamma_th = math.inf
             else:
                 used = gamma
@@ -58,6 +66,10 @@ def segment(
                 if j not in available:
                     continue
                 if connectivity_scope == "region" and not is_connected:
+                    continue
+                if plane_reach is not None and (
+                    gamma_j > reach(seed) or residual(points, normals, j, seed) > reach(j)
+                ):
                     continue
                 if gamma_j <= gamma_th and angle_deg(normals[seed], normals[j]) <= max_angle_deg:
                     region.append(j)

@@ -35,7 +35,7 @@ VARIANTS = [
 ]
 
 
-def expected_labels(points, normals, curvature, neighbors, config, valid=None):
+def expected_labels(points, normals, curvature, neighbors, config, valid=None, residual_rms=None):
     counted = torch.ones_like(neighbors.indices, dtype=torch.bool)
     counted = counted if neighbors.valid is None else neighbors.valid
     knn = [row[c].tolist() for row, c in zip(neighbors.indices, counted, strict=True)]
@@ -51,6 +51,7 @@ def expected_labels(points, normals, curvature, neighbors, config, valid=None):
         knn,
         k=neighbors.indices.shape[1],
         valid=None if valid is None else valid.tolist(),
+        residual_rms=None if residual_rms is None else residual_rms.tolist(),
         **settings,
     )
 
@@ -134,3 +135,27 @@ def test_neighbors_beyond_the_search_radius_do_not_count(rules):
     labels = grow_regions(*cloud, config, canonical=True)
     assert labels.tolist() == expected_labels(*cloud, config)
     assert labels.tolist() != grow_regions(points, normals, curvature, neighbors, config).tolist()
+
+
+@pytest.mark.parametrize("kind", ["room", "plates", "quantized", "sphere"])
+@pytest.mark.parametrize("coplanarity", [True, False])
+def test_planes_that_each_point_must_be_on(kind, coplanarity):
+    rng = np.random.default_rng(3)
+    coordinates = growing_clouds.KINDS[kind](rng)
+    cloud = growing_clouds.prepare(coordinates, 9, dtype=torch.float64)
+    # Exact fits, for which eq. 11 decides, and others.
+    rms = torch.from_numpy(0.03 * rng.random(len(coordinates)))
+    rms[::3] = 0
+    for connectivity in (None, 0.5):
+        config = GrowingConfig(
+            max_angle_deg=25.0,
+            seed_rule="curvature",
+            connectivity=connectivity,
+            coplanarity=coplanarity,
+            plane_reach=1.5,
+            min_size=3,
+        )
+        labels = grow_regions(*cloud, config, canonical=True, residual_rms=rms, chunk_size=64)
+        assert labels.tolist() == expected_labels(*cloud, config, residual_rms=rms)
+        loose = grow_regions(*cloud, dataclasses.replace(config, plane_reach=None), canonical=True)
+        assert kind == "sphere" or labels.tolist() != loose.tolist()

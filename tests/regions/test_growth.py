@@ -171,6 +171,31 @@ def test_points_of_another_color_join_only_within_the_distance():
         grow_regions(*cloud, config)
 
 
+def test_faces_of_a_plate_join_only_without_planes_to_be_on():
+    rng = torch.Generator().manual_seed(0)
+    points = torch.rand(600, 3, generator=rng, dtype=torch.float64)
+    face = torch.arange(600) % 2
+    points[:, 2] = 0.04 * face + 0.002 * torch.randn(600, generator=rng, dtype=torch.float64)
+    cloud = (points, torch.eye(3).double()[[2] * 600], torch.zeros(600).double())
+    cloud = (*cloud, search_knn(points, 30))
+    rms = torch.full((600,), 0.002, dtype=torch.float64)
+    assert grow_regions(*cloud, CLASSIC).max() == 0
+    config = GrowingConfig(**{**vars(CLASSIC), "plane_reach": 4.0})
+    labels = grow_regions(*cloud, config, residual_rms=rms)
+    assert labels.max() == 1
+    assert torch.equal(labels == labels[0], face == face[0])
+    order = torch.randperm(600, generator=rng)
+    again = search_knn(points[order], 30)
+    shuffled = grow_regions(
+        points[order], cloud[1], cloud[2], again, config, residual_rms=rms[order]
+    )
+    assert torch.equal(shuffled, labels[order])
+    with pytest.raises(ConfigError, match="grow_regions: expected residual_rms"):
+        grow_regions(*cloud, config)
+    with pytest.raises(ShapeError, match=r"expected residual_rms of shape \(N\)"):
+        grow_regions(*cloud, config, residual_rms=rms[:5])
+
+
 def test_two_faces_of_a_thin_wall_join_only_if_normals_have_no_sign():
     points, normals, curvature, _ = strip(20, 0.0)
     points[1::2] += torch.tensor([-1.0, 0.0, 0.1], dtype=torch.float64)

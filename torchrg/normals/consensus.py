@@ -57,8 +57,9 @@ def estimate_consensus(
 
     Returns:
         The fit, with ``sharp``. At sharp points curvature and residual are those of the neighbours
-        within three times the noise of the plane, elsewhere those of PCA. ``valid`` is that of PCA;
-        with fewer than 12 neighbours so is all else.
+        within three times the noise of the plane, the curvature less what the noise explains (in a
+        narrow face the little width would make a large curvature of it); elsewhere they are those
+        of PCA. ``valid`` is that of PCA; with fewer than 12 neighbours so is all else.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
@@ -92,7 +93,8 @@ def estimate_consensus(
     def describe(rows: Tensor) -> None:
         _, values = _inliers(points, neighbors, planes, survey.noise, rows)
         smallest, total = values[:, 0].clamp(min=0), values.clamp(min=0).sum(dim=1)
-        curvature[rows] = smallest / torch.where(total > 0, total, 1.0)
+        bent = (smallest - survey.noise[rows].square()).clamp_(min=0)
+        curvature[rows] = bent / torch.where(total > 0, total, 1.0)
         residual_rms[rows] = smallest.sqrt()
 
     each_block_of(describe, sharp, block)
@@ -127,7 +129,11 @@ def _standard_errors(
     eigenvalue ``l_1`` of their covariance: a quarter of the squared radius where they fill a disc.
     """
     radius = torch.where(survey.radius > 0, survey.radius, 1.0)
-    errors: Tensor = 2 * survey.noise / (radius * neighbors.indices.shape[1] ** 0.5)
+    counted = neighbors.valid
+    num_points: Tensor | int = neighbors.indices.shape[1]
+    if counted is not None:
+        num_points = counted.sum(dim=1).clamp_(min=1)
+    errors: Tensor = 2 * survey.noise / (radius * num_points**0.5)
 
     def work(rows: Tensor) -> None:
         count, values = _inliers(points, neighbors, planes, survey.noise, rows)

@@ -67,9 +67,10 @@ def survey_noise(
     ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``, where ``q`` is the 35th percentile
     over the neighbours, ``c_m`` the factor that makes it unbiased for a plane, and the root undoes
     that a plane of few points turns with their noise (``R_m = R (m / K)^(1/2)``: their radius, from
-    that of all; ``a_m``: measured on noisy planes). Neighbourhoods almost on one line, as on scan
-    lines, do not count. At corners, where none of the three finds a face, the noise is at most 3
-    times the 15th percentile of that of the neighbours.
+    that of all; ``a_m``: measured on noisy planes). A place counts once, however many points are
+    there; neighbourhoods almost on one line, as on scan lines, do not count. At corners, where none
+    of the three finds a face, the noise is at most 3 times the 15th percentile of that of the
+    neighbours.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -104,9 +105,12 @@ def survey_noise(
         coordinate_resolution(points), radius * (4 * torch.finfo(points.dtype).eps)
     )
     noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors, _QUANTILE)
+    count: Tensor | int = neighbors.indices.shape[1]
+    if neighbors.valid is not None:
+        count = neighbors.valid.sum(dim=1)
     for size, values in zip(_SMALL_SIZES, small, strict=True):
         found = size.factor * _neighbor_quantiles(values, neighbors, _QUANTILE)
-        near = radius * (size.num_points / neighbors.indices.shape[1]) ** 0.5
+        near = radius * (size.num_points / torch.as_tensor(count, dtype=radius.dtype)).sqrt()
         share = found / torch.where(radius > 0, size.limit * near, 1.0)
         below = (1 - share * share).clamp_(min=0)
         scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
@@ -132,8 +136,22 @@ def _deviations(
     spread = (rests * rests * counted).sum(dim=1) / (count - 3).clamp_(min=1)
     whole = torch.where(valid & (count > 3), spread.sqrt_(), torch.inf)
     radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
+    patches, counted = _each_place_once(patches, counted)
     small = [_small_deviations(patches, counted, size.num_points) for size in _SMALL_SIZES]
     return offsets, radius, whole, *small
+
+
+def _each_place_once(patches: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+    """Move neighbours at the place of the one before to the end, where they do not count."""
+    again = torch.zeros_like(counted, dtype=torch.bool)
+    again[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=2)
+    rows = again.any(dim=1).nonzero().squeeze(-1)
+    if len(rows) == 0:
+        return patches, counted
+    order = again[rows].to(torch.uint8).argsort(dim=1, stable=True)
+    once = (counted * ~again)[rows].gather(1, order)
+    moved = patches[rows].gather(1, order[:, :, None].expand(-1, -1, 3))
+    return patches.index_copy(0, rows, moved), counted.index_copy(0, rows, once)
 
 
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
@@ -150,7 +168,11 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
     """Return a quantile of values over the neighbours of each point."""
-    indices = neighbors.indices
+    indices, counted = neighbors
+    if counted is not None:
+        near = torch.where(counted, values[indices.long()], torch.inf).sort(dim=1).values
+        ranks = (quantile * counted.sum(dim=1, keepdim=True)).ceil().clamp(min=1)
+        return near.gather(1, ranks.long() - 1).squeeze(1)
     rank = max(math.ceil(quantile * indices.shape[1]), 1)
     if values.device.type != "cpu":
         return values[indices.long()].kthvalue(rank, dim=1).values

@@ -93,8 +93,8 @@ def fit_pieces(
     votes, pieces = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
 
     def split(rows: Tensor) -> None:
-        columns, counted = _gather(points, neighbors, rows)
-        scale = noise[rows]
+        columns = _gather_counted(points, neighbors, rows)
+        counted, scale = torch.ones_like(columns[0]), noise[rows]
         voted = vote_planes(columns, scale, fit.normals[rows], counted)
         found = _fit_broken(columns, *voted, scale, counted)
         votes.normals[rows], votes.offsets[rows] = voted
@@ -108,7 +108,8 @@ def fit_pieces(
         )
         gain[rows] = torch.where(known, drop, -_MOST_GAIN).clamp_(-_MOST_GAIN, _MOST_GAIN)
 
-    each_block_of(split, broken, chunk_size)
+    for same in _by_count(broken, neighbors):
+        each_block_of(split, same, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meeting = broken & explained & (gain > _LEAST_GAIN) & (pooled > _LEAST_POOLED_GAIN)
     voting = broken & ~meeting & (bent > _FAR_OFF * noise)
@@ -159,6 +160,25 @@ def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns
     return columns, neighbors.valid[rows].to(points.dtype)
 
 
+def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
+    """Return the chosen points in sets whose points have equally many neighbours that count."""
+    if neighbors.valid is None:
+        return [chosen]
+    count = neighbors.valid.sum(dim=1)
+    return [chosen & (count == number) for number in count[chosen].unique().tolist()]
+
+
+def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Columns:
+    """Return columns of the neighbours that count, equally many for all of these points."""
+    patches = gather_patches(points, neighbors.indices[rows])
+    if neighbors.valid is not None:
+        counted = neighbors.valid[rows]
+        order = (~counted).to(torch.uint8).argsort(dim=1, stable=True)
+        order = order[:, : int(counted[0].sum())]
+        patches = patches.gather(1, order[:, :, None].expand(-1, -1, 3))
+    return split_columns(patches)
+
+
 def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
     """Return the mean of values over the nearest neighbours."""
     means = torch.empty_like(values)
@@ -166,7 +186,11 @@ def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> T
     def work(part: slice) -> None:
         indices = neighbors.indices[part, :_NUM_POOLED]
         near = values.index_select(0, indices.reshape(-1)).view(indices.shape)
-        means[part] = near.mean(dim=1)
+        if neighbors.valid is None:
+            means[part] = near.mean(dim=1)
+            return
+        counted = neighbors.valid[part, :_NUM_POOLED]
+        means[part] = (near * counted).sum(dim=1) / counted.sum(dim=1).clamp_(min=1)
 
     each_block(work, len(values), chunk_size, values.device)
     return means

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchrg.neighbors import gather_patches
 from torchrg.robust import median, qn
+from torchrg.structures import Neighbors
 
 
 def sq_chord_limit(max_angle_deg: float) -> float:
@@ -105,6 +107,22 @@ def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = N
     """
     scale = torch.maximum(qn(residuals, mask=mask), floor)
     return median(residuals, mask=mask) + 2 * scale
+
+
+def neighborhood_radii(points: Tensor, neighbors: Neighbors) -> Tensor:
+    """Return the distance of each point to its last neighbour, shape ``(N,)``.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 0], [0, 3, 4]])
+        >>> neighborhood_radii(points, Neighbors(torch.tensor([[0, 1], [1, 0]]))).tolist()
+        [5.0, 5.0]
+    """
+    indices, counted = neighbors
+    last = torch.full_like(indices[:, :1], indices.shape[1] - 1)
+    if counted is not None:
+        last = counted.sum(dim=1, keepdim=True, dtype=last.dtype).sub_(1).clamp_(min=0)
+    ends = torch.cat([indices[:, :1], indices.gather(1, last.long())], dim=1)
+    return patch_radii(gather_patches(points, ends))
 
 
 def patch_radii(patches: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -34,6 +34,8 @@ class GrowingCloud(NamedTuple):
         neighbors: Neighbours of each point.
         valid: Points that may belong to a region, shape ``(N,)``, bool.
         colors: Shape ``(N, C)``, floating point, or None.
+        reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
+            where that is not known, or None.
     """
 
     points: Tensor
@@ -42,6 +44,7 @@ class GrowingCloud(NamedTuple):
     neighbors: Neighbors
     valid: Tensor
     colors: Tensor | None = None
+    reach: Tensor | None = None
 
 
 class AcceptedEdges(NamedTuple):
@@ -84,14 +87,17 @@ def accept_edges(
     if config.max_color_distance is not None and cloud.colors is not None:
         sq_distances = _sq_differences(cloud.colors, rows, indices)
         joins &= sq_distances <= config.max_color_distance**2
+    if cloud.reach is not None:
+        joins &= _on_planes(cloud, rows, indices, cloud.reach)
     connected: Tensor | None = None
     min_shared = min_shared_neighbors(config.connectivity, indices.shape[1])
-    if config.coplanarity and config.coplanarity_scope == "connected":
-        everyone = torch.ones_like(joins) if counted is None else counted
-        connected = shared.at_least(min_shared, rows, everyone)
-        joins &= _coplanar(cloud, rows, indices, joins, config.coplanarity_floor, connected)
-    elif config.coplanarity:
-        joins &= _coplanar(cloud, rows, indices, joins, config.coplanarity_floor, None)
+    if config.coplanarity:
+        if config.coplanarity_scope == "connected":
+            everyone = torch.ones_like(joins) if counted is None else counted
+            connected = shared.at_least(min_shared, rows, everyone)
+        asked = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
+        flat = _coplanar(cloud, rows, indices, asked, config.coplanarity_floor, connected)
+        joins &= flat | ~asked
     if config.connectivity is None:
         return AcceptedEdges(joins, None)
     if connected is None:
@@ -202,6 +208,19 @@ def _sq_differences(values: Tensor, rows: slice, indices: Tensor) -> Tensor:
         difference = column.index_select(0, flat).view(indices.shape) - column[rows, None]
         total += difference.mul_(difference)
     return total
+
+
+def _on_planes(cloud: GrowingCloud, rows: slice, indices: Tensor, reach: Tensor) -> Tensor:
+    """Return which neighbours lie on the plane of the point, and it on theirs, ``(n, K)``."""
+    flat = indices.reshape(-1)
+    own = torch.zeros(indices.shape, dtype=cloud.points.dtype, device=indices.device)
+    theirs = torch.zeros_like(own)
+    for place, normal in zip(cloud.points.unbind(dim=1), cloud.normals.unbind(dim=1), strict=True):
+        away = place.index_select(0, flat).view(indices.shape) - place[rows, None]
+        own += away * normal[rows, None]
+        theirs += away.mul_(normal.index_select(0, flat).view(indices.shape))
+    on_own = own.abs_() <= reach[rows, None]
+    return on_own & (theirs.abs_() <= reach.index_select(0, flat).view(indices.shape))
 
 
 def _coplanar(

@@ -10,6 +10,7 @@ from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
 from torchrg.regions.components import claim_leftovers, first_to_reach
+from torchrg.regions.criteria import neighborhood_radii
 from torchrg.regions.edges import EdgeFinder, GrowingCloud
 from torchrg.regions.frontier import grow_in_turn
 from torchrg.regions.graph import pack_edges
@@ -26,6 +27,7 @@ def grow_regions(
     *,
     valid: Tensor | None = None,
     colors: Tensor | NDArray[np.generic] | None = None,
+    residual_rms: Tensor | NDArray[np.floating] | None = None,
     canonical: bool = False,
     chunk_size: int = 16384,
 ) -> Tensor:
@@ -52,6 +54,8 @@ def grow_regions(
             region passes through them. Default: all. Points whose normal or curvature is not
             finite never join.
         colors: Colours of the points, shape ``(N, C)``, for ``max_color_distance``.
+        residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
+            :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
 
@@ -61,7 +65,7 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If the settings ask for colours, and there are none.
+        ConfigError: If the settings ask for colours or residuals, and there are none.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -81,6 +85,8 @@ def grow_regions(
             "grow_regions: expected colors, which max_color_distance needs, got None; pass them or "
             "set max_color_distance to None."
         )
+    if config.plane_reach is not None:
+        cloud = cloud._replace(reach=_plane_reach(cloud, residual_rms, config))
     device = cloud.points.device
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=device)
@@ -200,7 +206,25 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
         Neighbors(indices, None if mask is None else mask[order]),
         cloud.valid[order],
         None if cloud.colors is None else _by_column(cloud.colors[order]),
+        None if cloud.reach is None else cloud.reach[order],
     )
+
+
+def _plane_reach(
+    cloud: GrowingCloud, residual_rms: Tensor | NDArray[np.floating] | None, config: GrowingConfig
+) -> Tensor:
+    """Return how far from its plane a neighbour may be, shape ``(N,)``, infinite for exact fits."""
+    if residual_rms is None or config.plane_reach is None:
+        raise ConfigError(
+            "grow_regions: expected residual_rms, which plane_reach needs, got None; pass that of "
+            "the normals or set plane_reach to None."
+        )
+    caller = "grow_regions"
+    residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
+    check_shapes(caller, points=(cloud.points, "N 3"), residual_rms=(residual_rms, "N"))
+    check_floating(caller, points=cloud.points, residual_rms=residual_rms)
+    floor = config.coplanarity_floor * neighborhood_radii(cloud.points, cloud.neighbors)
+    return torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
 
 
 def _by_column(vectors: Tensor) -> Tensor:

@@ -4,10 +4,9 @@ import torch
 from torch import Tensor
 
 from torchrg.config import GrowingConfig
-from torchrg.neighbors import gather_patches
 from torchrg.regions.absorb import absorb_points
 from torchrg.regions.contacts import count_contacts
-from torchrg.regions.criteria import patch_radii
+from torchrg.regions.criteria import neighborhood_radii
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fitting import FittedPlanes, fit_planes
 from torchrg.regions.merge import Moments, merge_coplanar
@@ -93,15 +92,6 @@ def _planes_of(
     """
     segments = Segments(labels)
     fit = fit_planes(segments, cloud.points, cloud.normals)
-    radius = segments.median(segments.take(_neighborhood_radii(cloud))).double()
+    radii = neighborhood_radii(cloud.points, cloud.neighbors)
+    radius = segments.median(segments.take(radii)).double()
     return segments, fit, config.coplanarity_floor * radius
-
-
-def _neighborhood_radii(cloud: GrowingCloud) -> Tensor:
-    """Return the distance of each point to its last neighbour, shape ``(N,)``."""
-    indices, counted = cloud.neighbors
-    last = torch.full_like(indices[:, :1], indices.shape[1] - 1)
-    if counted is not None:
-        last = counted.sum(dim=1, keepdim=True, dtype=last.dtype).sub_(1).clamp_(min=0)
-    ends = torch.cat([indices[:, :1], indices.gather(1, last.long())], dim=1)
-    return patch_radii(gather_patches(cloud.points, ends))
