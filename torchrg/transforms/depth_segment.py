@@ -9,7 +9,8 @@ from torchrg.structures import Segmentation
 from torchrg.transforms.depth_camera import depth_to_points, has_depth
 from torchrg.transforms.depth_config import DepthConfig
 from torchrg.transforms.depth_normals import PixelPlanes, fit_pixels
-from torchrg.transforms.depth_regions import InverseCloud, grow_pixels
+from torchrg.transforms.depth_refine import InverseCloud
+from torchrg.transforms.depth_regions import grow_pixels
 
 
 @torch.no_grad()
