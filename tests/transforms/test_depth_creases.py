@@ -1,0 +1,80 @@
+"""Borders of regions move to the lines where their planes meet."""
+
+import torch
+
+from torchrg.regions.fitting import fit_planes
+from torchrg.regions.segments import Segments
+from torchrg.structures import Neighbors
+from torchrg.transforms.depth_creases import move_to_creases
+from torchrg.transforms.depth_windows import moved
+
+STEPS = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+
+
+def around(height, width):
+    """Return the pixels around each pixel of an image."""
+    rows = torch.arange(height * width).view(height, width)
+    near = torch.stack([rows, *(moved(rows, step, fill=-1) for step in STEPS)], dim=-1).view(-1, 9)
+    return Neighbors(near.clamp(min=0), near >= 0)
+
+
+def move(surface, labels, *, truth, reach):
+    """Return labels whose borders moved, on planes fitted to the true regions."""
+    height, width = surface.shape
+    x = torch.arange(width).double() / 100
+    y = torch.arange(height).double()[:, None] / 100
+    columns = [x.expand(height, width), y.expand(height, width), surface]
+    points = torch.stack(columns, dim=-1).view(-1, 3)
+    fit = fit_planes(Segments(truth.flatten()), points, torch.ones_like(points))
+    return move_to_creases(
+        points, labels.flatten(), around(height, width), fit, torch.tensor(reach)
+    ).view(height, width)
+
+
+def roof(height=40, width=60):
+    """Return two planes that meet at a slanted line, and which is which."""
+    x = torch.arange(width).double() / 100
+    y = torch.arange(height).double()[:, None] / 100
+    left, right = 2 + 0.5 * x + 0.1 * y, 2.36 - 0.7 * x + 0.2 * y
+    return torch.minimum(left, right), (right < left).long()
+
+
+def test_a_displaced_border_goes_back_to_the_crease():
+    surface, truth = roof()
+    displaced = moved(truth, (0, -6), fill=0)
+    assert int((displaced != truth).sum()) > 200
+    back = move(surface, displaced, truth=truth, reach=[0.1, 0.1])
+    # Pixels on the crease itself are on both sides.
+    assert int((back != truth).sum()) <= 6
+
+
+def test_pixels_off_the_other_plane_stay():
+    surface, truth = roof()
+    displaced = moved(truth, (0, -6), fill=0)
+    left = 2 + 0.5 * torch.arange(60) / 100 + 0.1 * torch.arange(40)[:, None] / 100
+    overhang = torch.where(displaced == 0, left, surface)
+    back = move(overhang, displaced, truth=truth, reach=[0.003, 0.003])
+    # The overhang leaves the other plane within a pixel of where they meet.
+    assert int((back != displaced).sum()) <= 2 * 40
+    curved = move(surface, displaced, truth=truth, reach=[0.1, float("nan")])
+    assert torch.equal(curved, displaced)
+
+
+def test_borders_do_not_run_along_the_crease():
+    # A leg stands on a floor: beside the leg, the floor goes on behind the line where they meet.
+    x = torch.arange(60).double() / 100
+    y = torch.arange(40).double()[:, None] / 100
+    floor = 1 + 2 * (y - 0.2) + 0 * x
+    is_leg = (y < 0.2) & (x > 0.2) & (x < 0.3)
+    surface, truth = torch.where(is_leg, 1.0, floor), is_leg.long()
+    assert torch.equal(move(surface, truth, truth=truth, reach=[0.05, 0.05]), truth)
+
+
+def test_unlabelled_pixels_and_whole_images_stay():
+    surface, truth = roof()
+    labels = moved(truth, (0, -6), fill=0)
+    labels[10:20] = -1
+    back = move(surface, labels, truth=truth, reach=[0.1, 0.1])
+    assert bool((back[10:20] == -1).all())
+    one = torch.zeros_like(truth)
+    assert torch.equal(move(surface, one, truth=truth, reach=[0.1, 0.1]), one)
