@@ -71,7 +71,8 @@ def _parse() -> argparse.Namespace:
         "--readme", action="store_true", help="put the main numbers into the README"
     )
     for key, title in TITLES.items():
-        parser.add_argument(f"--{key}", type=Path, metavar="PATH", help=f"the paper's {title}")
+        words = f"the paper's {title}; labels and normals in the file are its truth"
+        parser.add_argument(f"--{key}", type=Path, metavar="PATH", help=words)
     return parser.parse_args()
 
 

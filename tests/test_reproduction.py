@@ -83,6 +83,7 @@ def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch, capsys):
         assert (folder / file).read_bytes().startswith(b"\x89PNG"), file
     assert "printed: proposed" in page
     assert "9.84 min" in page
+    assert page.count("<b>another</b>") == 4
     assert {"commit", "torch", "processor", "threads"} <= {
         word.split()[0] for word in report["made_with"].split("; ")
     }
@@ -188,10 +189,12 @@ def test_file_of_the_paper_is_used_where_it_is_given(small, tmp_path):
 
     points = np.random.default_rng(0).normal(size=(500, 3))
     points[3] = np.nan
-    np.savez(tmp_path / "hall.npz", points=points, labels=np.arange(500))
+    colors = np.full((500, 3), 7, dtype=np.uint8)
+    np.savez(tmp_path / "hall.npz", points=points, labels=np.arange(500), color=colors)
     cloud = load_cloud("hallway", tmp_path / "hall.npz", quick=False)
     assert (len(cloud.points), cloud.is_papers) == (499, True)
     assert cloud.labels.tolist() == [*range(3), *range(4, 500)]
+    assert torch.equal(cloud.colors, torch.full((499, 3), 7, dtype=torch.uint8))
     assert load_cloud("hallway", None, quick=True).name != cloud.name
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud, load_cloud
-from torchrg import load_config, search_knn, segment_planes
+from torchrg import estimate_normals, load_config, search_knn, segment_planes
 from torchrg.scenes import make_room
-from torchrg.structures import Neighbors
+from torchrg.structures import Neighbors, NormalFit
 
 _WARM_UP = 2000
 
@@ -35,7 +35,7 @@ class Run:
         if key not in self._clouds:
             # Neighbours of a million points are large: those of other clouds are let go.
             for other in self._clouds.values():
-                other.__dict__.pop("neighbors", None)
+                other.forget()
             cloud = load_cloud(key, self.paths.get(key), quick=self.quick)
             self._clouds[key] = LoadedCloud(cloud)
         return self._clouds[key]
@@ -49,11 +49,26 @@ class Run:
 
 @dataclass(frozen=True)
 class LoadedCloud:
-    """A cloud, and its neighbours once they are asked for."""
+    """A cloud, and its neighbours and normals once they are asked for."""
 
     cloud: EvalCloud
+    _fits: dict[str, NormalFit] = field(default_factory=dict)
 
     @cached_property
     def neighbors(self) -> Neighbors:
         """The neighbours that all presets use."""
         return search_knn(self.cloud.points, load_config().normals.k)
+
+    def fit(self, preset: str) -> NormalFit:
+        """Return the normals of a preset; those of the last one asked for are kept."""
+        if preset not in self._fits:
+            self._fits.clear()
+            self._fits[preset] = estimate_normals(
+                self.cloud.points, config=load_config(preset).normals, neighbors=self.neighbors
+            )
+        return self._fits[preset]
+
+    def forget(self) -> None:
+        """Let go what is large and can be computed again."""
+        self.__dict__.pop("neighbors", None)
+        self._fits.clear()

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from reproduction.cells import Record
-from reproduction.paper_numbers import INDEX_NAMES, INDICES
+from reproduction.clouds import TITLES
+from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
 from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side, outcomes_of
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
@@ -55,6 +56,7 @@ def reproduce(run: Run) -> Record:
             "compare methods, not tables."
         )
     ]
+    blocks.append(cloud_table(run))
     records = []
     for key, number in CLOUDS.items():
         cloud = run.cloud(key).cloud
@@ -69,6 +71,23 @@ def reproduce(run: Run) -> Record:
             )
         blocks += draw_figures(run, key, number, METHODS)
     return section("Table 2, Figures 7 and 8: segmentation", blocks, records)
+
+
+def cloud_table(run: Run) -> Block:
+    """Return which clouds are the paper's own, and what stands in for the others."""
+    clouds = [run.cloud(key).cloud for key in TITLES]
+    rows = [
+        [
+            TITLES[cloud.key],
+            f"{POINTS[cloud.key]:,}",
+            "the paper's own" if cloud.is_papers else "**another**",
+            cloud.origin,
+            "yes" if cloud.labels is not None else "no",
+        ]
+        for cloud in clouds
+    ]
+    head = ["cloud of the paper", "its points", "here", "what it is", "truth known"]
+    return table("Clouds, and where they differ from the paper's", head, rows)
 
 
 def draw_figures(run: Run, key: str, number: str, presets: Sequence[str]) -> list[Block]:
@@ -108,7 +127,7 @@ def index_table(key: str, origin: str, found: dict[str, Record]) -> Block:
     for place, name in enumerate(INDEX_NAMES):
         part = "clusters" if name in INTERNAL else "labels"
         higher = METRICS[part][name].higher_is_better
-        form = ".4f" if part == "clusters" else ".1f"
+        form = ".4g" if part == "clusters" else ".1f"
         theirs = [papers[preset][place] for preset in papers]
         ours = [_index(record, part, name) for record in found.values()]
         title = INTERNAL.get(name, name.capitalize())
@@ -123,13 +142,15 @@ def index_table(key: str, origin: str, found: dict[str, Record]) -> Block:
         higher = METRICS["clusters"][name].higher_is_better
         ours = [_index(record, "directions", name) for record in found.values()]
         row = [f"{title} of directions {'↑' if higher else '↓'}", *[""] * len(papers)]
-        rows.append(row + mark_best(ours, ".4f", higher=higher))
+        rows.append(row + mark_best(ours, ".4g", higher=higher))
     rows += more_rows(found, len(papers))
     head = [f"**{key}**", *(f"printed: {PRINTED[preset]}" for preset in papers), *METHODS.values()]
     note = (
         f"Left, the paper's printed numbers; right, ours on {origin}. Clusters of more than "
         f"{SAMPLE_SIZE:,} points enter DBI by a subsample of that size."
     )
+    if all("labels" not in record for record in found.values()):
+        note += " The paper's hand-made truth is not public: no external indices."
     return table(f"**Table 2**, {key}", head, rows, note)
 
 

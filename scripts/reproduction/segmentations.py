@@ -38,16 +38,12 @@ class Segmented:
     Attributes:
         labels: Shape ``(N,)``, int64.
         normals: Shape ``(N, 3)``.
-        curvature: Shape ``(N,)``.
         valid: Shape ``(N,)``, bool.
-        sharp: Shape ``(N,)``, bool.
     """
 
     labels: Tensor
     normals: Tensor
-    curvature: Tensor
     valid: Tensor
-    sharp: Tensor
 
 
 def segment(run: Run, key: str, preset: str) -> Record:
@@ -99,7 +95,7 @@ def read_segmented(run: Run, key: str, preset: str) -> Segmented:
     """Return a segmentation, computed first if it is not there yet."""
     segment(run, key, preset)
     fields = read_cloud(_result_path(run, key, preset)).fields
-    names = ("labels", "normals", "curvature", "valid", "sharp")
+    names = ("labels", "normals", "valid")
     return Segmented(*(torch.from_numpy(fields[name]) for name in names))
 
 
@@ -180,19 +176,20 @@ def regrow(
     Returns:
         Labels, shape ``(N,)``, int64.
     """
-    loaded = run.cloud(key)
     growing = load_config(preset).growing
-    found = read_segmented(run, key, preset)
     if (max_angle_deg, curvature_quantile) == (growing.max_angle_deg, growing.curvature_quantile):
-        return found.labels
+        return read_segmented(run, key, preset).labels
     settings = replace(growing, max_angle_deg=max_angle_deg, curvature_quantile=curvature_quantile)
+    loaded = run.cloud(key)
+    fit = loaded.fit(preset)
     return grow_regions(
         loaded.cloud.points,
-        found.normals,
-        found.curvature,
+        fit.normals,
+        fit.curvature,
         loaded.neighbors,
         settings,
-        valid=found.valid,
+        valid=fit.valid,
+        residual_rms=fit.residual_rms,
     )
 
 
