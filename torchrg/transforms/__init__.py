@@ -3,6 +3,7 @@
 from torchrg.transforms.cloud import CenterCloud, KeepFinite
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth
 from torchrg.transforms.depth_config import DepthConfig
+from torchrg.transforms.depth_fusion import fuse_depth
 from torchrg.transforms.depth_segment import segment_depth
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
 from torchrg.transforms.voxel_planes import segment_voxels
@@ -18,6 +19,7 @@ __all__ = [
     "SampleVoxels",
     "SegmentDepth",
     "SegmentPlanes",
+    "fuse_depth",
     "restore_points",
     "sample_voxels",
     "segment_depth",
