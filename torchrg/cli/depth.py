@@ -11,15 +11,14 @@ import tyro
 
 from torchrg.batch.provenance import describe_versions, hash_file
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.cli.depth_input import read_frame
 from torchrg.cli.picture import check_picture, picture_paths
-from torchrg.datasets.rgbd_images import DEPTH_SUFFIXES, read_depth
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.io import check_output, write_cloud
 from torchrg.io.atomic import check_place
 from torchrg.report import color_planes, write_png
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import Segmentation
 from torchrg.transforms import DepthConfig, segment_depth
-from torchrg.transforms.depth_camera import depth_to_points, find_intrinsics, make_intrinsics
 
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 """Flags that say that the inputs are images."""
@@ -109,7 +108,12 @@ def _output_paths(arguments: Arguments) -> list[Path]:
 def _segment_image(source: Path, target: Path, picture: Path | None, arguments: Arguments) -> None:
     """Segment one image."""
     begin = time.perf_counter()
-    cloud, depth, intrinsics = _read(source, arguments)
+    cloud, depth, intrinsics = read_frame(
+        source,
+        intrinsics=arguments.intrinsics,
+        depth_scale=arguments.depth_scale,
+        organised=arguments.image,
+    )
     is_image = target.suffix.lower() == ".png"
     check_place(target) if is_image else check_output(target, cloud)
     # Results are about the cloud's origin.
@@ -132,60 +136,6 @@ def _segment_image(source: Path, target: Path, picture: Path | None, arguments: 
         f"{source}: {width} x {height} pixels, {num_pixels:,} with depth, {num_planes:,} planes, "
         f"{share:.1f} % of these labelled, {time.perf_counter() - begin:.1f} s -> {target}"
     )
-
-
-def _read(source: Path, arguments: Arguments) -> tuple[Cloud, torch.Tensor, torch.Tensor]:
-    """Return an input as a cloud, as depth ``(H, W)``, and its camera."""
-    if source.suffix.lower() not in DEPTH_SUFFIXES or arguments.image:
-        return _read_organised(source, arguments)
-    for name, value in (
-        ("intrinsics fx,fy,cx,cy", arguments.intrinsics),
-        ("depth-scale", arguments.depth_scale),
-    ):
-        if value is None:
-            raise ConfigError(
-                f"{source}: expected --{name}, which depth images do not hold; pass it."
-            )
-    intrinsics = _parse_intrinsics(arguments.intrinsics or "")
-    depth = read_depth(source, depth_scale=arguments.depth_scale or 1.0)
-    points = depth_to_points(depth[None].double(), intrinsics[None])[0]
-    cloud = Cloud(
-        points.view(-1, 3).float().numpy(),
-        grid_shape=(depth.shape[0], depth.shape[1]),
-        source=str(source),
-    )
-    return cloud, depth, intrinsics
-
-
-def _read_organised(source: Path, arguments: Arguments) -> tuple[Cloud, torch.Tensor, torch.Tensor]:
-    """Return an organised cloud, its depth, and the camera that is given or found."""
-    cloud = read_cloud(source)
-    if cloud.grid_shape is None:
-        raise FormatError(
-            f"{source}: expected an organised cloud, with a height above 1, got a list of points; "
-            "leave out --image."
-        )
-    points = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
-    given = arguments.intrinsics
-    intrinsics = find_intrinsics(points) if given is None else _parse_intrinsics(given)
-    if intrinsics is None:
-        raise FormatError(
-            f"{source}: expected points of a pinhole camera in its own coordinates, got others; "
-            "leave out --image."
-        )
-    depth = points[..., 2]
-    return cloud, torch.where(depth.isfinite(), depth, 0.0), intrinsics
-
-
-def _parse_intrinsics(text: str) -> torch.Tensor:
-    """Return the camera matrix of ``fx,fy,cx,cy``."""
-    try:
-        fx, fy, cx, cy = (float(word) for word in text.split(","))
-    except ValueError:
-        raise ConfigError(
-            f"expected --intrinsics fx,fy,cx,cy, four numbers without blanks, got {text!r}."
-        ) from None
-    return make_intrinsics(fx, fy, cx, cy)
 
 
 def _flattened(seg: Segmentation) -> Segmentation:
