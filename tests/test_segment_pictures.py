@@ -1,9 +1,12 @@
 """``torchrg segment --picture``: a picture of the planes beside the result."""
 
+import functools
+
 import numpy as np
 import pytest
 
-from torchrg.cli import main
+from torchrg.cli import main, picture
+from torchrg.report import render_cloud
 
 PNG = b"\x89PNG"
 
@@ -17,16 +20,21 @@ def rooms(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch):
+    monkeypatch.setattr(picture, "render_cloud", functools.partial(render_cloud, width=80))
+
+
 def segment(*arguments):
     return main(["segment", *map(str, arguments), "--preset", "classic"])
 
 
 def test_picture_is_what_view_draws_of_the_result(rooms, tmp_path):
-    result, picture = tmp_path / "seg.npz", tmp_path / "seg.png"
-    assert segment(rooms / "room1.npz", "--out", result, "--picture", picture) == 0
+    result, drawn = tmp_path / "seg.npz", tmp_path / "seg.png"
+    assert segment(rooms / "room1.npz", "--out", result, "--picture", drawn) == 0
     viewed = tmp_path / "viewed.png"
-    assert main(["view", str(result), "--out", str(viewed), "--width", "1400"]) == 0
-    assert picture.read_bytes() == viewed.read_bytes()
+    assert main(["view", str(result), "--out", str(viewed), "--width", "80"]) == 0
+    assert drawn.read_bytes() == viewed.read_bytes()
 
 
 def test_several_pictures_go_to_a_directory_under_the_names_of_the_inputs(rooms, tmp_path):
@@ -43,17 +51,17 @@ def test_no_picture_unless_asked_for(rooms, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("inputs", "picture", "message"),
+    ("inputs", "place", "message"),
     [
         (["room1.npz"], "seg.jpg", "expected a file that ends in .png"),
         (["room1.npz"], "no/seg.png", "there is no folder"),
         (["room1.npz", "room2.npz"], "both.png", "expected a directory for 2 pictures"),
     ],
 )
-def test_picture_is_refused_before_the_work(rooms, tmp_path, capsys, inputs, picture, message):
+def test_picture_is_refused_before_the_work(rooms, tmp_path, capsys, inputs, place, message):
     out = tmp_path / ("seg.npz" if len(inputs) == 1 else "out")
     paths = [rooms / name for name in inputs]
-    assert segment(*paths, "--out", out, "--picture", tmp_path / picture) == 2
+    assert segment(*paths, "--out", out, "--picture", tmp_path / place) == 2
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1

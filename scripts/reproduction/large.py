@@ -5,8 +5,8 @@ from reproduction.pictures import draw_side_by_side
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, section, table, text
 from reproduction.segmentation_tables import draw_figures, more_rows
-from reproduction.segmentations import METHODS, count_regions, face_recalls, regrow, score
-from reproduction.trends import trend_claims
+from reproduction.segmentations import METHODS, count_regions, regrow, score
+from reproduction.trends import face_recalls, trend_claims
 from torchrg.metrics import score_labels
 
 CLOUDS = ("cory", "kinect")

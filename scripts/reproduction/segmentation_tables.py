@@ -8,8 +8,8 @@ from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
 from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side, outcomes_of
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
-from reproduction.segmentations import METHODS, SAMPLE_SIZE, face_recalls, read_segmented, score
-from reproduction.trends import INTERNAL, internal_claim, trend_claims
+from reproduction.segmentations import METHODS, SAMPLE_SIZE, read_segmented, score
+from reproduction.trends import INTERNAL, face_recalls, internal_claim, trend_claims
 from torchrg.metrics import METRICS
 
 CLOUDS = {"tutorial": "Figure 7", "hallway": "Figure 8"}

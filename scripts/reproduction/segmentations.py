@@ -11,8 +11,6 @@ from reproduction.cells import Record
 from reproduction.runs import Run
 from torchrg import Cloud, load_config, read_cloud, segment_planes, write_cloud
 from torchrg.metrics import (
-    contingency_table,
-    match_regions,
     score_clusters,
     score_labels,
     score_normals,
@@ -134,31 +132,6 @@ def score(run: Run, key: str, preset: str, *, internal: bool) -> Record:
 
     kind = "indices" if internal else "external"
     return run.folder.cell(f"{kind}-{cloud.name}-{preset}", work)
-
-
-def face_recalls(run: Run, key: str, preset: str) -> Record:
-    """Return the recall of each true face that a region is paired with, and its points.
-
-    Args:
-        run: The call.
-        key: Of a cloud with truth.
-        preset: A key of :data:`METHODS`.
-
-    Returns:
-        Recall in percent and number of points by face, under ``faces``.
-    """
-    cloud = run.cloud(key).cloud
-
-    def work() -> Record:
-        table = contingency_table(read_segmented(run, key, preset).labels, cloud.labels)
-        pairs = match_regions(table)
-        sizes = table.face_sizes[table.faces[pairs]]
-        names = table.face_labels[table.faces[pairs]].tolist()
-        recalls = (100 * table.overlaps[pairs] / sizes).tolist()
-        faces = zip(names, recalls, sizes.tolist(), strict=True)
-        return {"faces": {str(name): [recall, size] for name, recall, size in faces}}
-
-    return run.folder.cell(f"faces-{cloud.name}-{preset}", work)
 
 
 def regrow(

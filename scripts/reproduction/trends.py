@@ -2,15 +2,41 @@
 
 from reproduction.cells import Record
 from reproduction.paper_numbers import INDICES
+from reproduction.runs import Run
 from reproduction.sections import Block, claim
-from reproduction.segmentations import METHODS
-from torchrg.metrics import METRICS
+from reproduction.segmentations import METHODS, read_segmented
+from torchrg.metrics import METRICS, contingency_table, match_regions
 
 INTERNAL = {"cp": "CP", "sp": "SP", "dbi": "DBI", "dvi": "DVI"}
 """The paper's internal indices, and how it writes them."""
 
 LARGE = 1000
 """Points from which on a face is called large here."""
+
+
+def face_recalls(run: Run, key: str, preset: str) -> Record:
+    """Return the recall of each true face that a region is paired with, and its points.
+
+    Args:
+        run: The call.
+        key: Of a cloud with truth.
+        preset: A key of :data:`METHODS`.
+
+    Returns:
+        Recall in percent and number of points by face, under ``faces``.
+    """
+    cloud = run.cloud(key).cloud
+
+    def work() -> Record:
+        table = contingency_table(read_segmented(run, key, preset).labels, cloud.labels)
+        pairs = match_regions(table)
+        sizes = table.face_sizes[table.faces[pairs]]
+        names = table.face_labels[table.faces[pairs]].tolist()
+        recalls = (100 * table.overlaps[pairs] / sizes).tolist()
+        faces = zip(names, recalls, sizes.tolist(), strict=True)
+        return {"faces": {str(name): [recall, size] for name, recall, size in faces}}
+
+    return run.folder.cell(f"faces-{cloud.name}-{preset}", work)
 
 
 def internal_claim(key: str, found: dict[str, Record]) -> Block:
@@ -33,7 +59,7 @@ def trend_claims(found: dict[str, Record], faces: dict[str, Record], origin: str
 
     Args:
         found: Scores by method.
-        faces: What :func:`reproduction.segmentations.face_recalls` says of each method.
+        faces: What :func:`face_recalls` says of each method.
         origin: What the cloud is.
     """
     scores = {preset: found[preset]["labels"] for preset in METHODS}
