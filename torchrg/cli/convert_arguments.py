@@ -54,7 +54,8 @@ class CloudArguments(Arguments):
     """What data sets of clouds have beside."""
 
     preset: str = DEFAULT_PRESET
-    """Settings to start from; see the files in configs/."""
+    """Settings to start from: classic, detmm, paper, consensus, or those for a kind of data: s3dis,
+    scannet, laser, rgbd."""
     config: Path | None = None
     """YAML file with settings that differ from the defaults; replaces the preset."""
     normals: NormalsConfig = dataclasses.field(default_factory=NormalsConfig)

@@ -48,7 +48,8 @@ class Arguments:
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
     preset: str = DEFAULT_PRESET
-    """Settings to start from: classic, detmm, paper or consensus."""
+    """Settings to start from: classic, detmm, paper, consensus, or those for a kind of data: s3dis,
+    scannet, laser, rgbd."""
     config: Path | None = None
     """YAML file with settings that differ from the defaults; replaces the preset."""
     normals: NormalsConfig = dataclasses.field(default_factory=NormalsConfig)
