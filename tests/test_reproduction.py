@@ -290,6 +290,35 @@ def test_results_in_the_readme_are_what_the_script_makes():
     assert f"{readme.BEGIN}\n{readme.to_section(results)}\n{readme.END}" in text
 
 
+def test_results_are_of_the_largest_clouds_with_little_noise():
+    from reproduction import readme
+
+    score = {"msae": 1.0, "median": 1.0, "under_10_deg": 1.0}
+    records = [
+        {"shape": shape, "variant": variant, "num_points": size, "noise_percent": noise}
+        | {"seconds": 1.0, "score": score}
+        for shape in ("cuboid", "torus")
+        for variant in ("pca", "mve")
+        for size in (5000, 35_000)
+        for noise in (0.25, 1.2)
+    ]
+    failed = {"kind": "claim", "text": "x", "numbers": "1", "why": "y", "holds": False}
+    labels = {"faces": 3, "f1": 1.0, "recall_iou50": 1.0, "mean_best_iou": 1.0}
+    with_truth = {"cloud": "cory", "preset": "paper", "labels": labels}
+    parts = {
+        "normals": {"records": records, "blocks": [failed, {**failed, "holds": True}]},
+        "segmentation": {"records": [{"cloud": "tutorial", "preset": "paper"}], "blocks": []},
+        "large": {"records": [with_truth, {"angles": {}}], "blocks": []},
+        "times": {"records": [], "blocks": []},
+    }
+    found = readme.take_results({"quick": False, "made_with": "", "parts": parts})
+    errors = found["normals"]["errors"]
+    assert [(r["shape"], r["variant"]) for r in errors] == [("cuboid", "pca")]
+    assert found["normals"]["num_points"] == 35_000
+    assert [(record["cloud"], record["f1"]) for record in found["scores"]] == [("cory", 1.0)]
+    assert found["claims"] == [{"text": "x", "numbers": "1", "why": "y"}]
+
+
 def test_readme_is_updated_between_the_markers_only(tmp_path, monkeypatch):
     from reproduction import readme
 
