@@ -192,7 +192,7 @@ def _sharp_clouds(shapes: list[str]) -> list[tuple[str, Scene, torch.Tensor]]:
     """Return shapes with little noise, and their sharp feature points."""
     clouds = []
     for shape in shapes:
-        scene = make_shape(shape, _DRAWN_POINTS, 0.001)
+        scene = make_shape(shape, _DRAWN_POINTS, 0.0002)
         sharp = estimate_normals(scene.points, config=VARIANTS["paper"]).sharp
         clouds.append((shape, scene, sharp))
     return clouds
