@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._chunks import chunks_of
 from torchrg.robust.lanes import smallest_points, sum_points, take_lanes
 from torchrg.robust.scatter import determinant, fit_ellipsoid, sq_distances
 
@@ -99,9 +100,10 @@ def _first_of_equal(members: Tensor, places: Tensor, shape: tuple[int, int]) -> 
     if not 1 < num_starts <= _MAX_COMPARED:
         return torch.arange(len(places), device=places.device)
     digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
-    parts = (members * digits.to(members.dtype)[:, None]).split(_DIGITS)
+    weighted = members * digits.to(members.dtype)[:, None]
+    parts = [sum_points(weighted[chunk]) for chunk in chunks_of(len(members), _DIGITS)]
     numbers = members.new_zeros(len(parts), num_starts * num_lanes)
-    numbers[:, places] = torch.stack([sum_points(part) for part in parts])
+    numbers[:, places] = torch.stack(parts)
     numbers = numbers.reshape(-1, num_starts, num_lanes)
     first = torch.ones(shape, dtype=torch.bool, device=members.device)
     for start in range(1, num_starts):
