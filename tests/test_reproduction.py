@@ -167,10 +167,14 @@ def test_points_at_edges_are_those_whose_neighbors_lie_on_another_face(normals):
 def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run, preset):
     from reproduction.segmentations import read_segmented, regrow
 
+    from torchrg import load_config
+
+    limits = load_config(preset).growing
+    angle, quantile = limits.max_angle_deg, limits.curvature_quantile
     kept = read_segmented(run, "hallway", preset).labels
     # Another angle by less than rounding: grown again instead of read.
-    assert torch.equal(regrow(run, "hallway", preset, 5.0 + 1e-12, 0.95), kept)
-    assert not torch.equal(regrow(run, "hallway", preset, 0.01, 0.95), kept)
+    assert torch.equal(regrow(run, "hallway", preset, angle + 1e-12, quantile), kept)
+    assert not torch.equal(regrow(run, "hallway", preset, 0.01, quantile), kept)
 
 
 def test_outcome_of_each_point():

@@ -150,7 +150,7 @@ def _blocks(run: Run, records: list[Record]) -> list[Block]:
             "figures/figure4.png",
             f"**Figure 4**: MSAE against noise, {max(sizes):,} points. Logarithmic scale.",
         ),
-        *order_claims(most, LOW_NOISE),
+        *order_claims(most, LOW_NOISE, with_times=not run.quick),
         *(time_table(records, size) for size in reversed(sizes)),
         *(summary_table(records, size) for size in reversed(sizes)),
         figure("figures/figure4_all.png", f"MSAE on every shape, {max(sizes):,} points."),

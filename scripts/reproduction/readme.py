@@ -125,7 +125,7 @@ def to_section(results: Record) -> str:
     parts = [
         f"From the report of `scripts/reproduce_paper.py` ({made}): {results['made_with']}.",
         _scores(results["scores"]),
-        _normals(results["normals"]),
+        _normals(results["normals"], with_times=not results["quick"]),
     ]
     if not results["quick"]:
         parts.insert(2, _times(results["times"]))
@@ -166,7 +166,7 @@ def _times(times: list[Record]) -> str:
     return markdown_table(table(title, ["cloud", "points", *METHODS.values()], rows))
 
 
-def _normals(normals: dict[str, Any]) -> str:
+def _normals(normals: dict[str, Any], *, with_times: bool) -> str:
     """Return errors of normals on two shapes."""
     rows = []
     for shape in SHAPES:
@@ -175,7 +175,9 @@ def _normals(normals: dict[str, Any]) -> str:
         share = [100 * found[name]["under_10_deg"] for name in VARIANTS]
         rows.append([shape, "MSAE (degrees²)", *mark_best(msae, ".1f", higher=False)])
         rows.append([shape, "errors under 10° (%)", *mark_best(share, ".1f", higher=True)])
-        rows.append([shape, "seconds", *(f"{found[name]['seconds']:.2f}" for name in VARIANTS)])
+        if with_times:
+            seconds = (f"{found[name]['seconds']:.2f}" for name in VARIANTS)
+            rows.append([shape, "seconds", *seconds])
     title = f"Normals of {normals['num_points']:,} points, {NOISE} % noise, k = 50:"
     return markdown_table(table(title, ["shape", "", *VARIANTS.values()], rows))
 
