@@ -34,7 +34,7 @@ def estimate_consensus(
     1. *Noise.* PCA at every point, and the noise ``s`` from small neighbourhoods; see
        :func:`torchrg.normals.noise.survey_noise`. Nothing is assumed of the sensor.
     2. *Flat.* Where the deviation from the plane is at most 1.05 s, PCA stands.
-    3. *Curved.* The others get a paraboloid. Where its deviation ``J`` is at most 1.05 s, or 0.15
+    3. *Curved.* The others get a paraboloid. Where its deviation ``J`` is at most 1.2 s, or 0.15
        of the plane's (that of a symmetric edge is 0.27), its normal stands.
     4. *Broken.* At what is left, the plane through the point with the most votes starts the fit of
        two planes that meet, and of three. The point takes its plane of these if they explain the

@@ -16,6 +16,7 @@ from torchrg.normals.wedge import Wedge, fit_corners, fit_wedges, split_by_votes
 from torchrg.structures import Neighbors, NormalFit
 
 _UNEXPLAINED = 1.05
+_BENT = 1.2
 _CURVED_SHARE = 0.15
 _EXPLAINED = 1.3
 _WELL_EXPLAINED = 1.15
@@ -53,7 +54,8 @@ def fit_pieces(
     r"""Give each point the plane, the paraboloid or the piece of broken planes that explains most.
 
     With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. The others get a
-    paraboloid, of deviation ``J``; it stands where ``J`` is at most 1.05 s, or at most 0.15 of the
+    paraboloid, of deviation ``J``; it stands where ``J`` is at most 1.2 s (of 200 points that have
+    an edge, one is missed; of those that have none, half are spared), or at most 0.15 of the
     plane's deviation. Otherwise two planes that meet are fitted, and where these deviate by more
     than 1.15 s, three, which replace the two if their deviation is below 0.9 of theirs. The point
     takes its plane of these, of deviation ``W``, where ``W <= 1.3 s`` and the gain over the
@@ -87,7 +89,7 @@ def fit_pieces(
         )
 
     each_block_of(bend, unexplained, chunk_size)
-    broken = unexplained & (bent > _UNEXPLAINED * noise)
+    broken = unexplained & (bent > _BENT * noise)
     broken &= bent > _CURVED_SHARE * survey.deviations
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
     votes, pieces = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
