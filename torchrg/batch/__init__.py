@@ -1,1 +1,27 @@
-"""Whole data sets: many scans, on one machine or on a cluster, and a record of each."""
+"""Whole data sets: many scans, on one machine or on a cluster, and a record of each.
+
+A source (:class:`~torchrg.batch.folder.FolderSource`, :class:`~torchrg.batch.s3dis.S3DISSource`,
+:class:`~torchrg.batch.rgbd.RGBDSource`, or a :class:`~torchrg.batch.scans.Source` of your own)
+lists scans and converts one of them. :func:`~torchrg.batch.plan.list_jobs` makes jobs of them,
+:func:`~torchrg.batch.plan.make_plan` finds those that are not done,
+:func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
+:func:`~torchrg.batch.run.run_plan` collects what becomes of them.
+
+Example:
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from torchrg.batch.convert import convert_scan
+    >>> from torchrg.batch.folder import FolderSource
+    >>> from torchrg.batch.plan import list_jobs
+    >>> from torchrg.config import load_config
+    >>> from torchrg.scenes import make_room
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> (folder / "in").mkdir()
+    >>> np.save(folder / "in" / "room.npy", make_room(2000).points)
+    >>> source = FolderSource(folder / "in", load_config("classic"), folder / "out")
+    >>> [convert_scan(job).status for job in list_jobs(source, folder / "out")]
+    ['converted']
+    >>> sorted(path.name for path in (folder / "out" / "room").iterdir())
+    ['coord.npy', 'curvature.npy', 'normal.npy', 'plane.npy', 'planes.json', 'provenance.json']
+"""
