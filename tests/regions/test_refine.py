@@ -10,8 +10,8 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.absorb import absorb_points
+from torchrg.regions.cloud import GrowingCloud
 from torchrg.regions.contacts import contact_neighbors, count_contacts
-from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.refine import refine_regions
 from torchrg.structures import UNLABELED
 

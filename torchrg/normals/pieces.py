@@ -167,7 +167,7 @@ def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
     if neighbors.valid is None:
         return [chosen]
     count = neighbors.valid.sum(dim=1)
-    return [chosen & (count == number) for number in count[chosen].unique().tolist()]
+    return [chosen & (count == number) for number in torch.unique(count[chosen]).tolist()]
 
 
 def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Columns:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import gather_patches
+from torchrg.regions.cloud import GrowingCloud
 from torchrg.regions.criteria import (
     coplanarity_limits,
     patch_radii,
@@ -19,32 +20,6 @@ from torchrg.regions.criteria import (
 )
 from torchrg.regions.graph import EdgeBlock
 from torchrg.regions.sharing import SharedNeighbors
-from torchrg.structures import Neighbors
-
-
-class GrowingCloud(NamedTuple):
-    """What growth reads: a cloud in canonical order with everything known about its points.
-
-    Coordinates and normals are fast to gather when each column is contiguous.
-
-    Attributes:
-        points: Shape ``(N, 3)``.
-        normals: Unit normals, shape ``(N, 3)``.
-        curvature: Shape ``(N,)``.
-        neighbors: Neighbours of each point.
-        valid: Points that may belong to a region, shape ``(N,)``, bool.
-        colors: Shape ``(N, C)``, floating point, or None.
-        reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
-            where that is not known, or None.
-    """
-
-    points: Tensor
-    normals: Tensor
-    curvature: Tensor
-    neighbors: Neighbors
-    valid: Tensor
-    colors: Tensor | None = None
-    reach: Tensor | None = None
 
 
 class AcceptedEdges(NamedTuple):

@@ -5,13 +5,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.config import GrowingConfig
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import ConfigError
 from torchrg.neighbors import canonical_order
+from torchrg.regions.cloud import GrowingCloud, checked_cloud, plane_reach_of, reordered
 from torchrg.regions.components import claim_leftovers, first_to_reach
-from torchrg.regions.criteria import neighborhood_radii
-from torchrg.regions.edges import EdgeFinder, GrowingCloud
+from torchrg.regions.edges import EdgeFinder
 from torchrg.regions.frontier import grow_in_turn
 from torchrg.regions.graph import pack_edges
 from torchrg.regions.refine import refine_regions
@@ -78,7 +77,7 @@ def grow_regions(
         >>> grow_regions(points, normals, curvature, neighbors, GrowingConfig(min_size=9)).unique()
         tensor([0])
     """
-    cloud = _checked_cloud(points, normals, curvature, neighbors, valid, colors)
+    cloud = checked_cloud(points, normals, curvature, neighbors, valid, colors)
     config = GrowingConfig() if config is None else config
     if config.max_color_distance is not None and colors is None:
         raise ConfigError(
@@ -86,13 +85,13 @@ def grow_regions(
             "set max_color_distance to None."
         )
     if config.plane_reach is not None:
-        cloud = cloud._replace(reach=_plane_reach(cloud, residual_rms, config))
+        cloud = cloud._replace(reach=plane_reach_of(cloud, residual_rms, config))
     device = cloud.points.device
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=device)
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
-        cloud = _reordered(cloud, order)
+        cloud = reordered(cloud, order)
     labels = _labels(_grow(cloud, config, chunk_size), config.min_size, device)
     refined = refine_regions(cloud, labels, config)
     if refined is not labels:
@@ -149,87 +148,6 @@ def number_by_size(heads: NDArray[np.integer], min_size: int) -> NDArray[np.int6
     numbers[kept] = np.arange(len(kept))
     labels: NDArray[np.int64] = numbers[heads]
     return labels
-
-
-def _checked_cloud(
-    points: Tensor | NDArray[np.floating],
-    normals: Tensor | NDArray[np.floating],
-    curvature: Tensor | NDArray[np.floating],
-    neighbors: Neighbors,
-    valid: Tensor | None,
-    colors: Tensor | NDArray[np.generic] | None,
-) -> GrowingCloud:
-    """Check what the user passed, and settle which points are valid."""
-    caller = "grow_regions"
-    points = as_tensor(caller, "points", points).detach()
-    normals = as_tensor(caller, "normals", normals).detach()
-    curvature = as_tensor(caller, "curvature", curvature).detach()
-    valid = None if valid is None else as_tensor(caller, "valid", valid)
-    colors = None if colors is None else as_tensor(caller, "colors", colors)
-    check_shapes(
-        caller,
-        points=(points, "N 3"),
-        normals=(normals, "N 3"),
-        curvature=(curvature, "N"),
-        neighbors=(neighbors.indices, "N K"),
-        neighbors_valid=(neighbors.valid, "N K"),
-        valid=(valid, "N"),
-        colors=(colors, "N C"),
-    )
-    check_floating(caller, points=points, normals=normals, curvature=curvature)
-    if valid is not None and valid.dtype != torch.bool:
-        raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
-    if neighbors.indices.device != points.device:
-        raise ShapeError(
-            f"{caller}: expected points and neighbors on one device, got {points.device} and "
-            f"{neighbors.indices.device}."
-        )
-    finite = normals.isfinite().all(dim=1) & curvature.isfinite()
-    valid = finite if valid is None else finite & valid
-    colors = None if colors is None else _by_column(colors.to(points.dtype))
-    return GrowingCloud(
-        _by_column(points), _by_column(normals), curvature, neighbors, valid, colors
-    )
-
-
-def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
-    """Return the cloud with its points, and the rows its neighbours name, in another order."""
-    row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
-    row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    indices = cloud.neighbors.indices[order]
-    indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
-    mask = cloud.neighbors.valid
-    return GrowingCloud(
-        _by_column(cloud.points[order]),
-        _by_column(cloud.normals[order]),
-        cloud.curvature[order],
-        Neighbors(indices, None if mask is None else mask[order]),
-        cloud.valid[order],
-        None if cloud.colors is None else _by_column(cloud.colors[order]),
-        None if cloud.reach is None else cloud.reach[order],
-    )
-
-
-def _plane_reach(
-    cloud: GrowingCloud, residual_rms: Tensor | NDArray[np.floating] | None, config: GrowingConfig
-) -> Tensor:
-    """Return how far from its plane a neighbour may be, shape ``(N,)``, infinite for exact fits."""
-    if residual_rms is None or config.plane_reach is None:
-        raise ConfigError(
-            "grow_regions: expected residual_rms, which plane_reach needs, got None; pass that of "
-            "the normals or set plane_reach to None."
-        )
-    caller = "grow_regions"
-    residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
-    check_shapes(caller, points=(cloud.points, "N 3"), residual_rms=(residual_rms, "N"))
-    check_floating(caller, points=cloud.points, residual_rms=residual_rms)
-    floor = config.coplanarity_floor * neighborhood_radii(cloud.points, cloud.neighbors)
-    return torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
-
-
-def _by_column(vectors: Tensor) -> Tensor:
-    """Return vectors ``(N, C)`` laid out column by column."""
-    return vectors.T.contiguous().T
 
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:

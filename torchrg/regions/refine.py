@@ -5,9 +5,9 @@ from torch import Tensor
 
 from torchrg.config import GrowingConfig
 from torchrg.regions.absorb import absorb_points
+from torchrg.regions.cloud import GrowingCloud
 from torchrg.regions.contacts import count_contacts
 from torchrg.regions.criteria import neighborhood_radii
-from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fitting import FittedPlanes, fit_planes
 from torchrg.regions.merge import Moments, merge_coplanar
 from torchrg.regions.planes import are_curved
