@@ -5,7 +5,7 @@ from pathlib import Path
 
 BASE_BYTES = 500_000_000
 """What a worker takes before the first point: Python, torch, scipy."""
-BYTES_PER_POINT = 1_000
+BYTES_PER_POINT = 1_100
 """What each point adds at the peak."""
 SHARE = 0.8
 """Part of the available memory that a batch may take when no limit is given."""
@@ -16,7 +16,7 @@ def memory_of_scan(num_points: int) -> int:
 
     Example:
         >>> memory_of_scan(1_000_000)
-        1500000000
+        1600000000
     """
     return BASE_BYTES + BYTES_PER_POINT * num_points
 
