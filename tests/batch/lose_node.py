@@ -8,14 +8,15 @@ import json
 import sys
 from pathlib import Path
 
-import faults
-from ray.cluster_utils import Cluster
-
 from torchrg.batch.ray_tasks import run_ray
 
 
 def main(folder):
     """Convert, lose a node when both are at work, and write what came of it."""
+    # Here, as the tests import every file of this folder.
+    import faults
+    from ray.cluster_utils import Cluster
+
     behaviors = {f"{i}_a": "sleep 2" for i in range(1, 7)} | {"9_b": "kill once", "8_c": "corrupt"}
     jobs = faults.make_jobs(folder, behaviors)
     small = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": False}
