@@ -191,3 +191,19 @@ def test_tutorial_scan_gives_the_regions_of_pcl(scan):
     seg = segment_planes(cloud.points, load_config("classic"))
     assert len(seg.planes.count) == 53
     assert int(seg.planes.count[0]) == 58031
+
+
+def test_consensus_keeps_the_faces_of_a_plate_apart():
+    rng = np.random.default_rng(1)
+    size = np.array([1.2, 0.8, 0.04])
+    area = np.repeat(size.prod() / size, 2)
+    face = rng.choice(6, 8000, p=area / area.sum())
+    points = rng.random((8000, 3)) * size
+    points[np.arange(8000), face // 2] = (face % 2) * size[face // 2]
+    points[np.arange(8000), face // 2] += 0.003 * rng.standard_normal(8000)
+    seg = segment_planes(points, load_config("consensus"))
+    for side in (4, 5):
+        found = int(seg.labels[torch.from_numpy(face == side)].mode().values)
+        both = ((seg.labels == found).numpy() & (face == side)).sum()
+        either = ((seg.labels == found).numpy() | (face == side)).sum()
+        assert both > 0.9 * either
