@@ -217,9 +217,9 @@ def test_quick_run_takes_the_middle_of_a_file(small, tmp_path, monkeypatch):
 
 
 def scored(f1, recall):
-    """Records of the four methods with such scores."""
+    """Records of the five methods with such scores."""
     rest = {"pairs": 6, "faces": 26, "recall_iou50": 0.2}
-    names = ("classic", "detmm", "paper", "consensus")
+    names = ("classic", "detmm", "paper", "paper@0.5", "consensus")
     return {
         name: {"labels": {"f1": a, "recall": b, **rest}}
         for name, a, b in zip(names, f1, recall, strict=True)
@@ -231,11 +231,13 @@ def test_trends_hold_only_where_the_numbers_say_so():
 
     classic = {"faces": {"0": [80.0, 5000], "1": [60.0, 100], "2": [10.0, 2000]}}
     others = {"faces": {"0": [90.0, 5000], "1": [20.0, 100], "3": [10.0, 2000]}}
-    faces = {"classic": classic, "paper": others, "consensus": others}
-    good = trend_claims(scored((60, 80, 95, 97), (80, 85, 90, 95)), faces, "a hall")
-    assert [claim["holds"] for claim in good] == [True, True, True]
-    bad = trend_claims(scored((60, 97, 95, 97), (90, 85, 90, 95)), faces, "a hall")
-    assert [claim["holds"] for claim in bad] == [False, False, True]
+    faces = {"classic": classic, "paper": others, "paper@0.5": others, "consensus": others}
+    good = trend_claims(scored((60, 80, 95, 70, 97), (80, 85, 90, 81, 95)), faces, "a hall")
+    assert [claim["holds"] for claim in good] == [True, True, True, True]
+    bad = trend_claims(scored((60, 97, 95, 98, 97), (90, 85, 90, 91, 95)), faces, "a hall")
+    assert [claim["holds"] for claim in bad] == [False, False, True, True]
+    assert "It does where half" in bad[0]["why"]
+    assert "Nor does it where half" in good[0]["why"]
     assert "classic RG 60.0, DetMM 97.0, paper 95.0" in bad[0]["numbers"]
     assert "of 26 faces" in bad[0]["why"]
     assert "90.0 against 80.0 on 1 faces of 1,000 points and more" in bad[1]["why"]

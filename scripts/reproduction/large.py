@@ -1,11 +1,12 @@
 """Figure 9: the two large clouds, at several angles."""
 
 from reproduction.cells import Record
+from reproduction.methods import DRAWN, METHODS
 from reproduction.pictures import draw_side_by_side
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, section, table, text
 from reproduction.segmentation_tables import draw_figures, more_rows
-from reproduction.segmentations import METHODS, count_regions, regrow, score
+from reproduction.segmentations import count_regions, regrow, score
 from reproduction.trends import face_recalls, trend_claims
 from torchrg.metrics import score_labels
 
@@ -44,7 +45,7 @@ def reproduce(run: Run) -> Record:
                 {preset: face_recalls(run, key, preset) for preset in METHODS},
                 cloud.origin,
             )
-        blocks += draw_figures(run, key, "Figure 9", tuple(METHODS))
+        blocks += draw_figures(run, key, "Figure 9", DRAWN)
         angles, made = _angles(run, key)
         blocks += angles
         records.append(made)

@@ -10,9 +10,9 @@ from typing import Any
 
 from reproduction.cells import Record
 from reproduction.clouds import TITLES
+from reproduction.methods import METHODS
 from reproduction.rendering import markdown_table
 from reproduction.sections import mark_best, table
-from reproduction.segmentations import METHODS
 from reproduction.times import ratio
 from torchrg.io import atomic_path
 

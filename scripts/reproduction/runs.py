@@ -7,6 +7,7 @@ from pathlib import Path
 
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud, load_cloud
+from reproduction.methods import settings_of
 from torchrg import estimate_normals, load_config, search_knn, segment_planes
 from torchrg.scenes import make_room
 from torchrg.structures import Neighbors, NormalFit
@@ -43,7 +44,7 @@ class Run:
     def warm_up(self, preset: str) -> None:
         """Segment a small cloud first, so that no time includes the loading of code."""
         if preset not in self._warm:
-            segment_planes(make_room(_WARM_UP).points, load_config(preset))
+            segment_planes(make_room(_WARM_UP).points, settings_of(preset))
             self._warm.add(preset)
 
 
@@ -64,7 +65,7 @@ class LoadedCloud:
         if preset not in self._fits:
             self._fits.clear()
             self._fits[preset] = estimate_normals(
-                self.cloud.points, config=load_config(preset).normals, neighbors=self.neighbors
+                self.cloud.points, config=settings_of(preset).normals, neighbors=self.neighbors
             )
         return self._fits[preset]
 

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 from reproduction.cells import Record
 from reproduction.clouds import TITLES
+from reproduction.methods import DRAWN, METHODS
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
 from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side, outcomes_of
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
-from reproduction.segmentations import METHODS, SAMPLE_SIZE, read_segmented, score
+from reproduction.segmentations import SAMPLE_SIZE, read_segmented, score
 from reproduction.trends import INTERNAL, face_recalls, internal_claim, trend_claims
 from torchrg.metrics import METRICS
 
@@ -69,7 +70,7 @@ def reproduce(run: Run) -> Record:
                 {preset: face_recalls(run, key, preset) for preset in METHODS},
                 cloud.origin,
             )
-        blocks += draw_figures(run, key, number, METHODS)
+        blocks += draw_figures(run, key, number, DRAWN)
     return section("Table 2, Figures 7 and 8: segmentation", blocks, records)
 
 

@@ -8,22 +8,15 @@ import torch
 from torch import Tensor
 
 from reproduction.cells import Record
+from reproduction.methods import settings_of
 from reproduction.runs import Run
-from torchrg import Cloud, load_config, read_cloud, segment_planes, write_cloud
+from torchrg import Cloud, read_cloud, segment_planes, write_cloud
 from torchrg.metrics import (
     score_clusters,
     score_labels,
     score_normals,
 )
 from torchrg.regions import grow_regions
-
-METHODS = {
-    "classic": "classic RG",
-    "detmm": "DetMM",
-    "paper": "paper",
-    "consensus": "consensus",
-}
-"""Presets that are compared, and their names in tables."""
 
 SAMPLE_SIZE = 4000
 """Points of a cluster whose pairs the internal indices take all; see ``score_clusters``."""
@@ -50,7 +43,7 @@ def segment(run: Run, key: str, preset: str) -> Record:
     Args:
         run: The call.
         key: Of the cloud.
-        preset: A key of :data:`METHODS`.
+        preset: A key of :data:`reproduction.methods.METHODS`.
 
     Returns:
         The record, with ``seconds`` by stage and their sum ``total``.
@@ -67,7 +60,7 @@ def segment(run: Run, key: str, preset: str) -> Record:
             begins[stage] = time.perf_counter()
             print(f" {stage}", end="", flush=True)
 
-        seg = segment_planes(cloud.points, load_config(preset), on_stage=note)
+        seg = segment_planes(cloud.points, settings_of(preset), on_stage=note)
         names, times = list(begins), list(begins.values())
         seconds = {
             name: end - begin
@@ -103,7 +96,7 @@ def score(run: Run, key: str, preset: str, *, internal: bool) -> Record:
     Args:
         run: The call.
         key: Of the cloud.
-        preset: A key of :data:`METHODS`.
+        preset: A key of :data:`reproduction.methods.METHODS`.
         internal: Whether to add CP, SP, DBI and DVI, of faces and of distinct directions.
 
     Returns:
@@ -149,7 +142,7 @@ def regrow(
     Returns:
         Labels, shape ``(N,)``, int64.
     """
-    growing = load_config(preset).growing
+    growing = settings_of(preset).growing
     if (max_angle_deg, curvature_quantile) == (growing.max_angle_deg, growing.curvature_quantile):
         return read_segmented(run, key, preset).labels
     settings = replace(growing, max_angle_deg=max_angle_deg, curvature_quantile=curvature_quantile)

@@ -8,11 +8,12 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from reproduction.cells import Record
+from reproduction.methods import METHODS
 from reproduction.pictures import draw_side_by_side
 from reproduction.plotting import settings
 from reproduction.runs import Run
 from reproduction.sections import Block, claim, figure, section, table, text
-from reproduction.segmentations import METHODS, count_regions, regrow
+from reproduction.segmentations import count_regions, regrow
 from torchrg.metrics import adjusted_rand_index, contingency_table, score_labels
 
 ANGLES_DEG = tuple(float(angle) for angle in range(2, 11))
