@@ -108,7 +108,6 @@ def check_patches(
     check_floating(caller, patches=patches, resolution=resolution)
 
 
-@torch.library.custom_op("torchrg::spans_plane", mutates_args=())
 def _spans_plane(
     patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None
 ) -> Tensor:
@@ -118,6 +117,21 @@ def _spans_plane(
     the few patches that narrow are looked at again. Which these are depends on the data: as an
     operator of its own, neither compilers nor vmap see that.
     """
+    spans: Tensor = torch.ops.torchrg.spans_plane(patches, mask, values, resolution)
+    return spans
+
+
+# ``torch.library.custom_op`` would do all of this, and load the compiler at the first call.
+torch.library.define(
+    "torchrg::spans_plane",
+    "(Tensor patches, Tensor? mask, Tensor values, Tensor? resolution) -> Tensor",
+)
+
+
+@torch.library.impl("torchrg::spans_plane", "CompositeExplicitAutograd")
+def _look_again_at_narrow(
+    patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None
+) -> Tensor:
     if resolution is None:
         resolution = patch_resolution(patches, mask)
     lengths, widths = (values[..., axis].clamp(min=0).sqrt() for axis in (2, 1))
@@ -129,12 +143,12 @@ def _spans_plane(
     return widths > flat
 
 
-@_spans_plane.register_fake
+@torch.library.register_fake("torchrg::spans_plane")  # type: ignore[untyped-decorator]
 def _(patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None) -> Tensor:
     return patches.new_empty(patches.shape[:-2], dtype=torch.bool)
 
 
-@_spans_plane.register_vmap
+@torch.library.register_vmap("torchrg::spans_plane")  # type: ignore[untyped-decorator]
 def _(
     info: Any,  # noqa: ANN401
     in_dims: tuple[int | None, ...],
@@ -148,7 +162,8 @@ def _(
         else argument.movedim(dim, 0)
         for argument, dim in zip(arguments, in_dims, strict=True)
     ]
-    return _spans_plane(*batched), 0
+    spans: Tensor = torch.ops.torchrg.spans_plane(*batched)
+    return spans, 0
 
 
 def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
