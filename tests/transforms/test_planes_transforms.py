@@ -4,6 +4,7 @@ import pickle
 
 import pytest
 import torch
+from torch import nn
 
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
@@ -83,3 +84,16 @@ def test_an_unknown_key_is_refused():
 def test_settings_are_shown():
     assert "max_angle_deg=7.0" in repr(GrowRegions(max_angle_deg=7.0))
     assert "method='pca'" in repr(EstimateNormals(method="pca"))
+
+
+def test_normals_then_regions_with_the_residual_are_the_whole_method():
+    config = load_config("consensus")
+    sample = {"coord": make_room(4000, 0.003, 5).points}
+    steps = nn.Sequential(
+        EstimateNormals(config.normals, residual=True), GrowRegions(config.growing)
+    )
+    whole = SegmentPlanes(config)(sample)["plane"]
+    assert whole.max() >= 3
+    assert torch.equal(steps(sample)["plane"], whole)
+    with pytest.raises(ConfigError, match="residual"):
+        GrowRegions(config.growing)(EstimateNormals(config.normals)(sample))

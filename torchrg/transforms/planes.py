@@ -23,6 +23,8 @@ class EstimateNormals(CloudTransform):
 
     Args:
         config: Settings of the estimator. Default: :class:`torchrg.config.NormalsConfig`.
+        residual: Whether to add ``residual`` ``(N,)`` too, the root mean square distance of the
+            neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
         keys: Other names for the keys.
         **changes: Single settings, as in ``method="pca", k=30``.
 
@@ -36,16 +38,19 @@ class EstimateNormals(CloudTransform):
         self,
         config: NormalsConfig | None = None,
         *,
+        residual: bool = False,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keys=keys)
         self.config = dataclasses.replace(config or NormalsConfig(), **changes)
+        self.residual = residual
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return normals and curvature of a cloud."""
         fit = estimate_normals(cloud["coord"], config=self.config)
-        return {"normal": fit.normals, "curvature": fit.curvature}
+        found = {"normal": fit.normals, "curvature": fit.curvature}
+        return {**found, "residual": fit.residual_rms} if self.residual else found
 
     def extra_repr(self) -> str:
         """Return the settings."""
@@ -55,8 +60,9 @@ class EstimateNormals(CloudTransform):
 class GrowRegions(CloudTransform):
     """Add plane labels grown on the normals that a sample has; see :func:`torchrg.grow_regions`.
 
-    Reads ``coord``, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``; adds ``plane`` ``(N,)``,
-    int64, -1 for none. A point with a zero normal joins no region.
+    Reads ``coord``, ``normal`` ``(N, 3)``, ``curvature`` ``(N,)`` and, where ``plane_reach`` is on
+    (as in the preset ``consensus``), ``residual`` ``(N,)``; adds ``plane`` ``(N,)``, int64, -1 for
+    none. A point with a zero normal joins no region.
 
     Args:
         config: Settings of the growth. Default: :class:`torchrg.config.GrowingConfig`.
@@ -71,8 +77,6 @@ class GrowRegions(CloudTransform):
         tensor([0])
     """
 
-    reads = ("coord", "normal", "curvature")
-
     def __init__(
         self,
         config: GrowingConfig | None = None,
@@ -84,6 +88,8 @@ class GrowRegions(CloudTransform):
         super().__init__(keys=keys)
         self.config = dataclasses.replace(config or GrowingConfig(), **changes)
         self.k = k
+        with_residual = self.config.plane_reach is not None
+        self.reads = ("coord", "normal", "curvature", *["residual"] * with_residual)
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the plane labels of a cloud."""
@@ -94,6 +100,7 @@ class GrowRegions(CloudTransform):
         finite = points[rows]
         if len(finite) == 0:
             return {"plane": torch.full((len(points),), UNLABELED, device=points.device)}
+        residual = cloud["residual"].to(points.dtype)[rows] if "residual" in cloud else None
         grown = grow_regions(
             finite,
             normals[rows],
@@ -101,6 +108,7 @@ class GrowRegions(CloudTransform):
             search_knn(finite, min(self.k, len(finite)), canonical=True),
             self.config,
             valid=(normals[rows] != 0).any(dim=-1),
+            residual_rms=residual,
             canonical=True,
         )
         return {"plane": restore_rows(grown, rows, len(points), fill=UNLABELED)}

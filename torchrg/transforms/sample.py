@@ -20,6 +20,7 @@ KEYS = {
     "coord": "coord",
     "normal": "normal",
     "curvature": "curvature",
+    "residual": "residual",
     "plane": "plane",
     "inverse": "inverse",
     "origin": "origin",
