@@ -1,0 +1,136 @@
+"""Voxels against a loop over points; small transforms on every kind of sample."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from torchrg.config import load_config
+from torchrg.errors import ConfigError
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+from torchrg.transforms import (
+    CenterCloud,
+    KeepFinite,
+    SampleVoxels,
+    SegmentPlanes,
+    restore_points,
+    sample_voxels,
+    segment_voxels,
+)
+
+
+def voxels_by_loop(points, size):
+    """The point nearest to the middle of each cell, and the cell of each point."""
+    low = points.min(axis=0)
+    nearest, cell_of = {}, []
+    for row, point in enumerate(points):
+        scaled = (point - low) / size
+        cell = tuple(np.floor(scaled).astype(int))
+        distance = ((scaled - np.floor(scaled) - 0.5) ** 2).sum()
+        cell_of.append(cell)
+        if cell not in nearest or distance < nearest[cell][0]:
+            nearest[cell] = (distance, row)
+    rows = sorted(row for _, row in nearest.values())
+    place = {cell: rows.index(row) for cell, (_, row) in nearest.items()}
+    return rows, [place[cell] for cell in cell_of]
+
+
+def test_voxels_are_those_of_a_loop_over_points(rng):
+    points = torch.rand(400, 3, generator=rng, dtype=torch.float64) * 3 - 1e6
+    rows, inverse = sample_voxels(points, 0.5)
+    expected_rows, expected_inverse = voxels_by_loop(points.numpy(), 0.5)
+    assert rows.tolist() == expected_rows
+    assert inverse.tolist() == expected_inverse
+
+
+def test_chosen_points_do_not_depend_on_the_order(rng):
+    points = torch.rand(500, 3, generator=rng).mul(8).round() / 8
+    chosen = points[sample_voxels(points, 0.3).rows]
+    moved = points[torch.randperm(500, generator=rng)]
+    again = moved[sample_voxels(moved, 0.3).rows]
+    assert set(map(tuple, chosen.tolist())) == set(map(tuple, again.tolist()))
+
+
+def test_labels_of_voxels_go_back_to_every_point():
+    room = make_room(6000, 0.003, 1)
+    points = room.points.clone()
+    points[7] = torch.nan
+    config = load_config("classic")
+    seg = segment_voxels(points, 0.1, config)
+    rows, inverse = sample_voxels(points, 0.1)
+    assert inverse[7] == seg.labels[7] == -1
+    own = segment_planes(points[rows], config).labels
+    back = restore_points(own, inverse, fill=-1)
+    pairs = torch.stack([back, seg.labels]).unique(dim=1)
+    assert pairs[0].unique().numel() == pairs[1].unique().numel() == pairs.shape[1]
+    assert (seg.planes.count.diff() <= 0).all()
+    assert seg.planes.count.tolist() == torch.bincount(seg.labels[seg.labels >= 0]).tolist()
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])
+def test_impossible_sizes_are_refused(size):
+    with pytest.raises(ConfigError, match="expected size > 0"):
+        SampleVoxels(size)
+
+
+def test_voxels_reduce_every_entry_with_a_row_a_point_and_no_other(rng):
+    coord = torch.rand(300, 3, generator=rng)
+    sample = {"coord": coord, "segment": torch.arange(300), "name": "a", "pose": torch.eye(4)}
+    small = SampleVoxels(0.4)(sample)
+    assert torch.equal(coord[small["segment"]], small["coord"])
+    assert small["inverse"].shape == (300,)
+    assert small["name"] == "a"
+    assert small["pose"].shape == (4, 4)
+    assert set(sample) == {"coord", "segment", "name", "pose"}
+
+
+def test_voxels_never_cross_the_clouds_of_a_batch(rng):
+    coord = torch.rand(200, 3, generator=rng)
+    both = SampleVoxels(0.5)({"coord": coord.repeat(2, 1), "offset": torch.tensor([200, 400])})
+    one = SampleVoxels(0.5)({"coord": coord})
+    count = len(one["coord"])
+    assert torch.equal(both["coord"], one["coord"].repeat(2, 1))
+    assert both["offset"].tolist() == [count, 2 * count]
+    assert torch.equal(both["inverse"], torch.cat([one["inverse"], one["inverse"] + count]))
+
+
+def test_centered_cloud_and_origin_give_the_coordinates_back():
+    coord = torch.tensor([[4e6, 5e6, 1.0], [4e6 + 2, 5e6, 3.0]], dtype=torch.float64)
+    sample = CenterCloud()(CenterCloud()({"coord": coord}))
+    assert sample["coord"].abs().max() == 1
+    assert torch.equal(sample["coord"] + sample["origin"], coord)
+
+
+def test_points_that_are_not_finite_leave_with_their_entries():
+    coord = torch.tensor([[0.0, 0, 0], [torch.inf, 0, 0], [1, 0, 0], [0, torch.nan, 0]])
+    sample = KeepFinite()({"coord": coord, "segment": torch.arange(4)})
+    assert sample["segment"].tolist() == [0, 2]
+
+
+def test_transforms_compose_and_keep_numpy_samples_numpy():
+    coord = make_room(5000, 0.003, 2).points.numpy()
+    coord[3] = np.nan
+    steps = nn.Sequential(KeepFinite(), CenterCloud(), SampleVoxels(0.05), SegmentPlanes("classic"))
+    sample = steps({"coord": coord, "index_valid_keys": ["coord"]})
+    assert isinstance(sample["plane"], np.ndarray)
+    assert len(sample["plane"]) == len(sample["coord"]) < 4999
+    assert {"plane", "normal", "curvature"} <= set(sample["index_valid_keys"])
+
+
+def test_pyg_data_go_through_and_batch():
+    geometric = pytest.importorskip("torch_geometric")
+    rooms = [make_room(3000, 0.003, seed).points for seed in (3, 4)]
+    samples = [
+        SegmentPlanes("classic")(geometric.data.Data(pos=points, name="a")) for points in rooms
+    ]
+    for data, points in zip(samples, rooms, strict=True):
+        expected = segment_planes(points, load_config("classic"))
+        assert torch.equal(data.plane, expected.labels)
+        assert torch.equal(data.normal, expected.normals)
+    batch = geometric.data.Batch.from_data_list(
+        [geometric.data.Data(pos=points) for points in rooms]
+    )
+    together = SegmentPlanes("classic")(batch)
+    assert torch.equal(together.plane, torch.cat([data.plane for data in samples]))
+    assert "plane" not in batch
