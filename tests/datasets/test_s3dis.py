@@ -154,3 +154,13 @@ def test_missing_areas_are_errors_with_the_repair(root):
         S3DIS(root.parent)
     with pytest.raises(ConfigError, match="expected areas among 1, 2, 3, 4, 5, 6, got 7"):
         S3DIS(root, [7])
+
+
+def test_a_room_without_objects_fails_when_it_is_read_and_not_before(root):
+    (root / "Area_1" / "office_0" / "Annotations").mkdir(parents=True)
+    with pytest.warns(UserWarning, match="rooms"):
+        data = S3DIS(root, [1], cache=None)
+    names = [scene.name for scene in data.scenes]
+    assert "Area_1/office_0" in names
+    with pytest.raises(FormatError, match="expected objects"):
+        data[names.index("Area_1/office_0")]

@@ -118,9 +118,12 @@ def _scenes_of_area(root: Path, area: int) -> list[Scene]:
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}.",
             stacklevel=3,
         )
-    return [
-        Scene(
-            f"{folder.name}/{room.name}", room, tuple(file for _, file in list_room(room).objects)
-        )
-        for room in rooms
-    ]
+    return [Scene(f"{folder.name}/{room.name}", room, _object_files(room)) for room in rooms]
+
+
+def _object_files(room: Path) -> tuple[Path, ...]:
+    """Return the files of a room's objects; none of a broken room, which fails when it is read."""
+    try:
+        return tuple(file for _, file in list_room(room).objects)
+    except FormatError:
+        return ()
