@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from torchrg._chunks import chunks_of, run_chunks
 
+_BLOCKS_A_THREAD = 4
+"""Blocks found before any is stored: threads wait for each other only so often."""
+
 
 class EdgeLists(NamedTuple):
     """Edges of a directed graph in compressed rows.
@@ -70,7 +73,7 @@ def pack_edges(
     starts = np.zeros(num_points + 1, dtype=np.int32 if capacity < 2**31 else np.int64)
     targets = np.empty(capacity, dtype=np.int32)
     chunks = chunks_of(num_points, chunk_size)
-    at_once = max(torch.get_num_threads(), 1)
+    at_once = _BLOCKS_A_THREAD * max(torch.get_num_threads(), 1)
     used = 0
     found: dict[int, EdgeBlock] = {}
 
