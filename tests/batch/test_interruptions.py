@@ -19,20 +19,34 @@ from torchrg.scenes import make_room
 NAMES = ("hall", "lobby", "office", "store")
 
 
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    """A folder of small rooms."""
-    folder = tmp_path_factory.mktemp("rooms")
+def save_rooms(folder, num_points):
+    """Make rooms of about so many points, and return their folder."""
     for seed, name in enumerate(NAMES):
-        points = make_room(num_points=3000 + 500 * seed, seed=seed).points
+        points = make_room(num_points=num_points + 500 * seed, seed=seed).points
         np.save(folder / f"{name}.npy", points)
     return folder
 
 
 @pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """A folder of small rooms."""
+    return save_rooms(tmp_path_factory.mktemp("rooms"), 3000)
+
+
+@pytest.fixture(scope="module")
+def larger_rooms(tmp_path_factory):
+    """A folder of rooms that take long enough for a signal to come between them."""
+    return save_rooms(tmp_path_factory.mktemp("larger_rooms"), 40_000)
+
+
+@pytest.fixture(scope="module")
 def undisturbed(rooms, tmp_path_factory):
     """The bytes of every result, made here and by nothing but the job function."""
-    out = tmp_path_factory.mktemp("undisturbed")
+    return convert_here(rooms, tmp_path_factory.mktemp("undisturbed"))
+
+
+def convert_here(rooms, out):
+    """Convert rooms in this process, and return the bytes of every result."""
     for job in list_jobs(FolderSource(rooms, load_config("classic"), out), out):
         assert convert_scan(job).status == "converted"
     assert len(results_of(out)) == 6 * len(NAMES)
@@ -119,10 +133,10 @@ def test_ten_kills_at_random_moments_change_nothing(rooms, undisturbed, tmp_path
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-def test_an_interrupt_says_how_to_go_on(rooms, undisturbed, tmp_path, number):
+def test_an_interrupt_says_how_to_go_on(larger_rooms, tmp_path, number):
     for attempt in range(5):
         out = tmp_path / str(attempt)
-        process = start(rooms, out)
+        process = start(larger_rooms, out)
         wait_for_files(out, process, 3)
         if number == signal.SIGINT:
             os.killpg(process.pid, number)  # A terminal sends it to the whole group.
@@ -135,4 +149,4 @@ def test_an_interrupt_says_how_to_go_on(rooms, undisturbed, tmp_path, number):
     assert told.count("\n") == 1
     assert "of 4 scans are complete. The same command goes on from here." in told
     assert not list(out.rglob(".*.np?"))
-    check_whole(out, undisturbed)
+    check_whole(out, convert_here(larger_rooms, tmp_path / "undisturbed"))
