@@ -28,7 +28,7 @@ class CellGrid(NamedTuple):
     """
 
     columns: list[NDArray[np.float64]]
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int32]
     asked: NDArray[np.int64]
     first_asked: NDArray[np.int64]
     num_asked: NDArray[np.int64]
@@ -60,7 +60,7 @@ def make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64])
     stops = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around + 2))]
     return CellGrid(
         columns=[np.append(points[order, axis], far[axis]) for axis in range(3)],
-        rows=np.append(order, -1),
+        rows=np.append(order, -1).astype(np.int32),
         asked=asked,
         first_asked=first_asked,
         num_asked=np.diff(first_asked, append=len(asked)),

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._chunks import run_chunks
+from torchrg._take import take
 from torchrg.neighbors.cell_grid import (
     WIDTH_STEP,
     CellGrid,
@@ -26,7 +27,7 @@ from torchrg.neighbors.selection import (
     sq_distances_between,
 )
 
-Store = Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], None]
+Store = Callable[[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""
 
 _MIN_CANDIDATES = 2.4
@@ -42,7 +43,7 @@ _MIN_SHARE = 0.03
 """Share of the points for which another size of cells is worth its sort."""
 
 _MAX_KEY = 2.0**62
-_CHUNK_BYTES = 2**20
+_CHUNK_BYTES = 2**22
 
 
 def search_cells(
@@ -126,36 +127,38 @@ def _make_tasks(grid: CellGrid, k: int) -> list[NDArray[np.int64]]:
 
 def _search_task(
     grid: CellGrid, cells: NDArray[np.int64], k: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
     """Return those rows of some cells whose neighbours are certain, distances and neighbours."""
     places = list_candidates(grid, cells)
     width = places.shape[1]
-    candidates = [column.take(places) for column in grid.columns]
+    candidates = [take(column, places) for column in grid.columns]
     counts = grid.num_asked[cells]
     lanes = np.repeat(np.arange(len(cells)), counts)
     slots = np.arange(len(lanes)) - np.repeat(np.cumsum(counts) - counts, counts)
-    own = grid.asked[grid.first_asked[cells][lanes] + slots]
-    points = [column.take(own) for column in grid.columns]
+    own = take(grid.asked, grid.first_asked[cells][lanes] + slots)
+    points = [take(column, own) for column in grid.columns]
 
     centers = grid.centers[:, cells]
     about = np.stack([c - m[:, None] for c, m in zip(candidates, centers, strict=True)], axis=1)
     offsets = np.stack([p - m[lanes] for p, m in zip(points, centers, strict=True)], axis=1)
     queries = np.zeros((len(cells), int(counts.max()), 3), np.float32)
     queries[lanes, slots] = offsets
-    sq_distances = sq_distances_between(queries, about.astype(np.float32))[lanes, slots]
-    selected, sq_beyond = select_smallest(sq_distances, k + _SPARE)
+    sq_distances = sq_distances_between(queries, about.astype(np.float32)).reshape(-1, width)
+    asked = lanes * queries.shape[1] + slots
+    selected, sq_beyond = select_smallest(take(sq_distances, asked), k + _SPARE)
 
     selected += (lanes * width)[:, None]
     exact = np.zeros(selected.shape)
     for candidate, point in zip(candidates, points, strict=True):
-        difference = candidate.take(selected)
+        difference = take(candidate.reshape(-1), selected)
         difference -= point[:, None]
         exact += np.multiply(difference, difference, out=difference)
-    rows = grid.rows.take(places.take(selected))
+    rows = take(grid.rows, take(places.reshape(-1), selected))
     distances, rows = sort_by_distance(np.sqrt(exact, out=exact), rows, k)
 
     # Rounding of the matrix product, and of which cell a point on a border is in.
     sq_beyond -= 64 * np.finfo(np.float32).eps * grid.size**2
     border = (1.5 * grid.size - np.abs(offsets).max(axis=1)) * (1 - 1e-6)
     certain = (distances[:, -1] < border) & (distances[:, -1] ** 2 < sq_beyond)
-    return grid.rows[own[certain]], distances[certain], rows[certain]
+    kept = np.flatnonzero(certain)
+    return grid.rows[own[kept]], take(distances, kept), take(rows, kept)

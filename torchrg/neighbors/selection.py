@@ -4,6 +4,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchrg._take import take
+
 MAX_CANDIDATES = 512
 """What NumPy sorts without a branch (AVX-512)."""
 
@@ -39,8 +41,8 @@ def select_smallest(
 
 
 def sort_by_distance(
-    distances: NDArray[np.float64], rows: NDArray[np.int64], k: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    distances: NDArray[np.float64], rows: NDArray[np.int32], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Return the k nearest by (distance, row)."""
     num_rows, count = distances.shape
     position = np.int64(2 ** (count - 1).bit_length() - 1)
@@ -49,7 +51,7 @@ def sort_by_distance(
     keys.sort(axis=1)
     order = keys & position
     order += (np.arange(num_rows) * count)[:, None]
-    distances, rows = distances.take(order), rows.take(order)
+    distances, rows = take(distances.reshape(-1), order), take(rows.reshape(-1), order)
     keys &= ~position
     if (keys[:, 1:] == keys[:, :-1]).any():
         tied = np.flatnonzero((keys[:, 1:] == keys[:, :-1]).any(axis=1))

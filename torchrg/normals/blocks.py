@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrg._chunks import chunks_of, run_chunks
+from torchrg._chunks import fair_chunks, run_chunks
 
 
 def each_block(
@@ -19,7 +19,7 @@ def each_block(
         >>> sorted(seen, key=lambda block: block.start)
         [slice(0, 3, None), slice(3, 5, None)]
     """
-    run_chunks(work, chunks_of(num_rows, block_size), device)
+    run_chunks(work, fair_chunks(num_rows, block_size), device)
 
 
 def each_block_of(work: Callable[[Tensor], None], chosen: Tensor, block_size: int) -> None:

@@ -15,7 +15,7 @@ from torchrg.normals.rounds import TangentPlanes, average_planes, choose_planes
 from torchrg.structures import Neighbors, NormalFit
 
 _LEAST_NEIGHBORS = 12
-_BLOCK = 2048
+_BLOCK = 8192
 _NUM_ROUNDS = 2
 _INLIER_REACH = 3.0
 _LEAST_ERROR = 0.003

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.linalg import eigh3
+from torchrg.linalg import eigh3_of_few
 from torchrg.regions.segments import Segments
 from torchrg.robust.scale import MAD_FACTOR
 
@@ -73,7 +73,7 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         middle = segments.spread_columns(mean)
         centered = [x - m for x, m in zip(local, middle, strict=True)]
         covariance = _covariances(segments, centered, weights)
-        variances, axes = eigh3(covariance)
+        variances, axes = eigh3_of_few(covariance)
         normal = _with_sign(_plane_normals(variances, axes, usual))
         residuals = sum_of_products(centered, segments.spread_columns(normal))
         thickness = MAD_FACTOR * segments.median(residuals.abs())
@@ -99,7 +99,7 @@ def shared_moments(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]
     The last eigenvector is the direction that the normals of a region share, signs aside.
     """
     columns = segments.take_columns(normals)
-    return eigh3(_covariances(segments, columns, torch.ones_like(columns[0])))
+    return eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
 
 
 def _means(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:

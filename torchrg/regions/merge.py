@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.linalg import eigh3
+from torchrg.linalg import eigh3_of_few
 
 _LEAST_CONTACTS = 3
 
@@ -115,7 +115,7 @@ def _joined(a: Moments, b: Moments) -> Moments:
 def _misfit(a: Moments, b: Moments) -> Tensor:
     """Return how far from the joint plane the worse of two regions is, in its own scales."""
     both = _joined(a, b)
-    normal = eigh3(both.covariance)[1][:, :, 0]
+    normal = eigh3_of_few(both.covariance)[1][:, :, 0]
     misfits = []
     for part in (a, b):
         own = (normal[:, None] @ part.covariance @ normal[:, :, None])[:, 0, 0]

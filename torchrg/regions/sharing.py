@@ -8,9 +8,16 @@ from torch import Tensor
 from torchrg._chunks import chunks_of, run_chunks
 from torchrg.structures import Neighbors
 
-_BLOCK_SIZE = 256
+_BITS_IN_LINE = 512
+"""Bits of a cache line: bit sets are as wide as one or a few of them."""
+
+_BLOCK_SIZE = 128
 """Points of a block: smaller ones repeat the lists around them more often, larger ones have wider
 bit sets."""
+
+_PATCH_SIZE = 1024
+"""Points worked on together, several blocks: each step is long enough for threads to go on side by
+side."""
 
 
 class SharedNeighbors:
@@ -33,7 +40,7 @@ class SharedNeighbors:
     def __init__(self, neighbors: Neighbors) -> None:
         self._indices = neighbors.indices.cpu().numpy()
         self._counted = None if neighbors.valid is None else neighbors.valid.cpu().numpy()
-        self._free_slots: list[NDArray[np.intp]] = []
+        self._free_numbers: list[NDArray[np.intp]] = []
 
     def at_least(self, min_shared: int, rows: slice, asked: Tensor) -> Tensor:
         """Tell which edges join points that share enough neighbours, eq. (10).
@@ -56,42 +63,101 @@ class SharedNeighbors:
                 counts = self._count(first, first + len(result[block]))
                 result[block] &= counts >= min_shared
 
-        run_chunks(test, chunks_of(len(result), _BLOCK_SIZE), torch.device("cpu"))
+        run_chunks(test, chunks_of(len(result), _PATCH_SIZE), torch.device("cpu"))
         return torch.from_numpy(result).to(asked.device)
 
     def _count(self, start: int, stop: int) -> NDArray[np.unsignedinteger]:
-        """Return the number of common neighbours along all edges of a block, shape ``(n, K)``."""
-        # Place of each point in the dictionary of the block, -1 for the others; kept between
-        # blocks, because filling it takes longer than a block.
-        slots = self._free_slots.pop() if self._free_slots else np.full(len(self._indices), -1)
-        lists = self._indices[start:stop].astype(np.intp)
-        members = lists.ravel() if self._counted is None else lists[self._counted[start:stop]]
-        places = np.arange(len(members))
-        slots[members] = places
-        members = members[slots[members] == places]
-        slots[members] = places[: len(members)]
-        words = self._bit_sets(members, slots)
-        own, others = slots[start:stop], slots[lists.ravel()]
-        counts = np.zeros(lists.shape, np.uint8 if lists.shape[1] < 256 else np.uint16)
-        for word in words:
-            # Entries that are no neighbours have place -1 and count nonsense; nobody asks for them.
-            common = word.take(others, mode="clip").reshape(lists.shape)
-            common &= word.take(own)[:, None]
-            counts += np.bitwise_count(common)
-        slots[members] = -1
-        self._free_slots.append(slots)
-        return counts
+        """Return the number of common neighbours along all edges of a patch, shape ``(n, K)``."""
+        own, lists, of_members = self._local_lists(start, stop)
+        # Every block has a column for each member of the patch, and one for what is none.
+        stride = len(of_members) + 1
+        first = np.arange(len(lists)) // _BLOCK_SIZE * stride
+        others = (lists + first[:, None]).ravel()
+        occurs = np.zeros((first[-1] // stride + 1, stride), dtype=bool)
+        occurs.ravel()[others] = True
+        occurs[:, -1] = False
+        rows, sets = _bit_sets(of_members, occurs)
+        # Entries that are no neighbours have place -1 and count nonsense; nobody asks for them.
+        common = sets.take(rows.take(others), axis=0)
+        common &= np.repeat(sets.take(rows.take(own + first), axis=0), lists.shape[1], axis=0)
+        return _sum_of_bits(common, at_most=lists.shape[1]).reshape(lists.shape)
 
-    def _bit_sets(self, members: NDArray[np.intp], slots: NDArray[np.intp]) -> NDArray[np.uint64]:
-        """Return the lists of ``members`` as bit sets over them, shape ``(words, members)``."""
-        size = len(members)
-        width = -(-size // 64) * 64
-        columns = slots[self._indices[members]]
+    def _local_lists(
+        self, start: int, stop: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Number the points that occur in the lists of a patch: its members.
+
+        Returns:
+            The numbers of the points of the patch ``(n,)``, and by these numbers their lists
+            ``(n, K)`` and those of all members ``(M, K)``; -1 for what is no member.
+        """
+        # Number of each point, -1 for the others; kept between patches, because filling it takes
+        # longer than a patch.
+        numbers = (
+            self._free_numbers.pop() if self._free_numbers else np.full(len(self._indices), -1)
+        )
+        rows = self._indices[start:stop].astype(np.intp)
+        members = rows.ravel() if self._counted is None else rows[self._counted[start:stop]]
+        places = np.arange(len(members))
+        numbers[members] = places
+        members = members[numbers.take(members) == places]
+        numbers[members] = places[: len(members)]
+        own, lists = numbers[start:stop].copy(), numbers.take(rows)
+        of_members = numbers.take(self._indices.take(members, axis=0))
         if self._counted is not None:
-            columns[~self._counted[members]] = -1
-        # Place -1 falls into the last column of the row before, which is cut off.
-        columns += np.arange(0, size * (width + 1), width + 1)[:, None]
-        bits = np.zeros(size * (width + 1), dtype=bool)
-        bits[columns.ravel()] = True
-        packed = np.packbits(bits.reshape(size, width + 1)[:, :width], axis=1)
-        return np.ascontiguousarray(packed.view(np.uint64).T)
+            of_members[~self._counted[members]] = -1
+        numbers[members] = -1
+        self._free_numbers.append(numbers)
+        return own, lists, of_members
+
+
+def _bit_sets(
+    lists: NDArray[np.intp], occurs: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.uint64]]:
+    """Hold the lists of the members that occur in a block as bit sets over these, block by block.
+
+    Args:
+        lists: List of each member, -1 for what is none, shape ``(M, K)``.
+        occurs: Members of each block, shape ``(blocks, M + 1)``; none in the last column.
+
+    Returns:
+        Row of each member of each block among the sets, shape ``(blocks * (M + 1),)``, and the
+        sets, shape ``(rows, words)``.
+    """
+    stride = occurs.shape[1]
+    found = np.flatnonzero(occurs)
+    sizes = np.count_nonzero(occurs, axis=1)
+    rows = np.zeros(occurs.size, dtype=np.intp)
+    rows[found] = np.arange(len(found))
+    # What is not in the block falls into the first eight columns, which are cut off.
+    columns = np.full(occurs.size, -8)
+    columns[found] = np.arange(len(found)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    block, member = np.divmod(found, stride)
+    of_found = lists.take(member, axis=0)
+    of_found += (block * stride)[:, None]
+    width = 8 + -(-int(sizes.max()) // _BITS_IN_LINE) * _BITS_IN_LINE
+    bits = np.zeros(len(found) * width, dtype=bool)
+    places = columns.take(of_found, mode="wrap")
+    places += np.arange(8, len(bits), width)[:, None]
+    bits[places.ravel()] = True
+    return rows, np.packbits(bits.reshape(-1, width)[:, 8:], axis=1).view(np.uint64)
+
+
+def _sum_of_bits(words: NDArray[np.uint64], at_most: int) -> NDArray[np.unsignedinteger]:
+    """Return the number of bits in each row of words ``(E, 8 n)``, known to be ``at_most`` so many.
+
+    Example:
+        >>> _sum_of_bits(np.full((1, 8), 5, dtype=np.uint64), at_most=16).tolist()
+        [16]
+    """
+    counts = np.bitwise_count(words)
+    if at_most >= 2**8:
+        return counts.sum(axis=1, dtype=np.uint32)
+    lanes = counts.view(np.uint64)
+    total = lanes[:, 0].copy()
+    for column in range(1, lanes.shape[1]):
+        total += lanes[:, column]
+    # The product adds all eight bytes up in the highest one.
+    total *= np.uint64(0x0101010101010101)
+    total >>= np.uint64(56)
+    return total

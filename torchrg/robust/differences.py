@@ -1,7 +1,9 @@
 """Order statistics of the pairwise differences of many short rows."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -9,11 +11,15 @@ from torch import Tensor
 
 from torchrg._chunks import chunks_of, share_chunks
 
-_CHUNK_BYTES = 2**21
+_CHUNK_BYTES = 2**22
 _NETWORK = 512
 """Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions.
 
 As integers, whose order is that of non-negative floats, they take two thirds of the time."""
+
+
+_MOST_LAGS = 8
+"""Lags in one subtraction. They are all as wide as the first of them."""
 
 
 def half_size(n: int) -> int:
@@ -38,7 +44,7 @@ def majority_difference(sorted_rows: Tensor) -> Tensor:
     out = sorted_rows.new_empty(num_rows)
 
     def work(chunks: Iterator[slice]) -> None:
-        lagged = _Lagged(sorted_rows, paired=True)
+        lagged = _Lagged(sorted_rows, sorts=True)
         for chunk in chunks:
             out[chunk] = lagged.select(sorted_rows[chunk], rank)
 
@@ -60,7 +66,7 @@ def count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
     out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
 
     def work(chunks: Iterator[slice]) -> None:
-        lagged = _Lagged(sorted_rows, paired=False)
+        lagged = _Lagged(sorted_rows, sorts=False)
         for chunk in chunks:
             out[chunk] = lagged.count(sorted_rows[chunk], bound)
 
@@ -71,54 +77,51 @@ def count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
 class _Lagged:
     """A buffer for the differences at lags 1 to h - 1 of the rows of a chunk, side by side.
 
-    With ``paired``, differences that fill two sorting networks go to one each.
+    With ``sorts``, differences that fill one or two sorting networks go to these.
     """
 
-    def __init__(self, rows: Tensor, *, paired: bool) -> None:
+    def __init__(self, rows: Tensor, *, sorts: bool) -> None:
         n = rows.shape[1]
-        size = _chunk_size(rows)
-        lags = range(1, half_size(n))
-        width = sum(n - lag for lag in lags)
-        first = _fitting(n, _NETWORK)
+        size, pitch = _chunk_size(rows), n + half_size(n)
         self.on_cpu = rows.device.type == "cpu"
-        self.paired = (
-            paired
-            and self.on_cpu
-            and rows.element_size() == 4
-            and _NETWORK < width <= _NETWORK + sum(n - lag for lag in range(1, first + 1))
-            and sum(n - lag for lag in lags[first:]) <= _NETWORK
-        )
-        self.rows = rows.new_empty(size, n)
-        self.differences = rows.new_empty(size, 2 * _NETWORK if self.paired else -(-width // 8) * 8)
+        runs = _runs_in_networks(n) if sorts and self.on_cpu and rows.element_size() == 4 else []
+        self.num_networks = -(-runs[-1].stop // _NETWORK) if runs else 0
+        runs = runs or _lay_out(n, _MOST_LAGS, room=None)
+        width = self.num_networks * _NETWORK or -(-runs[-1].stop // 8) * 8
+        # Windows that reach beyond the end of a row find infinity there.
+        self.rows = rows.new_full((size, pitch), torch.inf)
+        self.differences = rows.new_empty(size, width)
         self._steps: list[tuple[Tensor, Tensor, Tensor]] = []
         self._pads: list[Tensor] = []
-        start = 0
-        for lag in lags:
-            if self.paired and lag == first + 1:
-                self._pads.append(self.differences[:, start:_NETWORK])
-                start = _NETWORK
-            near, far = self.rows[:, :-lag], self.rows[:, lag:]
-            out = self.differences[:, start : start + n - lag]
-            self._steps.append((far, near, out))
-            start += n - lag
-        self._pads.append(self.differences[:, start:])
+        for run, following in zip(runs, [*runs[1:], None], strict=True):
+            shape = (size, run.num_lags, run.width)
+            far = self.rows.as_strided(shape, (pitch, 1, 1), run.lag)
+            out = self.differences[:, run.start : run.stop].view(shape)
+            self._steps.append((far, self.rows[:, None, : run.width], out))
+            end = width if following is None else following.start
+            if run.stop < end:
+                self._pads.append(self.differences[:, run.stop : end])
 
     def _fill(self, rows: Tensor) -> Tensor:
         """Write the differences of up to a chunk of sorted rows."""
-        self.rows[: len(rows)] = rows
+        count = len(rows)
+        self.rows[:count, : rows.shape[1]] = rows
         for minuend, subtrahend, out in self._steps:
-            torch.sub(minuend, subtrahend, out=out)
+            torch.sub(minuend[:count], subtrahend[:count], out=out[:count])
         for pad in self._pads:
             pad.fill_(torch.inf)
-        return self.differences[: len(rows)]
+        return self.differences[:count]
 
     def select(self, rows: Tensor, rank: int) -> Tensor:
         """The ``rank``-th smallest difference of each row."""
         differences = self._fill(rows)
-        if self.paired:
+        if self.num_networks:
             if not rows[:, :: rows.shape[1] - 1].isfinite().all():
                 differences.abs_()  # inf - inf may be a NaN with a sign, which would sort first
             bits = differences.view(torch.int32)
+            if self.num_networks == 1:
+                bits.numpy().sort(axis=1)
+                return bits[:, rank - 1].view(torch.float32)
             second = bits[:, _NETWORK:]
             torch.bitwise_not(second, out=second)
             bits.view(-1, _NETWORK).numpy().sort(axis=1)
@@ -143,13 +146,46 @@ class _Lagged:
         return torch.from_numpy(counts)
 
 
-def _fitting(n: int, room: int) -> int:
-    """How many lags from 1 on have together no more differences than there is room for."""
-    lag = 0
-    while lag < half_size(n) - 1 and room >= n - lag - 1:
-        lag += 1
-        room -= n - lag
-    return lag
+class _Run(NamedTuple):
+    """Consecutive lags whose differences are one subtraction of overlapping windows."""
+
+    lag: int
+    num_lags: int
+    width: int
+    start: int
+
+    @property
+    def stop(self) -> int:
+        """Where its differences end."""
+        return self.start + self.num_lags * self.width
+
+
+def _lay_out(n: int, most_lags: int, room: int | None) -> list[_Run]:
+    """Lay lags 1 to h - 1 out in runs, none of which crosses a multiple of ``room``."""
+    runs: list[_Run] = []
+    lag, start = 1, 0
+    while lag < half_size(n):
+        width = n - lag
+        num_lags = min(most_lags, half_size(n) - lag)
+        if room is not None:
+            left = room - start % room
+            if left < width:
+                start += left
+                left = room
+            num_lags = min(num_lags, left // width)
+        runs.append(_Run(lag, num_lags, width, start))
+        lag, start = lag + num_lags, runs[-1].stop
+    return runs
+
+
+@lru_cache(maxsize=256)
+def _runs_in_networks(n: int) -> list[_Run]:
+    """The fewest runs that fit two sorting networks, none if they do not."""
+    for most_lags in range(_MOST_LAGS, 0, -1) if n <= _NETWORK else ():
+        runs = _lay_out(n, most_lags, _NETWORK)
+        if runs and runs[-1].stop <= 2 * _NETWORK:
+            return runs
+    return []
 
 
 def _chunk_size(rows: Tensor) -> int:

@@ -20,7 +20,7 @@ from torchrg.robust.weights import subset_size
 Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
 """Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
 
-CHUNK_SIZE = 2048
+CHUNK_SIZE = 4096
 """Patches worked on together; what they need has to fit the processor's cache."""
 
 _MIN_SHARE = 64
