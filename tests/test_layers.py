@@ -5,7 +5,7 @@ from pathlib import Path
 
 LAYERS = [
     {"errors"},
-    {"_checks", "_chunks", "_optional", "structures"},
+    {"_checks", "_chunks", "_optional", "_take", "structures"},
     {"linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

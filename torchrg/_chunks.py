@@ -27,14 +27,16 @@ def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
 
 
 def fair_chunks(num_rows: int, chunk_size: int) -> list[slice]:
-    """Cut rows as :func:`chunks_of`, smaller if some thread would have none; at least one slice.
+    """Cut rows as :func:`chunks_of`, so that all threads have equally many; at least one slice.
 
     Example:
         >>> fair_chunks(0, 10)
         [slice(0, 0, None)]
     """
-    share = max(_MIN_SHARE, -(-num_rows // torch.get_num_threads()))
-    return chunks_of(num_rows, min(chunk_size, share)) or [slice(0, 0)]
+    num_threads = torch.get_num_threads()
+    num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
+    size = max(-(-num_rows // max(num_chunks, 1)), min(_MIN_SHARE, chunk_size))
+    return chunks_of(num_rows, size) or [slice(0, 0)]
 
 
 def map_chunks(

@@ -308,3 +308,16 @@ def test_wrong_arguments_are_refused():
         summarize_planes(points, points, torch.zeros(4, dtype=torch.int64))
     with pytest.raises(ConfigError, match="expected up to be three numbers"):
         summarize_planes(points, points, one_region(points), up=(0, 0, 0))
+
+
+def test_rounding_does_not_decide_the_sign_of_a_normal():
+    generator = torch.Generator().manual_seed(0)
+    flat = torch.rand(200, 2, generator=generator, dtype=torch.float64) @ torch.tensor(
+        [[0.0, 1.0, 0.0], [0.5**0.5, 0.0, 0.5**0.5]], dtype=torch.float64
+    )
+    truth = torch.tensor([-(0.5**0.5), 0.0, 0.5**0.5], dtype=torch.float64)
+    for unit in (1.0, 1 / 3, 0.7, 1e-3, 1e3):
+        planes = summarize_planes(
+            unit * flat, truth.expand(200, 3), torch.zeros(200, dtype=torch.int64)
+        )
+        assert torch.allclose(planes.normal[0], truth, atol=1e-9)

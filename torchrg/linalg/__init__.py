@@ -7,13 +7,17 @@ the number of threads. Vectorised ``acos`` or ``cos`` do not promise that.
 
 from torchrg.linalg.angles import sq_chord_to_deg, unsigned_angle_deg
 from torchrg.linalg.eigen import eigh3, eigh3_of_few, smallest_eigenvector3
+from torchrg.linalg.indicators import above, at_most, signs
 from torchrg.linalg.moments import covariance, rank_tolerance
 
 __all__ = [
+    "above",
+    "at_most",
     "covariance",
     "eigh3",
     "eigh3_of_few",
     "rank_tolerance",
+    "signs",
     "smallest_eigenvector3",
     "sq_chord_to_deg",
     "unsigned_angle_deg",

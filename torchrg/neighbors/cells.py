@@ -27,7 +27,7 @@ from torchrg.neighbors.selection import (
     sq_distances_between,
 )
 
-Store = Callable[[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]], None]
+Store = Callable[[NDArray[np.integer], NDArray[np.float64], NDArray[np.integer]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""
 
 _MIN_CANDIDATES = 2.4

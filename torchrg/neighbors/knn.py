@@ -127,7 +127,7 @@ def _search_cloud(
     places = points[starts].astype(np.float64)
 
     def store(
-        queried: NDArray[np.int64], distances: NDArray[np.float64], found: NDArray[np.int64]
+        queried: NDArray[np.integer], distances: NDArray[np.float64], found: NDArray[np.integer]
     ) -> None:
         rows = queried
         if len(places) < len(points):
@@ -188,9 +188,9 @@ def _sort_ties(
 
 
 def _restore_duplicates(
-    queried: NDArray[np.int64],
+    queried: NDArray[np.integer],
     distances: NDArray[np.float64],
-    found: NDArray[np.int64],
+    found: NDArray[np.integer],
     starts: NDArray[np.int64],
     counts: NDArray[np.int64],
     k: int,

@@ -4,6 +4,8 @@ A neighbourhood is three columns ``(n, K)`` of coordinates about its point. Whol
 arithmetic run at the speed of the cache, and give the same bits for any number of rows.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -62,6 +64,35 @@ def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tenso
         >>> normals.abs(), offsets.abs()
         (tensor([[0., 0., 1.]]), tensor([1.]))
     """
+    means, covariance = _moments(columns, weights)
+    values, normals = smallest_eigenvector3(covariance)
+    return normals, (normals * means).sum(dim=-1), values
+
+
+def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """Fit a plane to each of several groups of the neighbours; see :func:`fit_planes`.
+
+    Args:
+        columns: Coordinates about each point.
+        groups: Weights of each group, shape ``(n, K)``.
+
+    Returns:
+        Unit normals ``(n, 3)`` and offsets ``(n,)`` for each group.
+
+    Example:
+        >>> square = torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]])
+        >>> groups = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
+        >>> [normals.abs() for normals, _ in fit_planes_to_each(split_columns(square), groups)]
+        [tensor([[0., 0., 1.]]), tensor([[0., 1., 0.]])]
+    """
+    means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
+    normals = smallest_eigenvector3(torch.stack(covariances))[1]
+    offsets = (normals * torch.stack(means)).sum(dim=-1)
+    return list(zip(normals.unbind(), offsets.unbind(), strict=True))
+
+
+def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean ``(n, 3)`` and covariance ``(n, 3, 3)`` of each neighbourhood."""
     total = weights.sum(dim=1)
     share = weights / torch.where(total > 0, total, 1.0)[:, None]
     means = [(share * column).sum(dim=1) for column in columns]
@@ -70,5 +101,4 @@ def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tenso
     xx, xy, xz = (sx * x).sum(dim=1), (sx * y).sum(dim=1), (sx * z).sum(dim=1)
     yy, yz, zz = (sy * y).sum(dim=1), (sy * z).sum(dim=1), (sz * z).sum(dim=1)
     rows = [torch.stack(row, dim=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
-    values, normals = smallest_eigenvector3(torch.stack(rows, dim=-2))
-    return normals, (normals * torch.stack(means, dim=-1)).sum(dim=-1), values
+    return torch.stack(means, dim=-1), torch.stack(rows, dim=-2)

@@ -143,13 +143,18 @@ def _deviations(
 
 def _each_place_once(patches: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
     """Move neighbours at the place of the one before to the end, where they do not count."""
-    again = torch.zeros_like(counted, dtype=torch.bool)
-    again[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=2)
-    rows = again.any(dim=1).nonzero().squeeze(-1)
+    if patches.shape[1] < 2:
+        return patches, counted
+    moves = torch.zeros_like(counted[:, 1:])
+    for column in patches.unbind(dim=-1):
+        moves += (column[:, 1:] - column[:, :-1]).abs_()
+    rows = (moves.amin(dim=1) == 0).nonzero().squeeze(-1)
     if len(rows) == 0:
         return patches, counted
-    order = again[rows].to(torch.uint8).argsort(dim=1, stable=True)
-    once = (counted * ~again)[rows].gather(1, order)
+    again = torch.zeros_like(counted[rows], dtype=torch.bool)
+    again[:, 1:] = moves[rows] == 0
+    order = again.to(torch.uint8).argsort(dim=1, stable=True)
+    once = (counted[rows] * ~again).gather(1, order)
     moved = patches[rows].gather(1, order[:, :, None].expand(-1, -1, 3))
     return patches.index_copy(0, rows, moved), counted.index_copy(0, rows, once)
 

@@ -12,7 +12,14 @@ from torchrg.normals.noise import Survey
 from torchrg.normals.paraboloid import fit_paraboloids
 from torchrg.normals.rounds import TangentPlanes
 from torchrg.normals.votes import vote_planes
-from torchrg.normals.wedge import Wedge, fit_corners, fit_wedges, split_by_votes, split_off
+from torchrg.normals.wedge import (
+    Pieces,
+    Wedge,
+    fit_corners,
+    fit_wedges,
+    split_by_votes,
+    split_off,
+)
 from torchrg.structures import Neighbors, NormalFit
 
 _UNEXPLAINED = 1.05
@@ -110,7 +117,8 @@ def fit_pieces(
         )
         gain[rows] = torch.where(known, drop, -_MOST_GAIN).clamp_(-_MOST_GAIN, _MOST_GAIN)
 
-    for same in _by_count(broken, neighbors):
+    asked = broken & (_may_meet(broken, neighbors, chunk_size) | (bent > _FAR_OFF * noise))
+    for same in _by_count(asked, neighbors):
         each_block_of(split, same, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meeting = broken & explained & (gain > _LEAST_GAIN) & (pooled > _LEAST_POOLED_GAIN)
@@ -123,15 +131,15 @@ def fit_pieces(
 
 def _fit_broken(
     columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
-) -> Wedge:
+) -> Pieces:
     """Return two planes that meet, or three where two do not explain the neighbours."""
-    wedge = fit_wedges(columns, normals, offsets, noise, counted)
-    rows = (wedge.deviations > _WELL_EXPLAINED * noise).nonzero().squeeze(-1)
+    pieces, *parts = fit_wedges(columns, normals, offsets, noise, counted)
+    rows = (pieces.deviations > _WELL_EXPLAINED * noise).nonzero().squeeze(-1)
     some = (columns[0][rows], columns[1][rows], columns[2][rows])
-    start = Wedge(*(part[rows] for part in wedge))
+    start = Pieces(*(part[rows] for part in pieces))
     scale, count = noise[rows], counted[rows]
     guesses = (
-        split_off(start, scale, count),
+        split_off(Wedge(start, *(part[rows] for part in parts)), scale, count),
         split_by_votes(some, normals[rows], offsets[rows], scale, count),
     )
     best = start._replace(deviations=_CORNER_SHARE * start.deviations)
@@ -139,14 +147,14 @@ def _fit_broken(
         best = _better(best, fit_corners(some, groups, count))
     improved = best.deviations < _CORNER_SHARE * start.deviations
     rows = rows[improved]
-    merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(wedge, best, strict=True)]
-    return Wedge(*merged)
+    merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(pieces, best, strict=True)]
+    return Pieces(*merged)
 
 
-def _better(one: Wedge, other: Wedge) -> Wedge:
+def _better(one: Pieces, other: Pieces) -> Pieces:
     """Return, for each point, the fit that deviates less."""
     less = other.deviations < one.deviations
-    return Wedge(
+    return Pieces(
         *(
             torch.where(less.view(-1, *[1] * (a.dim() - 1)), b, a)
             for a, b in zip(one, other, strict=True)
@@ -179,6 +187,17 @@ def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Colum
         order = order[:, : int(counted[0].sum())]
         patches = patches.gather(1, order[:, :, None].expand(-1, -1, 3))
     return split_columns(patches)
+
+
+def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
+    """Return the points whose gain can make that of some point large enough on average.
+
+    Noise makes single points look broken: most of them are spared the fits.
+    """
+    most = _mean_of_nearest(broken.float() * _MOST_GAIN, neighbors, chunk_size)
+    open_points = broken & (most > _LEAST_POOLED_GAIN)
+    pooled = neighbors.indices[open_points, :_NUM_POOLED].reshape(-1)
+    return torch.zeros_like(broken).index_fill_(0, pooled.long(), True)
 
 
 def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg.linalg import signs
 from torchrg.neighbors import gather_patches
 from torchrg.normals.blocks import each_block
 from torchrg.normals.columns import residuals, split_columns, sq_lengths
@@ -76,7 +77,7 @@ def average_planes(
         x, y, z = (part.index_select(0, flat).view(indices.shape) for part in parts)
         a, b, c = (part.index_select(0, chosen)[:, None] for part in parts)
         cosines = x * a + y * b + z * c
-        sign = torch.where(cosines < 0, -1.0, 1.0).to(points.dtype)
+        sign = signs(cosines)
         offset = planes.offsets.index_select(0, flat).view(indices.shape)
         rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
         sq_chords = 2 * (1 - cosines.abs())

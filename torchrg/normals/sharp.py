@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrg._chunks import fair_chunks, run_chunks
 from torchrg.errors import ConfigError
-from torchrg.linalg import sq_chord_to_deg
+from torchrg.linalg import at_most, signs, sq_chord_to_deg
 from torchrg.robust.scale import QN_FACTOR, qn_exceeds
 from torchrg.structures import Neighbors
 
@@ -53,12 +53,13 @@ def find_sharp_points(
     if rule not in ("qn", "percentile"):
         raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
     columns = normals.T.contiguous()
+    everywhere = valid is None or bool(valid.all())
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
 
     def classify(block: slice) -> None:
         indices = neighbors.indices[block]
         counted = None if neighbors.valid is None else neighbors.valid[block]
-        if valid is not None:
+        if valid is not None and not everywhere:
             has_normal = valid.index_select(0, indices.reshape(-1)).view(indices.shape)
             counted = has_normal if counted is None else counted & has_normal
         sq_chords = _sq_chords(columns, indices)
@@ -77,7 +78,7 @@ def _sq_chords(columns: Tensor, indices: Tensor) -> Tensor:
     dot = own[0] * gathered[0]
     for a, b in zip(own[1:], gathered[1:], strict=True):
         dot += a * b
-    sign = torch.where(dot < 0, -1.0, 1.0).to(columns.dtype)
+    sign = signs(dot)
     result = torch.zeros_like(dot)
     for a, b in zip(own, gathered, strict=True):
         difference = b * sign - a
@@ -94,14 +95,13 @@ def _qn_exceeds(sq_chords: Tensor, counted: Tensor | None, angle_deg: float) -> 
     """Return whether Qn of the angles exceeds the limit.
 
     If the majority of the angles lies within one difference of zero, all their pairs do, and they
-    are
-    enough: most points of a room are settled by counting, and only the rest needs angles.
+    are enough: most points of a room are settled by counting, and only the rest needs angles.
     """
-    near = sq_chords <= _sq_chord_of(angle_deg / QN_FACTOR)
+    near = at_most(sq_chords, _sq_chord_of(angle_deg / QN_FACTOR))
     if counted is None:
         majority: Tensor | int = sq_chords.shape[-1] // 2 + 1
     else:
-        near &= counted
+        near *= counted
         majority = counted.sum(dim=-1) // 2 + 1
     exceeds = near.sum(dim=-1) < majority
     rows = exceeds.nonzero().squeeze(-1)

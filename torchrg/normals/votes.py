@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.normals.columns import Columns, fit_planes, residuals, sq_lengths
+from torchrg.linalg import above
+from torchrg.normals.columns import Columns, along, fit_planes, residuals, sq_lengths
 
 _NUM_PAIRS = 32
 _THINNEST_TRIANGLE = 0.1
@@ -75,14 +76,15 @@ def vote_planes(
 def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
     """Return the score of planes by their residuals in units of the reach, shape ``(n,)``."""
     support = (weights * (1 - rests * rests).clamp_(min=0)).sum(dim=1)
-    above, below = (weights * (rests > 1)).sum(dim=1), (weights * (rests < -1)).sum(dim=1)
-    return support - torch.minimum(above, below)
+    over = (above(rests, 1).mul_(weights)).sum(dim=1)
+    under = (above(-rests, 1).mul_(weights)).sum(dim=1)
+    return support - torch.minimum(over, under)
 
 
 def _score(columns: Columns, weights: Tensor, normals: Tensor, reach: Tensor) -> Tensor:
     """Return the score of planes through the points."""
     scaled = normals / reach[:, None]
-    return support_scores(residuals(columns, scaled, torch.zeros_like(reach)), weights)
+    return support_scores(along(columns, scaled), weights)
 
 
 def _within(rests: Tensor, reach: Tensor) -> Tensor:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.normals.columns import Columns, fit_planes, residuals
+from torchrg.linalg import above, at_most
+from torchrg.normals.columns import Columns, fit_planes, fit_planes_to_each, residuals
 from torchrg.normals.votes import vote_planes
 
 _NUM_ROUNDS = 4
@@ -15,7 +16,7 @@ _LEAST_POINTS = 5
 _PLANE_PARAMETERS = 3
 
 
-class Wedge(NamedTuple):
+class Pieces(NamedTuple):
     """The plane of each point, one of several that explain its neighbourhood.
 
     Attributes:
@@ -23,14 +24,24 @@ class Wedge(NamedTuple):
         offsets: Of the planes ``normal . q = offset`` about the point, shape ``(n,)``.
         deviations: Standard deviation of all neighbours from the planes, three degrees of freedom
             less for each, shape ``(n,)``; infinite where a plane has fewer than five points.
-        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``.
-        second: Points of the second plane, likewise.
-        outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
     """
 
     normals: Tensor
     offsets: Tensor
     deviations: Tensor
+
+
+class Wedge(NamedTuple):
+    """Two planes that meet.
+
+    Attributes:
+        pieces: The plane of each point.
+        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``.
+        second: Points of the second plane, likewise.
+        outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
+    """
+
+    pieces: Pieces
     first: Tensor
     second: Tensor
     outer: Tensor
@@ -66,8 +77,8 @@ def fit_wedges(
         >>> corner = torch.cat([torch.tensor([[0.0, 1, 0]]), floor, floor[:, [0, 2, 1]]])
         >>> columns = split_columns((corner - corner[:1])[None])
         >>> start, zero, noise = torch.tensor([[0.0, 1, 0]]), torch.zeros(1), torch.tensor([0.1])
-        >>> wedge = fit_wedges(columns, start, zero - 1, noise, torch.ones(1, 41))
-        >>> wedge.normals.abs(), bool(wedge.deviations < 0.01)
+        >>> pieces = fit_wedges(columns, start, zero - 1, noise, torch.ones(1, 41)).pieces
+        >>> pieces.normals.abs(), bool(pieces.deviations < 0.01)
         (tensor([[0., 0., 1.]]), True)
     """
     rests = residuals(columns, normals, offsets)
@@ -76,17 +87,18 @@ def fit_wedges(
     present = torch.ones_like(noise, dtype=torch.bool)
     for _ in range(_NUM_ROUNDS):
         present &= _all_present((first, second))
-        planes = [fit_planes(columns, group)[:2] for group in (first, second)]
+        planes = fit_planes_to_each(columns, (first, second))
         inside = (
             _inside(residuals(columns, *planes[0]), second),
             _inside(residuals(columns, *planes[1]), first),
         )
-        outer, on_first = torch.minimum(*inside), inside[0] < inside[1]
-        first, second = counted * on_first, counted * ~on_first
-    return _summary(planes, (first, second), outer, present, counted)
+        outer = torch.minimum(*inside)
+        first = above(inside[1], inside[0]).mul_(counted)
+        second = counted - first
+    return Wedge(_summary(planes, (first, second), outer, present, counted), first, second, outer)
 
 
-def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> Wedge:
+def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> Pieces:
     r"""Fit three half-spaces, from a first guess which points lie on which.
 
     Corners where three faces meet; rims of plates, where both faces of the plate are among the
@@ -105,21 +117,20 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> 
     """
     first, second, third = groups
     present = torch.ones_like(counted[:, 0], dtype=torch.bool)
-    cut: Tensor | None = None
+    side: Tensor | None = None
     for _ in range(_NUM_ROUNDS):
         present &= _all_present((first, second, third))
-        planes = [fit_planes(columns, group)[:2] for group in (first, second, third)]
+        planes = fit_planes_to_each(columns, (first, second, third))
         rests = [residuals(columns, *plane) for plane in planes]
         inside = _inside(rests[0], second), _inside(rests[1], first)
         wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
-        if cut is None:
-            cut = ((wedge * third).sum(dim=1) >= 0)[:, None]
-        added = torch.where(cut, added, -added)
-        on_third = torch.where(cut, added < wedge, added > wedge)
-        outer = torch.where(on_third, added, wedge)
-        on_first = inside[0] < inside[1]
-        third = counted * on_third
-        first, second = (counted - third) * on_first, (counted - third) * ~on_first
+        if side is None:
+            side = _side((wedge * third).sum(dim=1))
+        wedge *= side
+        outer = torch.minimum(added, wedge) * side
+        third = above(wedge, added).mul_(counted)
+        first = above(inside[1], inside[0]).mul_(counted - third)
+        second = counted - third - first
     return _summary(planes, (first, second, third), outer, present, counted)
 
 
@@ -147,20 +158,26 @@ def split_by_votes(
 
 
 def _near(rests: Tensor, noise: Tensor) -> Tensor:
-    """Return which points are within twice the noise of a plane."""
-    return rests.abs() <= (_GAP * noise)[:, None]
+    """Return which points are within twice the noise of a plane, as 0 or 1."""
+    return at_most(rests.abs(), (_GAP * noise)[:, None])
 
 
 def _beyond(rests: Tensor, noise: Tensor, counted: Tensor) -> Tensor:
     """Return the points off a surface by more than twice the noise, on the side with more."""
     gap = _GAP * noise[:, None]
-    above, below = (rests > gap) * counted, (rests < -gap) * counted
-    return torch.where((above.sum(dim=1) >= below.sum(dim=1))[:, None], above, below)
+    over, under = above(rests, gap).mul_(counted), above(-rests, gap).mul_(counted)
+    more = at_most(under.sum(dim=1), over.sum(dim=1))[:, None]
+    return over.mul_(more).add_(under.mul_(1 - more))
 
 
 def _inside(rests: Tensor, others: Tensor) -> Tensor:
     """Return distances from a plane, positive on the side where other points are."""
-    return torch.where(((rests * others).sum(dim=1) >= 0)[:, None], rests, -rests)
+    return rests * _side((rests * others).sum(dim=1))
+
+
+def _side(totals: Tensor) -> Tensor:
+    """Return 1 or, for a negative total, -1, shape ``(n, 1)``."""
+    return torch.where(totals >= 0, 1.0, -1.0).to(totals.dtype)[:, None]
 
 
 def _all_present(groups: Sequence[Tensor]) -> Tensor:
@@ -177,7 +194,7 @@ def _summary(
     outer: Tensor,
     present: Tensor,
     counted: Tensor,
-) -> Wedge:
+) -> Pieces:
     """Return the plane whose group each point is in, and the deviation from all planes."""
     normals, offsets = planes[0]
     for (normal, offset), group in zip(planes[1:], groups[1:], strict=True):
@@ -187,4 +204,4 @@ def _summary(
     freedom = (counted.sum(dim=1) - _PLANE_PARAMETERS * len(planes)).clamp_(min=1)
     deviations = ((outer * outer * counted).sum(dim=1) / freedom).sqrt_()
     deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
-    return Wedge(normals, offsets, deviations, groups[0], groups[1], outer)
+    return Pieces(normals, offsets, deviations)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._take import places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.regions.contacts import NUM_CONTACTS, contact_neighbors
 from torchrg.structures import Neighbors, PlaneAdjacency
@@ -116,17 +117,15 @@ def _find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, _Conta
         indices = neighbors.indices[rows]
         own = narrow[rows]
         other = narrow.index_select(0, indices.reshape(-1)).view(indices.shape)
-        differs = other != own[:, None]
+        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
         if neighbors.valid is not None:
-            differs &= neighbors.valid[rows]
-        source, column = differs.nonzero(as_tuple=True)
-        ends = torch.stack([own[source], other[source, column]])
-        low, high = ends.amin(dim=0), ends.amax(dim=0)
-        touches = low >= 0
-        source, column = source[touches], column[touches]
-        keys.append(low[touches].long() * num_regions + high[touches])
+            touches &= neighbors.valid[rows]
+        places = places_of(touches)
+        source, column = places // touches.shape[1], places % touches.shape[1]
+        first, second = own[source].long(), other.reshape(-1)[places].long()
+        keys.append(torch.minimum(first, second) * num_regions + torch.maximum(first, second))
         sources.append(source + start)
-        targets.append(indices[source, column].long())
+        targets.append(indices.reshape(-1)[places].long())
         ranks.append(column - 1)
     found, pair = torch.unique(torch.cat(keys), return_inverse=True)
     pairs = torch.stack([found // max(num_regions, 1), found % max(num_regions, 1)], dim=1)

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrg._take import places_of
 from torchrg.structures import Neighbors
 
 NUM_CONTACTS = 8
@@ -46,8 +47,10 @@ def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor
     nearest, counted = contact_neighbors(neighbors)
     other = labels[nearest]
     touches = counted & (other != labels[:, None]) & (other >= 0) & (labels[:, None] >= 0)
-    rows, columns = touches.nonzero(as_tuple=True)
-    own, other = labels[rows], other[rows, columns]
-    pairs = torch.stack([torch.minimum(own, other), torch.maximum(own, other)], dim=1)
-    found, counts = torch.unique(pairs, dim=0, return_counts=True)
-    return found, counts
+    places = places_of(touches)
+    own, other = labels[places // touches.shape[1]], other.reshape(-1)[places]
+    num_regions = int(labels.max()) + 1 if len(labels) else 0
+    keys = torch.minimum(own, other) * num_regions + torch.maximum(own, other)
+    found, counts = torch.unique(keys, return_counts=True)
+    width = max(num_regions, 1)
+    return torch.stack([found // width, found % width], dim=1), counts

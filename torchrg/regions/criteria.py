@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchrg.linalg import signs
 from torchrg.neighbors import gather_patches
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors
@@ -54,7 +55,7 @@ def sq_chords(
     else:
         (a0, b0), (a1, b1), (a2, b2) = pairs
         dot = a0 * b0 + a1 * b1 + a2 * b2
-        sign = torch.where(dot < 0, -1.0, 1.0).to(dot.dtype)
+        sign = signs(dot)
         first, second, third = (b - a * sign for a, b in pairs)
     result = first.mul_(first)
     result += second.mul_(second)

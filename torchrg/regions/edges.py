@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._take import places_of
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import gather_patches
 from torchrg.regions.cloud import GrowingCloud
@@ -121,12 +122,11 @@ class EdgeFinder:
         """Return the edges of the block's points that spread, and remember those of the others."""
         joins = accept_edges(self._cloud, self._config, rows, self._shared).joins
         spreads = self._spreads[rows, None]
-        targets = self._cloud.neighbors.indices[rows].cpu().numpy()
-        sources, columns = (joins & ~spreads).cpu().numpy().nonzero()
-        self._others[rows.start] = (
-            (sources + rows.start).astype(np.int32),
-            targets[sources, columns],
-        )
+        targets = self._cloud.neighbors.indices[rows]
+        others = joins & ~spreads
+        found = _pick(targets, others)
+        sources = np.arange(rows.start, rows.stop, dtype=np.int32)
+        self._others[rows.start] = np.repeat(sources, found.counts), found.targets
         return _pick(targets, joins & spreads)
 
     def others(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -146,14 +146,14 @@ class EdgeFinder:
             becomes_seed = target <= self._limit
         if edges.connected is not None and config.connectivity_scope == "seed":
             becomes_seed &= edges.connected
-        codes = indices.to(torch.int32) * 2 + becomes_seed
-        return _pick(codes.cpu().numpy(), edges.joins)
+        codes = (indices.to(torch.int32) * 2).add_(becomes_seed.to(torch.int32))
+        return _pick(codes, edges.joins)
 
 
-def _pick(targets: NDArray[np.int32], accepted: Tensor) -> EdgeBlock:
+def _pick(targets: Tensor, accepted: Tensor) -> EdgeBlock:
     """Return the accepted ones of targets ``(n, K)``."""
-    mask = accepted.cpu().numpy()
-    return EdgeBlock(targets[mask].astype(np.int32, copy=False), np.count_nonzero(mask, axis=1))
+    chosen = targets.reshape(-1).index_select(0, places_of(accepted)).to(torch.int32)
+    return EdgeBlock(chosen.cpu().numpy(), np.count_nonzero(accepted.cpu().numpy(), axis=1))
 
 
 def _is_candidate(cloud: GrowingCloud, rows: slice, indices: Tensor) -> Tensor:
@@ -207,7 +207,7 @@ def _coplanar(
     left: Tensor | None,
 ) -> Tensor:
     """Return which of the asked edges are coplanar by eq. (11), over the neighbours ``left``."""
-    needed = asked.any(dim=1).nonzero().squeeze(-1)
+    needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
     patches = gather_patches(cloud.points, indices[needed])
     counted = None if cloud.neighbors.valid is None else cloud.neighbors.valid[rows][needed]
     residuals = plane_residuals(patches, cloud.normals[rows][needed])

@@ -18,6 +18,10 @@ _FLAT_RATIO = 4.0
 their directions."""
 
 
+_SAME_MAGNITUDE = 1e-6
+"""Components of a normal that differ by less than this share are equal but for rounding."""
+
+
 class FittedPlanes(NamedTuple):
     """Planes of M regions, in float64.
 
@@ -51,7 +55,8 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
             regions of one or two points or along a line.
 
     Returns:
-        The planes. The normal's component of largest magnitude is positive.
+        The planes. The normal's component of largest magnitude, of equal ones the last, is
+        positive.
 
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
@@ -135,6 +140,8 @@ def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
 
 
 def _with_sign(normals: Tensor) -> Tensor:
-    """Return normals whose component of largest magnitude is positive."""
-    largest = normals.gather(1, normals.abs().argmax(dim=1, keepdim=True))
-    return torch.where(largest < 0, -normals, normals)
+    """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
+    magnitudes = normals.abs()
+    near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)
+    last = 2 - near.flip(1).to(torch.uint8).argmax(dim=1, keepdim=True)
+    return torch.where(normals.gather(1, last) < 0, -normals, normals)

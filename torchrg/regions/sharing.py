@@ -152,7 +152,8 @@ def _sum_of_bits(words: NDArray[np.uint64], at_most: int) -> NDArray[np.unsigned
     """
     counts = np.bitwise_count(words)
     if at_most >= 2**8:
-        return counts.sum(axis=1, dtype=np.uint32)
+        total: NDArray[np.unsignedinteger] = counts.sum(axis=1, dtype=np.uint64)
+        return total
     lanes = counts.view(np.uint64)
     total = lanes[:, 0].copy()
     for column in range(1, lanes.shape[1]):

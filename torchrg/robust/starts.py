@@ -25,6 +25,7 @@ NUM_STARTS = 6
 """Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order."""
 
 _LONG = 1000
+_STARTS_AT_ONCE = 3
 
 
 def deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
@@ -38,11 +39,13 @@ def deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
         1 for a point in the set, 0 for another, shape ``(K, 6, M)``.
     """
     standard = [_standardize(column) for column in columns]
-    vectors = eigenvectors(_scatter_matrices(standard))
-    num_points, num_lanes = columns[0].shape
-    loadings = vectors.reshape(NUM_STARTS, num_lanes, len(columns), len(columns))
-    distances = _sphered_distances(standard, loadings)
-    return smallest_points(distances, size).reshape(num_points, NUM_STARTS, num_lanes)
+    # Some starts after the others: what they need fits the cache.
+    distances = [
+        _sphered_distances(standard, eigenvectors(matrices))
+        for matrices in torch.split(_scatter_matrices(standard), _STARTS_AT_ONCE)
+    ]
+    sets = [smallest_points(part.flatten(1), size).view_as(part) for part in distances]
+    return torch.cat(sets, dim=1)
 
 
 def _standardize(column: Tensor) -> Tensor:
@@ -106,27 +109,30 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
 
 
 def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
-    """Squared distances of the points after sphering by each start's scatter, ``(K, 6 M)``."""
-    size = len(columns)
-    lanes = (len(columns[0]), -1)
+    """Squared distances of the points after sphering by each start's scatter, ``(K, S, M)``.
+
+    Args:
+        columns: P coordinates of shape ``(K, M)``.
+        loadings: Eigenvectors of the scatters, as columns, shape ``(S, M, P, P)``.
+    """
+    shape = (len(columns[0]), *loadings.shape[:2])
     sphered: list[Tensor] = []
-    for j in range(size):
-        score = _combine(columns, [loadings[..., i, j] for i in range(size)]).reshape(lanes)
+    for directions in loadings.unbind(dim=3):
+        axis = [part.contiguous() for part in directions.unbind(dim=2)]
+        score = _combine(columns, axis).flatten(1)
         rows = sorted_points(score)
-        spread = _positive_scale(rows, median_of_sorted(rows))
-        axis = [loadings[..., i, j].reshape(-1) for i in range(size)]
-        score = score / spread
-        for i in range(size):
-            part = score * axis[i]
-            if j == 0:
+        score /= _positive_scale(rows, median_of_sorted(rows))
+        for i, factor in enumerate(axis):
+            part = score * factor.flatten()
+            if i == len(sphered):
                 sphered.append(part)
             else:
                 sphered[i] += part
-    return sum_squares([part - median_points(part) for part in sphered])
+    return sum_squares([part - median_points(part) for part in sphered]).view(shape)
 
 
 def _combine(columns: list[Tensor], factors: list[Tensor]) -> Tensor:
-    """Sum of the columns ``(K, M)`` times factors ``(6, M)``, shape ``(K, 6, M)``."""
+    """Sum of the columns ``(K, M)`` times factors ``(S, M)``, shape ``(K, S, M)``."""
     total = columns[0][:, None] * factors[0]
     for column, factor in zip(columns[1:], factors[1:], strict=True):
         total += column[:, None] * factor
