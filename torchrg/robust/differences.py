@@ -84,6 +84,7 @@ class _Lagged:
         n = rows.shape[1]
         size, pitch = _chunk_size(rows), n + half_size(n)
         self.on_cpu = rows.device.type == "cpu"
+        self.finite = bool(rows[:, :: max(n - 1, 1)].isfinite().all())
         runs = _runs_in_networks(n) if sorts and self.on_cpu and rows.element_size() == 4 else []
         self.num_networks = -(-runs[-1].stop // _NETWORK) if runs else 0
         runs = runs or _lay_out(n, _MOST_LAGS, room=None)
@@ -104,10 +105,13 @@ class _Lagged:
 
     def _fill(self, rows: Tensor) -> Tensor:
         """Write the differences of up to a chunk of sorted rows."""
-        count = len(rows)
-        self.rows[:count, : rows.shape[1]] = rows
-        for minuend, subtrahend, out in self._steps:
-            torch.sub(minuend[:count], subtrahend[:count], out=out[:count])
+        count, n = rows.shape
+        steps = self._steps
+        if count < len(self.rows):
+            steps = [(far[:count], near[:count], out[:count]) for far, near, out in steps]
+        self.rows[:count, :n] = rows
+        for far, near, out in steps:
+            torch.sub(far, near, out=out)
         for pad in self._pads:
             pad.fill_(torch.inf)
         return self.differences[:count]
@@ -116,7 +120,7 @@ class _Lagged:
         """The ``rank``-th smallest difference of each row."""
         differences = self._fill(rows)
         if self.num_networks:
-            if not rows[:, :: rows.shape[1] - 1].isfinite().all():
+            if not self.finite:
                 differences.abs_()  # inf - inf may be a NaN with a sign, which would sort first
             bits = differences.view(torch.int32)
             if self.num_networks == 1:

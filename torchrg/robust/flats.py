@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._chunks import chunks_of
 from torchrg.robust.lanes import eigenvectors, sum_points, sum_squares, take_lanes
 from torchrg.robust.scatter import covariance_entries
 
@@ -16,6 +17,7 @@ NUM_SIMPLICES = 128
 """Sets of P + 1 points looked at; 27 of 50 points on a plane escape all of them once in 25,000."""
 
 _MAX_CANDIDATES = 16
+_LANES = 1024
 _MIN_EDGE = 0.01
 _ROUNDING = 8
 
@@ -62,18 +64,29 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
     Returns:
         The flats found.
     """
+    parts = [
+        _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
+        for lanes in chunks_of(len(tolerance), _LANES)
+    ]
+    dimensions, members = zip(*parts, strict=True)
+    return Flats(torch.cat(dimensions), torch.cat(members, dim=1))
+
+
+def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
+    """Do as :func:`find_flats` for few enough lanes to fit the cache."""
     num_coordinates, (num_points, num_lanes) = len(columns), columns[0].shape
     dimension = torch.full((num_lanes,), num_coordinates, device=tolerance.device)
     members = torch.zeros((num_points, num_lanes), dtype=torch.bool, device=tolerance.device)
     simplices = _simplices(num_points, min(num_coordinates, num_points - 1))
     vertices = [torch.tensor(vertex, device=tolerance.device) for vertex in simplices]
-    origins = [column[vertices[0]] for column in columns]
+    origins = [column.index_select(0, vertices[0]) for column in columns]
     extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
     axes: list[list[Tensor]] = []
     steep = torch.ones_like(origins[0], dtype=torch.bool)
     reach = (2 * tolerance).expand_as(origins[0])
     for vertex in vertices[1:]:
-        edge = [column[vertex] - origin for column, origin in zip(columns, origins, strict=True)]
+        corners = [column.index_select(0, vertex) for column in columns]
+        edge = [corner.sub_(origin) for corner, origin in zip(corners, origins, strict=True)]
         rest = _reject(edge, axes)
         height = sum_squares(rest).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
