@@ -63,7 +63,8 @@ def all_distances(points, k):
 
 @pytest.mark.parametrize("k", [2, 17, 50])
 @pytest.mark.parametrize("kind", CLOUDS)
-def test_what_cells_answer_is_what_all_distances_say(kind, k):
+def test_what_cells_answer_is_what_all_distances_say(kind, k, monkeypatch):
+    monkeypatch.setitem(search_cells.__globals__, "MIN_FOR_CELLS", 1)
     points, near, rows = cloud_of(kind)
     near, rows = near[:, :k], rows[:, :k]
     answered = np.zeros(len(points), dtype=int)

@@ -6,7 +6,10 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes
 
 _JACOBI_SWEEPS = 5
-_NEWTON_STEPS = 10
+_FIRST_STEPS, _MORE_STEPS = 4, 6
+_SETTLED = 1e-9
+"""Share of the trace by which the last step may move a root that is as good as found."""
+
 _NEARLY_EQUAL = 1e-9
 """Share of the squared largest eigenvalue below which the adjugate has no direction."""
 
@@ -130,12 +133,31 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor:
     """Return the smallest root of a characteristic polynomial without negative roots."""
-    root = torch.zeros_like(trace)
-    for _ in range(_NEWTON_STEPS):
-        value = ((root - trace) * root + minors) * root - determinant
-        slope = (3 * root - 2 * trace) * root + minors
-        root = root - value / slope
-    return torch.where(root.isfinite(), root, 0.0)
+    coefficients = torch.stack([values.reshape(-1) for values in (trace, minors, determinant)])
+    root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
+    # Convergence is quadratic but near a double root: few need the other steps.
+    rows = (step.abs() > _SETTLED * coefficients[0]).nonzero().squeeze(1)
+    if len(rows):
+        root[rows] = _newton(root[rows], coefficients[:, rows], _MORE_STEPS)[0]
+    return torch.where(root.isfinite(), root, 0.0).view_as(trace)
+
+
+def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
+    """Return what so many steps of Newton's method lead to, and the last step.
+
+    Args:
+        root: Where to begin, shape ``(n,)``.
+        coefficients: Trace, sum of the principal minors and determinant, shape ``(3, n)``.
+        num_steps: At least 1.
+    """
+    trace, minors, determinant = coefficients
+    twice, step = 2 * trace, root
+    for _ in range(num_steps):
+        value = (root - trace).mul_(root).add_(minors).mul_(root).sub_(determinant)
+        slope = (3 * root).sub_(twice).mul_(root).add_(minors)
+        step = value.div_(slope)
+        root = root - step
+    return root, step
 
 
 def _kernel(

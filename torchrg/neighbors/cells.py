@@ -30,6 +30,9 @@ from torchrg.neighbors.selection import (
 Store = Callable[[NDArray[np.integer], NDArray[np.float64], NDArray[np.integer]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""
 
+MIN_FOR_CELLS = 2000
+"""Points below which a tree is as fast as cells."""
+
 _MIN_CANDIDATES = 2.4
 """Candidates for a neighbour wanted; with fewer, most results would not count."""
 
@@ -62,18 +65,18 @@ def search_cells(
         Rows that are left, shape ``(m,)``, ascending.
 
     Example:
-        >>> grid = np.argwhere(np.ones((20, 20, 1))) * 1.0
+        >>> grid = np.argwhere(np.ones((50, 50, 1))) * 1.0
         >>> found = {}
         >>> def store(rows, distances, neighbors):
         ...     found.update(zip(rows.tolist(), distances[:, -1].tolist()))
         >>> left = search_cells(grid, 9, np.full(5, 1.5), store)
-        >>> len(left) + len(found), found[190]
-        (400, 1.4142135623730951)
+        >>> len(left) + len(found), found[1225]
+        (2500, 1.4142135623730951)
     """
     left = np.arange(len(points))
     if _MIN_CANDIDATES * (k + _SPARE) <= MAX_CANDIDATES:
         for size in _cell_sizes(reach):
-            if len(left):
+            if len(left) >= MIN_FOR_CELLS:
                 left = _search_level(points, k, size, left, store)
     return left
 

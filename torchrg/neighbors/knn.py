@@ -11,15 +11,12 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
-from torchrg.neighbors.cells import search_cells
+from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
 _QUERY_CHUNK = 65536
-_MIN_FOR_CELLS = 2000
-"""Points below which a tree is as fast as cells."""
-
-_SAMPLE_SIZE = 1000
+_SAMPLE_SIZE = 400
 
 
 def search_knn(
@@ -145,7 +142,7 @@ def _search_cloud(
     width = min(k, len(places))
     tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
     left = np.arange(len(places))
-    if len(places) >= _MIN_FOR_CELLS:
+    if len(places) >= MIN_FOR_CELLS:
         sample = places[:: -(-len(places) // _SAMPLE_SIZE)]
         left = search_cells(places, k, tree.query(sample, [k])[0][:, 0], store)
     for begin in range(0, len(left), _QUERY_CHUNK):
