@@ -38,9 +38,9 @@ def residuals(columns: Columns, normals: Tensor, offsets: Tensor) -> Tensor:
 
 
 def along(columns: Columns, axes: Tensor) -> Tensor:
-    """Return coordinates of the neighbours along an axis ``(n, 3)`` of each point, ``(n, K)``."""
+    """Return coordinates of the neighbours along axes ``(*, n, 3)``, shape ``(*, n, K)``."""
     x, y, z = columns
-    a, b, c = (part[:, None] for part in axes.unbind(dim=-1))
+    a, b, c = (part[..., None] for part in axes.unbind(dim=-1))
     # Products and sums apart: a fused multiply-add may round differently at the end of a block.
     return (x * a).add_(y * b).add_(z * c)
 

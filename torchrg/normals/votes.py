@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg._chunks import chunks_of
 from torchrg.linalg import above
 from torchrg.normals.columns import Columns, along, fit_planes, residuals, sq_lengths
 
@@ -13,6 +14,7 @@ _NUM_PAIRS = 32
 _THINNEST_TRIANGLE = 0.1
 _VOTE_TOLERANCE = 2.0
 _FIT_TOLERANCE = 3.5
+_ROWS = 8192
 
 
 def vote_planes(
@@ -56,12 +58,15 @@ def vote_planes(
     weights = (1 - 0.9 * nearness) * counted
     reach = _VOTE_TOLERANCE * noise
     best, normals = _score(columns, weights, start, reach), start
-    for first, second in _pairs(sq_distances.shape[1]):
-        candidates, broad = _plane_through(columns, first, second)
-        score = torch.where(broad, _score(columns, weights, candidates, reach), -torch.inf)
-        better = score > best
-        best = torch.where(better, score, best)
-        normals = torch.where(better[:, None], candidates, normals)
+    candidates, broad = _planes_through(columns, _pairs(sq_distances.shape[1]))
+    # Few points are scored for several candidates in one step.
+    for some in chunks_of(len(candidates), max(1, _ROWS // max(len(noise), 1))):
+        scores = _score(columns, weights, candidates[some], reach)
+        scores = torch.where(broad[some], scores, -torch.inf)
+        for candidate, score in zip(candidates[some], scores, strict=True):
+            better = score > best
+            best = torch.where(better, score, best)
+            normals = torch.where(better[:, None], candidate, normals)
     offsets = torch.zeros_like(noise)
     for _ in range(2):
         near = _within(residuals(columns, normals, offsets), reach)
@@ -74,10 +79,18 @@ def vote_planes(
 
 
 def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
-    """Return the score of planes by their residuals in units of the reach, shape ``(n,)``."""
-    support = (weights * (1 - rests * rests).clamp_(min=0)).sum(dim=1)
-    over = (above(rests, 1).mul_(weights)).sum(dim=1)
-    under = (above(-rests, 1).mul_(weights)).sum(dim=1)
+    """Return the score of planes by their residuals in units of the reach.
+
+    Args:
+        rests: Residuals, shape ``(*, n, K)``.
+        weights: Weights, shape ``(n, K)``.
+
+    Returns:
+        Shape ``(*, n)``.
+    """
+    support = (1 - rests * rests).clamp_(min=0).mul_(weights).sum(dim=-1)
+    over = above(rests, 1).mul_(weights).sum(dim=-1)
+    under = above(-rests, 1).mul_(weights).sum(dim=-1)
     return support - torch.minimum(over, under)
 
 
@@ -105,10 +118,20 @@ def _refit(
     )
 
 
-def _plane_through(columns: Columns, first: int, second: int) -> tuple[Tensor, Tensor]:
-    """Return the plane through the points and two neighbours, and whether the triangle is broad."""
-    a, b, c = (column[:, first] for column in columns)
-    d, e, f = (column[:, second] for column in columns)
+def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor]:
+    """Return planes through the points and two neighbours, and whether the triangles are broad.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        pairs: Ranks of the two neighbours.
+
+    Returns:
+        Unit normals ``(P, n, 3)`` and flags ``(P, n)``.
+    """
+    ranks = torch.tensor(pairs, dtype=torch.int64, device=columns[0].device).view(-1, 2)
+    by_rank = [column.t() for column in columns]
+    a, b, c = (column.index_select(0, ranks[:, 0]) for column in by_rank)
+    d, e, f = (column.index_select(0, ranks[:, 1]) for column in by_rank)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
     sq_area = x * x + y * y + z * z
     sq_sides = (a * a + b * b + c * c) * (d * d + e * e + f * f)
