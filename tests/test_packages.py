@@ -36,7 +36,8 @@ def test_built_package_runs_in_a_fresh_environment(distributions, tmp_path, suff
         capture_output=True,
     )
     # The dependencies are those of this environment; torchrg itself must come from the package.
-    Path(target, "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    folders = [folder for folder in sys.path if folder.endswith("site-packages")]
+    Path(target, "dependencies.pth").write_text("\n".join(folders))
     run = [binaries / "python", "-m", "torchrg"]
     clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     options = {"cwd": tmp_path, "check": True, "capture_output": True, "text": True, "env": clean}
