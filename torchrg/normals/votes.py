@@ -15,6 +15,7 @@ _THINNEST_TRIANGLE = 0.1
 _VOTE_TOLERANCE = 2.0
 _FIT_TOLERANCE = 3.5
 _ROWS = 8192
+"""Points times candidates that are scored in one step."""
 
 
 def vote_planes(

@@ -17,7 +17,6 @@ _NETWORK = 512
 
 As integers, whose order is that of non-negative floats, they take two thirds of the time."""
 
-
 _MOST_LAGS = 8
 """Lags in one subtraction. They are all as wide as the first of them."""
 

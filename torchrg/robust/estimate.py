@@ -5,7 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.robust.lanes import indicator, join_columns, sum_points
+from torchrg.linalg import at_most
+from torchrg.robust.lanes import join_columns, sum_points
 from torchrg.robust.scatter import covariance_entries
 from torchrg.robust.weights import chi2_quantile, consistency_factor
 
@@ -63,7 +64,7 @@ def reweight(
     """
     size = len(columns)
     bound = distances.new_tensor([chi2_quantile(quantile, size)])
-    weights = indicator(distances, bound)
+    weights = at_most(distances, bound)
     count = sum_points(weights)
     means = [sum_points(weights * column) / count.clamp(min=1) for column in columns]
     covariance = covariance_entries(columns, means, weights, (count - 1).clamp(min=1))

@@ -18,6 +18,7 @@ NUM_SIMPLICES = 128
 
 _MAX_CANDIDATES = 16
 _LANES = 1024
+"""Patches looked at together: what they need fits the cache."""
 _MIN_EDGE = 0.01
 _ROUNDING = 8
 

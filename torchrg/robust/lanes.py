@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.linalg import eigh3
+from torchrg.linalg import at_most, eigh3
 
 
 def split_columns(patches: Tensor) -> list[Tensor]:
@@ -75,7 +75,7 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
         return torch.ones_like(distances)
     rows = sorted_points(distances)
     bound = rows[:, size - 1].contiguous()
-    marked = indicator(distances, bound)
+    marked = at_most(distances, bound)
     tied = torch.nonzero(rows[:, size] == bound).squeeze(1)
     if len(tied):
         # A threshold alone would mark too many, and C-steps on such subsets can cycle.
@@ -84,14 +84,6 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
         room = size - sum_points(below)
         marked[:, tied] = below + level * (level.cumsum(dim=0) <= room)
     return marked
-
-
-def indicator(values: Tensor, bound: Tensor) -> Tensor:
-    """1 where ``values <= bound`` and 0 elsewhere, in the dtype of ``values``."""
-    if values.device.type == "cpu":
-        below = np.less_equal(values.numpy(), bound.numpy())
-        return torch.from_numpy(below.astype(values.numpy().dtype))
-    return (values <= bound).to(values.dtype)
 
 
 def sum_squares(parts: list[Tensor]) -> Tensor:

@@ -7,7 +7,7 @@ from torchrg.errors import ConfigError
 from torchrg.robust.bisquare import Target, bisquare_loss, breakdown_constant, efficiency_constant
 from torchrg.robust.differences import half_size
 from torchrg.robust.estimate import Estimate
-from torchrg.robust.lanes import indicator, join_columns, smallest_points, sum_points
+from torchrg.robust.lanes import join_columns, smallest_points, sum_points
 from torchrg.robust.mcd import Starts, check_starts, initial_sets
 from torchrg.robust.patchwise import fit_patchwise
 from torchrg.robust.result import RobustFit
@@ -180,7 +180,7 @@ def _estimate(
     return Estimate(
         location=join_columns(final.ellipsoid.means),
         covariance=scatter(final),
-        support=indicator(distances, bound) > 0,
+        support=distances <= bound,
         sq_distances=distances,
         raw_location=join_columns(raw.ellipsoid.means),
         raw_covariance=scatter(raw),

@@ -26,6 +26,7 @@ NUM_STARTS = 6
 
 _LONG = 1000
 _STARTS_AT_ONCE = 3
+"""Starts worked on together."""
 
 
 def deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
