@@ -5,14 +5,15 @@ from pathlib import Path
 
 LAYERS = [
     {"errors"},
-    {"_checks", "_chunks", "_optional", "_take", "structures"},
+    {"_checks", "_optional", "_parallel", "structures"},
     {"linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},
     {"pipeline", "tiling"},
-    {"transforms", "nn"},
+    {"depth", "nn"},
+    {"transforms"},
     {"datasets"},
-    {"batch", "report"},
+    {"batch", "render"},
     {"cli"},
     {"__init__", "__main__"},
 ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchrg.cli import main, picture
-from torchrg.report import render_cloud
+from torchrg.render import render_cloud
 
 PNG = b"\x89PNG"
 

@@ -1,6 +1,6 @@
 """Robust normals, curvature and plane labels for indoor point clouds."""
 
-from torchrg import datasets, metrics, nn, normals, robust, scenes, transforms
+from torchrg import datasets, depth, metrics, nn, normals, robust, scenes, transforms
 from torchrg.config import load_config
 from torchrg.errors import TorchrgError
 from torchrg.io import read_cloud, write_cloud
@@ -17,6 +17,7 @@ __all__ = [
     "Cloud",
     "TorchrgError",
     "datasets",
+    "depth",
     "estimate_normals",
     "grow_regions",
     "load_config",

@@ -10,15 +10,9 @@ import torch
 from torch import Tensor
 
 from reproduction.paper_numbers import POINTS
+from reproduction.scenes import HALL_LAYOUT, StoreyLayout, make_kinect_room, make_storey
 from torchrg.io import read_cloud
-from torchrg.scenes import (
-    HALL_LAYOUT,
-    Scene,
-    StoreyLayout,
-    make_kinect_room,
-    make_room,
-    make_storey,
-)
+from torchrg.scenes import Scene, make_room
 
 QUICK_POINTS = 100_000
 """Most points of a file in a quick run."""

@@ -15,7 +15,7 @@ from torchrg import estimate_normals, load_config, search_knn
 from torchrg.neighbors import gather_patches
 from torchrg.regions.criteria import coplanarity_limits, patch_radii, plane_residuals
 from torchrg.regions.edges import min_shared_neighbors
-from torchrg.regions.sharing import SharedNeighbors
+from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.structures import Neighbors
 
 _SIDE = 15

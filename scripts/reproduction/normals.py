@@ -19,13 +19,14 @@ from reproduction.normal_tables import (
     where,
 )
 from reproduction.runs import Run
+from reproduction.scenes import SHAPES, make_shape
 from reproduction.sections import Block, figure, section, text
 from torchrg.config import NormalsConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_normals
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals
-from torchrg.scenes import SHAPES, Scene, make_shape
+from torchrg.scenes import Scene
 
 K = 50
 EDGE_DEG = 20.0

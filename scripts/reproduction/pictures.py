@@ -12,7 +12,7 @@ from torch import Tensor
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
 from torchrg.metrics import contingency_table, match_regions
-from torchrg.report import color_planes, render_cloud, tile_pictures, write_png
+from torchrg.render import color_planes, render_cloud, tile_pictures, write_png
 from torchrg.structures import UNLABELED
 
 _GRAY = 190

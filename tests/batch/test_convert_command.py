@@ -10,8 +10,8 @@ import pytest
 from tqdm import tqdm
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.plan import make_plan
+from torchrg.batch.run import DirectoryLock
 from torchrg.cli import main
 from torchrg.cli.convert import _Progress
 from torchrg.config import load_config
@@ -108,7 +108,7 @@ def test_a_dry_run_writes_nothing(rooms, tmp_path, capsys):
 
 
 def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("torchrg.batch.lock.DirectoryLock.__init__.__kwdefaults__", {"patience": 0})
+    monkeypatch.setattr("torchrg.batch.run.DirectoryLock.__init__.__kwdefaults__", {"patience": 0})
     with DirectoryLock(tmp_path):
         assert convert("folder", rooms, tmp_path) == 2
     assert "another torchrg convert (process" in capsys.readouterr().err

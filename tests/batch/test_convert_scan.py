@@ -5,7 +5,7 @@ import json
 import pytest
 
 from torchrg.batch.convert import convert_scan
-from torchrg.batch.done import RECORD, reason_to_convert
+from torchrg.batch.records import RECORD, reason_to_convert
 
 
 def test_the_record_tells_what_was_made_from_what(faults, tmp_path):

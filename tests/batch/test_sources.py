@@ -9,11 +9,9 @@ import pytest
 import torch
 
 from torchrg.batch.convert import convert_scan
-from torchrg.batch.done import reason_to_convert
-from torchrg.batch.folder import FolderSource
 from torchrg.batch.plan import list_jobs
-from torchrg.batch.rgbd import RGBDSource
-from torchrg.batch.s3dis import S3DISSource, find_areas
+from torchrg.batch.records import reason_to_convert
+from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
 from torchrg.io import Cloud, write_cloud

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchrg.datasets import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd_images import read_color, read_depth
+from torchrg.datasets.rgbd_files import read_color, read_depth
 from torchrg.errors import ConfigError, FormatError, ShapeError
-from torchrg.report import write_png
+from torchrg.render import write_png
 from torchrg.transforms import DepthToCloud
 
 HALF = math.sqrt(0.5)

@@ -8,7 +8,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
-from torchrg.io.atomic import atomic_path
+from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud
 
 

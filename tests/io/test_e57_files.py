@@ -5,7 +5,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.e57_pose import Scan, to_cartesian
+from torchrg.io.e57 import Scan, to_cartesian
 from torchrg.structures import Cloud
 
 pye57 = pytest.importorskip("pye57")

@@ -5,7 +5,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.tables import LINES_AT_ONCE
+from torchrg.io.text import LINES_AT_ONCE
 from torchrg.structures import Cloud
 
 POINTS = [[0.0, 1.5, -2.0], [3.0, 4.0, 1e3]]

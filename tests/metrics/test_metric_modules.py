@@ -206,7 +206,7 @@ def test_a_collection_scores_each_scan_once(monkeypatch):
         calls.append(arguments)
         return score_labels(*arguments, **settings)
 
-    monkeypatch.setattr("torchrg.metrics.modules.labels.score_labels", counted)
+    monkeypatch.setattr("torchrg.metrics.modules.score_labels", counted)
     collection = torchmetrics.MetricCollection(
         [modules.PlaneF1(), modules.PlaneARI(), modules.MeanBestIoU(), modules.MissedFaces()]
     )

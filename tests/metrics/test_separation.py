@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.metrics.sphere_clusters import scattered
-from torchrg.metrics.separation import closest_between
+from torchrg.metrics.clusters import closest_between
 from torchrg.metrics.sphere import chord_table, chord_to_angle
 
 
@@ -29,13 +29,13 @@ def test_closest_pair_is_that_of_all_pairs(rng, num_clusters, spread):
 def test_both_searches_find_the_same_pair(rng, monkeypatch, max_cells, spread):
     directions, clusters = scattered(rng, [50, 60, 70, 1, 2], spread)
     expected = closest_of_all_pairs(directions, clusters)
-    monkeypatch.setattr("torchrg.metrics.separation._MAX_CELLS", max_cells)
+    monkeypatch.setattr("torchrg.metrics.clusters._MAX_CELLS", max_cells)
     assert closest_between(directions, clusters) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("max_cells", [0, 4096])
 def test_opposite_directions_across_the_equator_are_close(monkeypatch, max_cells):
-    monkeypatch.setattr("torchrg.metrics.separation._MAX_CELLS", max_cells)
+    monkeypatch.setattr("torchrg.metrics.clusters._MAX_CELLS", max_cells)
     for turn in range(3):
         a = torch.tensor([[math.cos(0.01), 0, math.sin(0.01)], [0, 1, 0]], dtype=torch.float64)
         b = torch.tensor([[-math.cos(0.02), 0, math.sin(0.02)]], dtype=torch.float64)
@@ -47,7 +47,7 @@ def test_opposite_directions_across_the_equator_are_close(monkeypatch, max_cells
 
 @pytest.mark.parametrize("max_cells", [0, 4096])
 def test_repeated_directions_do_not_hide_the_closest_pair(rng, monkeypatch, max_cells):
-    monkeypatch.setattr("torchrg.metrics.separation._MAX_CELLS", max_cells)
+    monkeypatch.setattr("torchrg.metrics.clusters._MAX_CELLS", max_cells)
     directions, clusters = scattered(rng, [5, 5], 0.01, axes=torch.eye(3)[:2])
     expected = closest_of_all_pairs(directions, clusters)
     repeated = closest_between(directions.repeat(50, 1), clusters.repeat(50))
@@ -57,7 +57,7 @@ def test_repeated_directions_do_not_hide_the_closest_pair(rng, monkeypatch, max_
 def test_repeated_directions_are_searched_once(rng, monkeypatch):
     searched = []
     monkeypatch.setattr(
-        "torchrg.metrics.separation._closest_chord",
+        "torchrg.metrics.clusters._closest_chord",
         lambda points, *_: searched.append(len(points)) or 1.0,
     )
     directions, clusters = scattered(rng, [5, 5], 0.01, axes=torch.eye(3)[:2])
@@ -87,6 +87,6 @@ def test_nearly_exact_planes_far_apart_are_settled_without_trees(rng, monkeypatc
     def refuse(*_arguments):
         raise AssertionError
 
-    monkeypatch.setattr("torchrg.metrics.separation._closest_by_digits", refuse)
+    monkeypatch.setattr("torchrg.metrics.clusters._closest_by_digits", refuse)
     directions, clusters = scattered(rng, [20_000] * 3, 1e-6, axes=torch.eye(3))
     assert closest_between(directions, clusters) == pytest.approx(math.pi / 2, abs=2e-5)

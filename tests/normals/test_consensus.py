@@ -4,16 +4,16 @@ import dataclasses
 
 import pytest
 import torch
+from reproduction.scenes import make_shape
 
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import canonical_order, search_knn
-from torchrg.normals.chunks import fit_points
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.jet import fit_normals_jet
+from torchrg.normals.patches import fit_points
 from torchrg.normals.pca import fit_normals_pca
-from torchrg.scenes import make_shape
 from torchrg.structures import Neighbors
 
 

@@ -8,7 +8,7 @@ import torch
 
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.normals import fit_jet, fit_normals_jet, fit_normals_pca
-from torchrg.normals.least_squares import least_squares
+from torchrg.normals.jet import least_squares
 
 # Sums of CGAL lose digits far from the origin; the frame of exact planes and lines is arbitrary.
 LOSES_DIGITS = ("utm", "off1e4")

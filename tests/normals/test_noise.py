@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from reproduction.scenes import make_shape
 
 from torchrg.neighbors import search_knn
-from torchrg.normals.chunks import fit_points
-from torchrg.normals.noise import survey_noise
+from torchrg.normals.consensus.noise import survey_noise
+from torchrg.normals.patches import fit_points
 from torchrg.normals.pca import fit_normals_pca
-from torchrg.scenes import make_shape
 
 
 def survey(points, k=50):

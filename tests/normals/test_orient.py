@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from reproduction.scenes import make_shape
 
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, orient_normals
-from torchrg.normals.interior import vote_free_side
-from torchrg.normals.propagate import propagate_signs
-from torchrg.scenes import make_room, make_shape
+from torchrg.normals.orient import propagate_signs, vote_free_side
+from torchrg.scenes import make_room
 
 
 def shuffled_signs(normals):

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from torchrg.normals.columns import split_columns
-from torchrg.normals.paraboloid import fit_paraboloids
+from torchrg.linalg.moments import split_columns
+from torchrg.normals.jet import fit_paraboloids
 
 
 def literal(patch, up):

@@ -4,9 +4,13 @@ import pytest
 import torch
 
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.normals.columns import split_columns
-from torchrg.normals.votes import vote_planes
-from torchrg.normals.wedge import fit_corners, fit_wedges, split_by_votes
+from torchrg.linalg.moments import split_columns
+from torchrg.normals.consensus.hypotheses import (
+    fit_corners,
+    fit_wedges,
+    split_by_votes,
+    vote_planes,
+)
 
 
 def faces(normals, rng, noise, first, num=40):

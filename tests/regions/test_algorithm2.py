@@ -12,7 +12,7 @@ from tests.regions import algorithm2, growing_clouds
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.frontier import grow_in_turn
+from torchrg.regions.growth import grow_in_turn
 
 RULES = [
     {

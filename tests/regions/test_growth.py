@@ -9,9 +9,8 @@ from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.components import first_to_reach
-from torchrg.regions.graph import EdgeLists
-from torchrg.regions.grow import curvature_limit, number_by_size
+from torchrg.regions.edges import EdgeLists
+from torchrg.regions.growth import curvature_limit, first_to_reach, number_by_size
 from torchrg.structures import Neighbors
 
 CLASSIC = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)

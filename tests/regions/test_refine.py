@@ -9,10 +9,9 @@ from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.absorb import absorb_points
-from torchrg.regions.cloud import GrowingCloud
-from torchrg.regions.contacts import contact_neighbors, count_contacts
-from torchrg.regions.refine import refine_regions
+from torchrg.regions.adjacency import contact_neighbors, count_contacts
+from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.refine import absorb_points, refine_regions
 from torchrg.structures import UNLABELED
 
 OFF = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)

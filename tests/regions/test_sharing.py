@@ -7,7 +7,7 @@ import torch
 from tests.regions import growing_clouds
 from torchrg.neighbors import search_knn
 from torchrg.regions.edges import min_shared_neighbors
-from torchrg.regions.sharing import SharedNeighbors
+from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.structures import Neighbors
 
 

@@ -5,8 +5,7 @@ import torch
 from tests.robust.oracle_cases import FRACTIONS, fit_all, load_oracles, local_float32, points_of
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_fastmcd
-from torchrg.robust.concentrate import Concentrated
-from torchrg.robust.fastmcd import _distinct_best
+from torchrg.robust.mcd import Concentrated, _distinct_best
 
 
 def gaps(folder, convert, chosen):

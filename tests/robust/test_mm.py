@@ -13,7 +13,7 @@ from tests.robust.oracle_cases import (
 )
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_detmm, fit_dets
-from torchrg.robust.bisquare import breakdown_constant, efficiency_constant
+from torchrg.robust.mm import breakdown_constant, efficiency_constant
 
 
 def regular_fits(folder, fit, families, convert=torch.from_numpy, without=()):

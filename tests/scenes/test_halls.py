@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from reproduction.scenes import StoreyLayout, build_storey, make_hall, make_storey
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import StoreyLayout, build_storey, make_hall, make_storey
-from torchrg.scenes.rays import cast_rays
+from torchrg.scenes.sampling import cast_rays
 
 
 def test_hall_has_doors_on_both_sides():

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from reproduction.scenes import SHAPES, make_shape
 from scipy.stats import chisquare, kstest
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import SHAPES, make_shape
 
 GOLDEN = (1 + 5**0.5) / 2
 

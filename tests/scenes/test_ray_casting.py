@@ -3,33 +3,26 @@
 import numpy as np
 import pytest
 import torch
-from scipy.stats import kstest
-
-from torchrg.errors import ConfigError
-from torchrg.scenes import (
+from reproduction.scenes import (
     SHAPES,
     Camera,
-    RoomLayout,
-    SceneModel,
-    build_room,
     build_storey,
     cameras_around,
     make_kinect_room,
-    make_room,
     render_depth,
-    sample_scene,
 )
-from torchrg.scenes.bumps import Bumpy
-from torchrg.scenes.cones import Cone
-from torchrg.scenes.extrusions import extrude
-from torchrg.scenes.frames import Frame, unit
-from torchrg.scenes.kinect import KINECT_LAYOUT, fuse_frames
-from torchrg.scenes.outlines import Outline
-from torchrg.scenes.rays import cast_rays
-from torchrg.scenes.rings import Ring
+from reproduction.scenes.cameras import KINECT_LAYOUT, fuse_frames
+from reproduction.scenes.extrusions import Outline, extrude
+from reproduction.scenes.shapes import Bumpy
+from scipy.stats import kstest
+
+from torchrg.errors import ConfigError
+from torchrg.scenes import RoomLayout, SceneModel, build_room, make_room, sample_scene
+from torchrg.scenes.geometry import Frame, solve_quadratic, unit
+from torchrg.scenes.round import Cone, Ring
+from torchrg.scenes.sampling import cast_rays
 from torchrg.scenes.scene import Part, plane_table
 from torchrg.scenes.surfaces import Flat
-from torchrg.scenes.turns import solve_quadratic
 from torchrg.structures import UNLABELED
 
 CURVED = RoomLayout(

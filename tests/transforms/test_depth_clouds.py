@@ -4,13 +4,14 @@ import pickle
 
 import pytest
 import torch
+from reproduction.scenes import cameras_around, render_depth
 
+from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.scenes import build_room, cameras_around, render_depth
+from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED, Planes
 from torchrg.transforms import DepthToCloud, SegmentDepth, segment_depth
-from torchrg.transforms.depth_camera import depth_to_points, find_intrinsics, make_intrinsics
-from torchrg.transforms.depth_fusion import fuse_depth
+from torchrg.transforms.fusion import fuse_depth
 
 
 @pytest.fixture(scope="module")

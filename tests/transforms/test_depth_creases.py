@@ -2,11 +2,11 @@
 
 import torch
 
-from torchrg.regions.fitting import fit_planes
-from torchrg.regions.segments import Segments
+from torchrg.depth.refine import move_to_creases
+from torchrg.depth.windows import moved
+from torchrg.linalg.moments import Segments
+from torchrg.regions.planes import fit_planes
 from torchrg.structures import Neighbors
-from torchrg.transforms.depth_creases import move_to_creases
-from torchrg.transforms.depth_windows import moved
 
 STEPS = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 

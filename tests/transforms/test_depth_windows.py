@@ -2,9 +2,9 @@
 
 import torch
 
-from torchrg.transforms.depth_noise import noise_by_radius
-from torchrg.transforms.depth_normals import RADII
-from torchrg.transforms.depth_windows import fit_windows, least_in_windows, moved
+from torchrg.depth.noise import noise_by_radius
+from torchrg.depth.normals import RADII
+from torchrg.depth.windows import fit_windows, least_in_windows, moved
 
 
 def coordinates(height, width):

@@ -1,7 +1,7 @@
 """Whole data sets: many scans, on one machine or on a cluster, and a record of each.
 
-A source (:class:`~torchrg.batch.folder.FolderSource`, :class:`~torchrg.batch.s3dis.S3DISSource`,
-:class:`~torchrg.batch.rgbd.RGBDSource`, or a :class:`~torchrg.batch.scans.Source` of your own)
+A source (:class:`~torchrg.batch.sources.FolderSource`, :class:`~torchrg.batch.sources.S3DISSource`,
+:class:`~torchrg.batch.sources.RGBDSource`, or a :class:`~torchrg.batch.scans.Source` of your own)
 lists scans and converts one of them. :func:`~torchrg.batch.plan.list_jobs` makes jobs of them,
 :func:`~torchrg.batch.plan.make_plan` finds those that are not done,
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
@@ -12,7 +12,7 @@ Example:
     >>> from pathlib import Path
     >>> import numpy as np
     >>> from torchrg.batch.convert import convert_scan
-    >>> from torchrg.batch.folder import FolderSource
+    >>> from torchrg.batch.sources import FolderSource
     >>> from torchrg.batch.plan import list_jobs
     >>> from torchrg.config import load_config
     >>> from torchrg.scenes import make_room

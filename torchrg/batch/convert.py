@@ -9,11 +9,11 @@ import traceback
 from dataclasses import dataclass, field
 from typing import Literal
 
-from torchrg.batch.done import RECORD, describe_job, read_record, write_record
 from torchrg.batch.memory import peak_memory, reset_peak_memory
+from torchrg.batch.records import RECORD, describe_job, read_record, write_record
 from torchrg.batch.scans import Job
 from torchrg.errors import TorchrgError
-from torchrg.io.atomic import remove_leftovers
+from torchrg.io.files import remove_leftovers
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 

@@ -10,10 +10,10 @@ from multiprocessing.connection import Connection
 from threading import Thread
 
 from torchrg.batch.convert import ScanReport, convert_scan
-from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import memory_of_scan
+from torchrg.batch.run import DirectoryLock
 from torchrg.batch.scans import Job
-from torchrg.io.atomic import remove_leftovers
+from torchrg.io.files import remove_leftovers
 
 Work = Callable[[Job], ScanReport]
 ONE_THREAD = dict.fromkeys(

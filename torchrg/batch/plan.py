@@ -7,8 +7,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrg.batch.done import reason_to_convert
 from torchrg.batch.memory import memory_of_scan
+from torchrg.batch.records import reason_to_convert
 from torchrg.batch.scans import Job, Source
 from torchrg.errors import ConfigError, FormatError
 

@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.done import read_record
 from torchrg.batch.plan import Plan
-from torchrg.batch.provenance import describe_versions
+from torchrg.batch.records import describe_versions, read_record
 from torchrg.batch.scans import Job
 
 STAGES = ("hash", "read", "neighbors", "normals", "regions", "planes", "write", "record")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import tyro
 
-from torchrg.batch.provenance import describe_run
+from torchrg.batch.records import describe_run
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrg.errors import FormatError
-from torchrg.io.atomic import check_place
-from torchrg.report import color_planes, render_cloud, write_png
+from torchrg.io.files import check_place
+from torchrg.render import color_planes, render_cloud, write_png
 from torchrg.structures import Cloud, Segmentation
 
 

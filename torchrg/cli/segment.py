@@ -10,7 +10,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.provenance import describe_run
+from torchrg.batch.records import describe_run
 from torchrg.cli import depth
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, settings_asked_for, warn
 from torchrg.cli.picture import draw_segmentation, picture_paths

@@ -12,7 +12,7 @@ from torchrg.cli.console import parse
 from torchrg.cli.picture import check_picture
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud
-from torchrg.report import (
+from torchrg.render import (
     color_curvature,
     color_normals,
     color_planes,

@@ -20,16 +20,13 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
 * ``collate_offset(samples)`` joins samples into a ragged batch.
 """
 
-from torchrg.datasets.annotations import Repair
 from torchrg.datasets.collate import collate_offset
-from torchrg.datasets.folder import FolderOfClouds
-from torchrg.datasets.plane_table import describe_planes
-from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
+from torchrg.datasets.folder import FolderOfClouds, Scene
+from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrames
-from torchrg.datasets.rgbd_frame import RGBDFrame
-from torchrg.datasets.rooms import CLASS_ORDERS, Room, RoomReport, Skipped, read_room
+from torchrg.datasets.rgbd_layouts import RGBDFrame
+from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
 from torchrg.datasets.s3dis import S3DIS
-from torchrg.datasets.scene_list import Scene
 
 __all__ = [
     "CLASS_ORDERS",

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchrg.datasets.rgbd_frame import RGBDFrame
-from torchrg.datasets.rgbd_images import read_color, read_depth
-from torchrg.datasets.rgbd_layouts import LAYOUTS
-from torchrg.datasets.scene_list import Scene
+from torchrg.datasets.folder import Scene
+from torchrg.datasets.rgbd_files import read_color, read_depth
+from torchrg.datasets.rgbd_layouts import LAYOUTS, RGBDFrame
 from torchrg.errors import ConfigError
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrg.datasets.annotations import Repair
-from torchrg.datasets.rooms import Room, RoomReport, Skipped, class_names, read_room
-from torchrg.datasets.scene_list import Scene
+from torchrg.datasets.folder import Scene
+from torchrg.datasets.rooms import Repair, Room, RoomReport, Skipped, class_names, read_room
 from torchrg.errors import FormatError
 from torchrg.io.npy import map_array
 

@@ -10,9 +10,15 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from torchrg.datasets.folder import Scene, listed
 from torchrg.datasets.room_cache import USER_CACHE, read_cached_room
-from torchrg.datasets.rooms import ANNOTATIONS, Room, class_names, list_room, read_room
-from torchrg.datasets.scene_list import Scene, listed
+from torchrg.datasets.rooms import (
+    ANNOTATIONS,
+    Room,
+    _object_files,
+    class_names,
+    read_room,
+)
 from torchrg.errors import ConfigError, FormatError
 
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
@@ -119,11 +125,3 @@ def _scenes_of_area(root: Path, area: int) -> list[Scene]:
             stacklevel=3,
         )
     return [Scene(f"{folder.name}/{room.name}", room, _object_files(room)) for room in rooms]
-
-
-def _object_files(room: Path) -> tuple[Path, ...]:
-    """Return the files of a room's objects; none of a broken room, which fails when it is read."""
-    try:
-        return tuple(file for _, file in list_room(room).objects)
-    except FormatError:
-        return ()

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.atomic import atomic_path, check_place
 from torchrg.io.e57 import check_e57, read_e57, write_e57
 from torchrg.io.fields import checked_coordinates
-from torchrg.io.files import check_file
+from torchrg.io.files import atomic_path, check_file, check_place
 from torchrg.io.las import check_las, read_las, write_las
 from torchrg.io.npy import (
     cloud_arrays,

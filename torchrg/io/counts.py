@@ -8,7 +8,7 @@ from typing import IO, BinaryIO
 from numpy.lib import format as npy_format
 
 from torchrg.errors import FormatError
-from torchrg.io import pcd_header, ply_header
+from torchrg.io import pcd, ply
 from torchrg.io.files import DAMAGES
 
 TEXT_SAMPLE = 1 << 16
@@ -53,10 +53,10 @@ def _count(path: Path, stream: BinaryIO, size: int) -> int:
             with archive.open(name) as member:
                 return _length_of_array(member)
     if suffix == ".ply":
-        elements = ply_header.read_header(path, stream).elements
+        elements = ply.read_header(path, stream).elements
         return next(element.num_records for element in elements if element.name == "vertex")
     if suffix == ".pcd":
-        header = pcd_header.read_header(path, stream)
+        header = pcd.read_header(path, stream)
         return header.width * header.height
     if suffix in (".las", ".laz"):
         head = stream.read(LAS14_COUNT + 8)

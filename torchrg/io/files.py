@@ -1,9 +1,104 @@
-"""What is checked about a file before anything is read from it."""
+"""Files: checked before they are read, and written whole or not at all."""
 
+import errno
+import os
+import re
+import secrets
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from torchrg.errors import FormatError
+
+_BESIDE = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a path to write to that takes the place of ``path`` once the block has ended well.
+
+    The file is written beside its final place, flushed to the disk, and moved there in one step. If
+    the block raises, nothing is left behind and an older file stays as it was. The suffix is kept.
+
+    Args:
+        path: Where the file shall be. A symbolic link is followed.
+
+    Yields:
+        The path to write to, in the same folder.
+
+    Raises:
+        FormatError: If the folder does not exist, or the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "a.txt"
+        ...     with atomic_path(path) as beside:
+        ...         _ = beside.write_text("whole")
+        ...         print(path.exists())
+        ...     print(path.read_text())
+        False
+        whole
+    """
+    target = Path(os.path.realpath(path))
+    beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    check_place(path)
+    try:
+        yield beside
+        with beside.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        beside.replace(target)
+    except OSError as error:
+        known = _with_number(error)
+        reason = known.strerror or known
+        raise FormatError(f"{path}: cannot be written: {reason}.") from known
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _with_number(error: OSError) -> OSError:
+    """Return NumPy's error of a short write, which comes without its number, as a full disk's."""
+    if error.errno is None and "requested and" in str(error):
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    return error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what :func:`atomic_path` left in a folder when its process was killed.
+
+    Args:
+        folder: The folder; nothing else may be writing there. Folders in it are left alone.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     Path(folder, ".a.0123abcd.txt").touch()
+        ...     Path(folder, "a.txt").touch()
+        ...     remove_leftovers(Path(folder))
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['a.txt']
+    """
+    for path in folder.iterdir():
+        if _BESIDE.fullmatch(path.name):
+            path.unlink()
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Check that a file can be put at a path: its folder exists, and it is no directory itself.
+
+    Args:
+        path: Where a file shall be.
+
+    Raises:
+        FormatError: If it cannot.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
+    if not target.parent.is_dir():
+        raise FormatError(f"{path}: there is no folder {target.parent}; make it first.")
+
 
 # What libraries raise on damaged files beside their own errors, found by flipping bytes.
 DAMAGES = (

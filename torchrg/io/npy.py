@@ -20,10 +20,15 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.atomic import atomic_path
-from torchrg.io.columns import Spelling, check_length, flatten_cloud
-from torchrg.io.fields import assemble_cloud, cloud_of, name_columns
-from torchrg.io.files import DAMAGES, check_file, check_promise, first_line
+from torchrg.io.fields import (
+    Spelling,
+    assemble_cloud,
+    check_length,
+    cloud_of,
+    flatten_cloud,
+    name_columns,
+)
+from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, first_line
 from torchrg.structures import Cloud
 
 COORDINATES = ("points", "coord")

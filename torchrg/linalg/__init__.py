@@ -5,10 +5,9 @@ the last bit wherever an element stands in a tensor, so results do not depend on
 the number of threads. Vectorised ``acos`` or ``cos`` do not promise that.
 """
 
-from torchrg.linalg.angles import sq_chord_to_deg, unsigned_angle_deg
-from torchrg.linalg.eigen import eigh3, eigh3_of_few, smallest_eigenvector3
-from torchrg.linalg.indicators import above, at_most, signs
-from torchrg.linalg.moments import covariance, rank_tolerance
+from torchrg.linalg.angles import above, at_most, signs, sq_chord_to_deg, unsigned_angle_deg
+from torchrg.linalg.eigen import eigh3, eigh3_of_few, rank_tolerance, smallest_eigenvector3
+from torchrg.linalg.moments import covariance
 
 __all__ = [
     "above",

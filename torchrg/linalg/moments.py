@@ -1,26 +1,12 @@
-"""Covariances of many small sets of points, and when a direction of one counts as flat."""
+"""Means and covariances: of small neighbourhoods, of weighted columns, of regions."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
-
-
-def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
-    """Return the singular value, relative to the largest, at which a direction counts as flat.
-
-    Args:
-        num_values: Number of points (or rows) that went into the matrix.
-        dtype: Working precision.
-
-    Returns:
-        ``max(num_values, 3) * eps``.
-
-    Example:
-        >>> rank_tolerance(50, torch.float64) < 1e-13
-        True
-    """
-    return max(num_values, 3) * torch.finfo(dtype).eps
+from torchrg.linalg.eigen import smallest_eigenvector3
 
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -79,3 +65,181 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
     if mask is not None:
         center = torch.where(mask.any(dim=-1, keepdim=True), center, 0.0)
     return center, torch.stack(rows, dim=-2)
+
+
+def coordinate_resolution(points: Tensor) -> Tensor:
+    """Return the rounding of coordinate differences at each point, shape ``(N,)``.
+
+    Example:
+        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
+        tensor([True])
+    """
+    return points.abs().amax(dim=-1) * (4 * torch.finfo(points.dtype).eps)
+
+
+Columns = tuple[Tensor, Tensor, Tensor]
+
+
+def split_columns(patches: Tensor) -> Columns:
+    """Return the coordinates of patches ``(n, K, 3)`` as contiguous columns ``(n, K)``."""
+    x, y, z = patches.unbind(dim=-1)
+    return x.contiguous(), y.contiguous(), z.contiguous()
+
+
+def sq_lengths(columns: Columns) -> Tensor:
+    """Return the squared distance of each neighbour, shape ``(n, K)``."""
+    x, y, z = columns
+    return x * x + y * y + z * z
+
+
+def residuals(columns: Columns, normals: Tensor, offsets: Tensor) -> Tensor:
+    """Return signed distances of the neighbours to planes ``normal . q = offset``, ``(n, K)``.
+
+    Example:
+        >>> columns = split_columns(torch.tensor([[[0.0, 0, 0], [1, 2, 3]]]))
+        >>> residuals(columns, torch.tensor([[0.0, 0, 1]]), torch.tensor([1.0]))
+        tensor([[-1.,  2.]])
+    """
+    return along(columns, normals).sub_(offsets[:, None])
+
+
+def along(columns: Columns, axes: Tensor) -> Tensor:
+    """Return coordinates of the neighbours along axes ``(*, n, 3)``, shape ``(*, n, K)``."""
+    x, y, z = columns
+    a, b, c = (part[..., None] for part in axes.unbind(dim=-1))
+    # Products and sums apart: a fused multiply-add may round differently at the end of a block.
+    return (x * a).add_(y * b).add_(z * c)
+
+
+def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit a plane to each weighted neighbourhood by least squares.
+
+    Args:
+        columns: Coordinates about each point.
+        weights: Weights, shape ``(n, K)``, not negative.
+
+    Returns:
+        Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset``, and the
+        eigenvalues of the weighted covariance ``(n, 3)``, ascending.
+
+    Example:
+        >>> square = torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [5, 5, 5]]])
+        >>> normals, offsets, _ = fit_planes(
+        ...     split_columns(square), torch.tensor([[1.0, 1, 1, 0]])
+        ... )
+        >>> normals.abs(), offsets.abs()
+        (tensor([[0., 0., 1.]]), tensor([1.]))
+    """
+    means, covariance = _moments(columns, weights)
+    values, normals = smallest_eigenvector3(covariance)
+    return normals, (normals * means).sum(dim=-1), values
+
+
+def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """Fit a plane to each of several groups of the neighbours; see :func:`fit_planes`.
+
+    Args:
+        columns: Coordinates about each point.
+        groups: Weights of each group, shape ``(n, K)``.
+
+    Returns:
+        Unit normals ``(n, 3)`` and offsets ``(n,)`` for each group.
+
+    Example:
+        >>> square = torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]])
+        >>> groups = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
+        >>> [normals.abs() for normals, _ in fit_planes_to_each(split_columns(square), groups)]
+        [tensor([[0., 0., 1.]]), tensor([[0., 1., 0.]])]
+    """
+    means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
+    normals = smallest_eigenvector3(torch.stack(covariances))[1]
+    offsets = (normals * torch.stack(means)).sum(dim=-1)
+    return list(zip(normals.unbind(), offsets.unbind(), strict=True))
+
+
+def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean ``(n, 3)`` and covariance ``(n, 3, 3)`` of each neighbourhood."""
+    total = weights.sum(dim=1)
+    share = weights / torch.where(total > 0, total, 1.0)[:, None]
+    means = [(share * column).sum(dim=1) for column in columns]
+    x, y, z = (column - mean[:, None] for column, mean in zip(columns, means, strict=True))
+    sx, sy, sz = share * x, share * y, share * z
+    xx, xy, xz = (sx * x).sum(dim=1), (sx * y).sum(dim=1), (sx * z).sum(dim=1)
+    yy, yz, zz = (sy * y).sum(dim=1), (sy * z).sum(dim=1), (sz * z).sum(dim=1)
+    rows = [torch.stack(row, dim=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+    return torch.stack(means, dim=-1), torch.stack(rows, dim=-2)
+
+
+class Segments:
+    """The points of each region side by side, in the order of their rows.
+
+    Sums run over one region after the other, never by atomic additions, so they do not depend on
+    threads or device scheduling.
+
+    Args:
+        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
+
+    Example:
+        >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
+        >>> segments.counts.tolist(), segments.rows.tolist()
+        ([1, 2], [1, 0, 3])
+        >>> segments.mean(segments.take(torch.tensor([1.0, 2.0, 9.0, 3.0]))).tolist()
+        [2.0, 2.0]
+    """
+
+    def __init__(self, labels: Tensor) -> None:
+        ascending, rows = labels.sort(stable=True)
+        num_unlabeled = int(torch.searchsorted(ascending, 0))
+        self.rows = rows[num_unlabeled:]
+        self.labels = ascending[num_unlabeled:].long()
+        self.counts = torch.bincount(self.labels)
+
+    def take(self, values: Tensor) -> Tensor:
+        """Return the values of the points that have a region, region by region."""
+        return values.index_select(0, self.rows)
+
+    def first(self, values: Tensor) -> Tensor:
+        """Return the value of the first point of each region."""
+        return values[self.rows[self.counts.cumsum(0) - self.counts]]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Return for each point, in the order of :meth:`take`, the value of its region."""
+        return values.index_select(0, self.labels)
+
+    def take_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
+        return [self.take(column).double() for column in vectors.unbind(dim=1)]
+
+    def spread_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Return the three columns of :meth:`spread` of vectors ``(M, 3)``."""
+        return [self.spread(column) for column in vectors.unbind(dim=1)]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Return the sum of each region's values, given in the order of :meth:`take`."""
+        return self._reduce(values, "sum")
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the mean of each region's values."""
+        return self.sum(values) / self.counts
+
+    def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest value of each region."""
+        return self._reduce(values, "min"), self._reduce(values, "max")
+
+    def first_of_each(self, chosen: Tensor) -> Tensor:
+        """Return the place of the first chosen value of each region that has one."""
+        places = chosen.nonzero().squeeze(1)
+        owner = self.labels[places]
+        is_first = torch.ones_like(owner, dtype=torch.bool)
+        is_first[1:] = owner[1:] != owner[:-1]
+        return places[is_first]
+
+    def median(self, values: Tensor) -> Tensor:
+        """Return the median of each region's values, the lower one of an even number."""
+        parts = torch.split(values, self.counts.tolist())
+        return torch.stack([part.median() for part in parts]) if parts else values
+
+    def _reduce(self, values: Tensor, how: str) -> Tensor:
+        if len(self.counts) == 0:
+            return values[:0]
+        return torch.segment_reduce(values.contiguous(), how, lengths=self.counts)

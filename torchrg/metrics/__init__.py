@@ -4,16 +4,17 @@
 are in :mod:`torchrg.metrics.modules`, which needs the extra ``metrics``.
 """
 
-from torchrg.metrics.agreement import (
+from torchrg.metrics.catalog import METRICS, Index
+from torchrg.metrics.clusters import ClusterScore, score_clusters
+from torchrg.metrics.contingency import ContingencyTable, contingency_table
+from torchrg.metrics.labels import (
+    LabelScore,
     adjusted_rand_index,
+    match_regions,
     normalized_mutual_information,
+    score_labels,
     segmentation_covering,
 )
-from torchrg.metrics.catalog import METRICS, Index
-from torchrg.metrics.contingency import ContingencyTable, contingency_table
-from torchrg.metrics.external import LabelScore, score_labels
-from torchrg.metrics.internal import ClusterScore, score_clusters
-from torchrg.metrics.matching import match_regions
 from torchrg.metrics.normals import NormalScore, score_normals
 from torchrg.metrics.protocols import EvopsScore, SegCompCounts, count_segcomp, score_evops
 

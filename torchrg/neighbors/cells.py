@@ -6,26 +6,152 @@ only if no point outside the cells can be nearer; the tree answers for the other
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrg._chunks import run_chunks
-from torchrg._take import take
-from torchrg.neighbors.cell_grid import (
-    WIDTH_STEP,
-    CellGrid,
-    list_candidates,
-    make_grid,
-    run_starts,
-)
-from torchrg.neighbors.selection import (
-    MAX_CANDIDATES,
-    select_smallest,
-    sort_by_distance,
-    sq_distances_between,
-)
+from torchrg._parallel import run_chunks, take
+
+_FAR = 1e6
+"""Distance of what fills up rows of candidates, in extents of the cloud."""
+
+WIDTH_STEP = 64
+"""Rows of candidates are filled up to a multiple of this."""
+
+
+class CellGrid(NamedTuple):
+    """A cloud sorted by cells; places are positions in that order.
+
+    Attributes:
+        columns: Coordinates by place, and a last one far away, each shape ``(N + 1,)``.
+        rows: Row of each place, shape ``(N + 1,)``.
+        asked: Places to answer for, ascending, shape ``(n,)``.
+        first_asked: First of each asked cell in ``asked``, shape ``(C,)``.
+        num_asked: Number of them, shape ``(C,)``.
+        centers: Centres of the asked cells, shape ``(3, C)``.
+        starts: First place of each of the nine columns of three cells about a cell, ``(C, 9)``.
+        lengths: Number of points in each, shape ``(C, 9)``.
+        size: Side of a cell.
+    """
+
+    columns: list[NDArray[np.float64]]
+    rows: NDArray[np.int32]
+    asked: NDArray[np.int64]
+    first_asked: NDArray[np.int64]
+    num_asked: NDArray[np.int64]
+    centers: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    size: float
+
+
+def make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64]) -> CellGrid:
+    """Sort a cloud by cells, and list those around each cell that holds an asked row."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    far = low + _FAR * (high - low).max()
+    cell = np.floor((points - low) / size).astype(np.int64) + 1
+    _, width, height = (int(count) + 2 for count in cell.max(axis=0))
+    keys = (cell[:, 0] * width + cell[:, 1]) * height + cell[:, 2]
+    order = np.argsort(keys)
+    keys = keys[order]
+    first = run_starts(keys)
+    cell_keys, ends = keys[first], np.append(first, len(points))
+    is_asked = np.zeros(len(points), dtype=bool)
+    is_asked[rows] = True
+    asked = np.flatnonzero(is_asked[order])
+    first_asked = run_starts(keys[asked])
+    own = asked[first_asked]
+    # Cells that differ in z alone have consecutive keys: three of them are one range.
+    around = np.array([x * width + y for x in (-1, 0, 1) for y in (-1, 0, 1)]) * height
+    starts = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around - 1))]
+    stops = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around + 2))]
+    return CellGrid(
+        columns=[np.append(points[order, axis], far[axis]) for axis in range(3)],
+        rows=np.append(order, -1).astype(np.int32),
+        asked=asked,
+        first_asked=first_asked,
+        num_asked=np.diff(first_asked, append=len(asked)),
+        centers=(low + (cell[order[own]] - 0.5) * size).T.copy(),
+        starts=starts,
+        lengths=stops - starts,
+        size=size,
+    )
+
+
+def run_starts(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where runs of equal values begin."""
+    return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else values
+
+
+def list_candidates(grid: CellGrid, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the places of all points about each cell, the rest of a row the place far away."""
+    starts, lengths = grid.starts[cells].ravel(), grid.lengths[cells].ravel()
+    total = grid.lengths[cells].sum(axis=1)
+    before = np.cumsum(lengths) - lengths
+    width = -(-int(total.max()) // WIDTH_STEP) * WIDTH_STEP
+    places = np.full((len(cells), width), len(grid.rows) - 1)
+    places[np.arange(width) < total[:, None]] = np.arange(total.sum()) + np.repeat(
+        starts - before, lengths
+    )
+    return places
+
+
+MAX_CANDIDATES = 512
+"""What NumPy sorts without a branch (AVX-512)."""
+
+_POSITION = MAX_CANDIDATES - 1
+
+
+def sq_distances_between(
+    queries: NDArray[np.float32], candidates: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return squared distances from ``(C, Q, 3)`` to ``(C, 3, W)``, shape ``(C, Q, W)``."""
+    lengths = (candidates * candidates).sum(axis=1, keepdims=True)
+    product = torch.baddbmm(
+        torch.from_numpy(lengths), torch.from_numpy(queries), torch.from_numpy(candidates), alpha=-2
+    )
+    result: NDArray[np.float32] = product.numpy()
+    result += (queries * queries).sum(axis=2)[:, :, None]
+    return result
+
+
+def select_smallest(
+    sq_distances: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return where the smallest values of each row are, and what the others are not below.
+
+    The last bits of a value give way to its position: one sort does for both.
+    """
+    keys = sq_distances.view(np.int32)
+    keys &= ~_POSITION
+    keys |= np.arange(keys.shape[1], dtype=np.int32)
+    keys.sort(axis=1)
+    bound = (keys[:, count] & ~_POSITION).view(np.float32)
+    return (keys[:, :count] & _POSITION).astype(np.int64), bound.astype(np.float64)
+
+
+def sort_by_distance(
+    distances: NDArray[np.float64], rows: NDArray[np.int32], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the k nearest by (distance, row)."""
+    num_rows, count = distances.shape
+    position = np.int64(2 ** (count - 1).bit_length() - 1)
+    keys = distances.view(np.int64) & ~position
+    keys |= np.arange(count)
+    keys.sort(axis=1)
+    order = keys & position
+    order += (np.arange(num_rows) * count)[:, None]
+    distances, rows = take(distances.reshape(-1), order), take(rows.reshape(-1), order)
+    keys &= ~position
+    if (keys[:, 1:] == keys[:, :-1]).any():
+        tied = np.flatnonzero((keys[:, 1:] == keys[:, :-1]).any(axis=1))
+        by_both = np.lexsort((rows[tied], distances[tied]))
+        distances[tied] = np.take_along_axis(distances[tied], by_both, axis=1)
+        rows[tied] = np.take_along_axis(rows[tied], by_both, axis=1)
+    return distances[:, :k], rows[:, :k]
+
 
 Store = Callable[[NDArray[np.integer], NDArray[np.float64], NDArray[np.integer]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""

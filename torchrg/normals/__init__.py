@@ -12,19 +12,18 @@ from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals.consensus import estimate_consensus
-from torchrg.normals.detmcd import fit_normals_detmcd
-from torchrg.normals.irls import fit_normals_irls
+from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
+from torchrg.normals.paper import estimate_paper, find_sharp_points
+from torchrg.normals.patches import Estimator, at_all_points
 from torchrg.normals.pca import fit_normals_pca
-from torchrg.normals.robust_fits import (
+from torchrg.normals.robust import (
+    fit_normals_detmcd,
     fit_normals_detmm,
     fit_normals_fastmcd,
     fit_normals_mve,
 )
-from torchrg.normals.sharp import find_sharp_points
-from torchrg.normals.single import Estimator, at_all_points, estimate_irls
-from torchrg.normals.staged import estimate_paper
 from torchrg.structures import Neighbors, NormalFit
 
 __all__ = [

@@ -1,17 +1,135 @@
 """Quadratic height fields: normals and curvatures of curved surfaces."""
 
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrg.linalg import rank_tolerance
-from torchrg.normals.frame import PrincipalFrame, root
-from torchrg.normals.least_squares import least_squares
+from torchrg.linalg.eigen import PrincipalFrame, root
+from torchrg.linalg.moments import Columns, along, sq_lengths
+from torchrg.normals.patches import about_query
 from torchrg.normals.pca import check_patches, fit_plane, patch_resolution
-from torchrg.normals.query import about_query
-from torchrg.normals.shape_operator import principal_curvatures, shape_operator
 from torchrg.structures import NormalFit
+
+
+def least_squares(
+    columns: Sequence[tuple[Tensor, Tensor | float]], target: Tensor
+) -> tuple[list[Tensor], Tensor]:
+    """Fit a target by columns, and leave out columns that depend on the ones before.
+
+    Modified Gram-Schmidt with the target as the last column: as accurate as Householder's QR, and
+    made of sums of products only, so it runs batched on any device and gradients flow.
+
+    Args:
+        columns: Columns, shape ``(*, K)``, each with the share of its length, a number or shape
+            ``(*, 1)``, that must be left after the columns before it are taken out.
+        target: Shape ``(*, K)``.
+
+    Returns:
+        The coefficient of each column, shape ``(*, 1)``, 0 where it is left out, and the residual,
+        shape ``(*, K)``.
+
+    Example:
+        >>> one, x = torch.ones(3), torch.tensor([0.0, 1.0, 2.0])
+        >>> (a, b), _ = least_squares([(one, 1e-6), (x, 1e-6)], 2 * x + 1)
+        >>> a.round(decimals=4), b.round(decimals=4)
+        (tensor([1.]), tensor([2.]))
+    """
+    basis: list[Tensor] = []
+    mixing: list[list[Tensor]] = []
+    for column, share in columns:
+        rest, mix = column, []
+        for direction in basis:
+            mix.append((direction * rest).sum(dim=-1, keepdim=True))
+            rest = rest - mix[-1] * direction
+        sq_rest = (rest * rest).sum(dim=-1, keepdim=True)
+        kept = sq_rest > share * share * (column * column).sum(dim=-1, keepdim=True)
+        length = torch.where(kept, sq_rest, 1.0).sqrt()
+        basis.append(torch.where(kept, rest / length, 0.0))
+        mixing.append([*mix, length])
+    projections = []
+    for direction in basis:
+        projections.append((direction * target).sum(dim=-1, keepdim=True))
+        target = target - projections[-1] * direction
+    coefficients: list[Tensor] = []
+    for row in reversed(range(len(basis))):
+        known = sum(
+            (mixing[row + 1 + i][row] * c for i, c in enumerate(coefficients)),
+            start=torch.zeros_like(projections[row]),
+        )
+        coefficients.insert(0, (projections[row] - known) / mixing[row][row])
+    return coefficients, target
+
+
+def shape_operator(
+    slope_u: Tensor, slope_v: Tensor, uu: Tensor, uv: Tensor, vv: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the normal of a height field and how it turns along two tangents.
+
+    Args:
+        slope_u: First derivative along u, shape ``(*)``.
+        slope_v: First derivative along v.
+        uu: Second derivative along u.
+        uv: Mixed derivative.
+        vv: Second derivative along v.
+
+    Returns:
+        Unit normal with positive height, shape ``(*, 3)``; entries aa, ab, bb of the shape operator
+        in an orthonormal basis of tangents a and b, shape ``(*, 3)``; that basis, ``(*, 2, 3)``.
+
+    Example:
+        >>> zero, one = torch.zeros(()), torch.ones(())
+        >>> shape_operator(zero, zero, 2 * one, zero, one)[1]
+        tensor([2., 0., 1.])
+    """
+    one = torch.ones_like(slope_u)
+    gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()
+    normal = torch.stack([-slope_u, -slope_v, one], dim=-1) / gradient[..., None]
+    length = (slope_u * slope_u + 1).sqrt()
+    first = torch.stack([one, torch.zeros_like(one), slope_u], dim=-1) / length[..., None]
+    second = torch.linalg.cross(normal, first)
+    au, bu, bv = first[..., 0], second[..., 0], second[..., 1]
+    aa = au * au * uu
+    ab = au * (bu * uu + bv * uv)
+    bb = bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv
+    shape = torch.stack([aa, ab, bb], dim=-1) / gradient[..., None]
+    return normal, shape, torch.stack([first, second], dim=-2)
+
+
+def principal_curvatures(shape: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the eigenvalues of shape operators, larger first, and their directions.
+
+    Args:
+        shape: Entries aa, ab, bb, shape ``(*, 3)``.
+        tangents: The tangents a and b, shape ``(*, 2, 3)``.
+
+    Returns:
+        Curvatures, shape ``(*, 2)``, and unit directions, shape ``(*, 2, 3)``, without gradient.
+
+    Example:
+        >>> principal_curvatures(torch.tensor([1.0, 1.0, 1.0]), torch.eye(3)[:2])[0]
+        tensor([2., 0.])
+    """
+    aa, ab, bb = shape.unbind(dim=-1)
+    middle, half = (aa + bb) / 2, (aa - bb) / 2
+    radius = root(half * half + ab * ab)
+    values = torch.stack([middle + radius, middle - radius], dim=-1)
+    with torch.no_grad():
+        # Of the two rows of (S - k1), the longer one is orthogonal to the first direction.
+        along = torch.where(half >= 0, half + radius, ab)
+        across = torch.where(half >= 0, ab, radius - half)
+        size = root(along * along + across * across)
+        round_ = size == 0
+        along = torch.where(round_, 1.0, along / torch.where(round_, 1.0, size))
+        across = torch.where(round_, 0.0, across / torch.where(round_, 1.0, size))
+        first = torch.stack([along, across], dim=-1)
+        second = torch.stack([-across, along], dim=-1)
+        directions = torch.stack([first, second], dim=-2) @ tangents
+    return values, directions
+
 
 _NUM_TERMS = 6
 
@@ -182,3 +300,97 @@ def _fit_height(
     units = (torch.ones_like(p), p, q, p * p, p * q, q * q)
     terms = [(c / unit).squeeze(-1) for c, unit in zip(coefficients, units, strict=True)]
     return terms, residual
+
+
+_NUM_COEFFICIENTS = 6
+_FLAT_PIVOT = 1e-5
+
+
+def fit_paraboloids(
+    columns: Columns, normals: Tensor, counted: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Fit ``h(u, v) = a + b u + c v + d u^2 + e u v + f v^2`` over a plane through each point.
+
+    The normal at the point is that of the height field at ``u = v = 0``: a 2-jet [1], by normal
+    equations. Terms that the neighbours cannot tell from the ones before, as on two scan lines,
+    are left out.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        normals: Directions of the heights, shape ``(n, 3)``, within some 60 degrees of the surface
+            normal.
+        counted: Weights 0 or 1, shape ``(n, K)``.
+
+    Returns:
+        Unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``, and
+        standard deviations of the residuals ``(n,)``: root of their sum of squares by the number of
+        points less six.
+
+    References:
+        [1] F. Cazals, M. Pouget. Estimating differential quantities using polynomial fitting of
+        osculating jets. Computer Aided Geometric Design 22, 2005.
+
+    Example:
+        >>> from torchrg.linalg.moments import split_columns
+        >>> grid = torch.cartesian_prod(torch.arange(-2.0, 3), torch.arange(-2.0, 3))
+        >>> bowl = torch.cat([grid, grid.square().sum(dim=1, keepdim=True)], dim=1)[None]
+        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
+        >>> normals, _, deviations = fit_paraboloids(split_columns(bowl), up, torch.ones(1, 25))
+        >>> bool((normals - up).abs().max() < 1e-6), bool(deviations < 1e-5)
+        (True, True)
+    """
+    radius = sq_lengths(columns).mul_(counted).amax(dim=1).sqrt_()
+    scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None]
+    first, second = _tangents(normals)
+    u, v, height = (along(columns, axis) * scale for axis in (first, second, normals))
+    terms = [counted, u * counted, v * counted, u * u * counted, u * v * counted, v * v * counted]
+    matrix = {
+        (j, i): (terms[i] * terms[j]).sum(dim=1)
+        for i, j in combinations_with_replacement(range(_NUM_COEFFICIENTS), 2)
+    }
+    a, b, c, *bend = _solve(matrix, [(term * height).sum(dim=1) for term in terms])
+    rest = height * counted
+    for coefficient, term in zip((a, b, c, *bend), terms, strict=True):
+        rest = rest.sub_(term * coefficient[:, None])
+    freedom = (counted.sum(dim=1) - _NUM_COEFFICIENTS).clamp_(min=1)
+    deviations = (rest.square_().sum(dim=1) / freedom).sqrt_() * radius
+    length = (1 + b * b + c * c).sqrt_()
+    tilted = normals - b[:, None] * first - c[:, None] * second
+    return tilted / length[:, None], a * radius / length, deviations
+
+
+def _tangents(normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two unit vectors that complete each normal to an orthonormal frame [Duff 2017]."""
+    x, y, z = normals.unbind(dim=-1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(normals.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
+    return first, torch.stack([b, sign + y * y * a, -y], dim=-1)
+
+
+def _solve(matrix: dict[tuple[int, int], Tensor], right: list[Tensor]) -> list[Tensor]:
+    """Solve positive semi-definite systems by LDL^T; a term without a pivot of its own gets 0."""
+    size = len(right)
+    lower: dict[tuple[int, int], Tensor] = {}
+    inverse: list[Tensor] = []
+    for j in range(size):
+        column = {i: matrix[i, j] for i in range(j, size)}
+        for k in range(j):
+            scaled = lower[j, k] * inverse[k]
+            for i in range(j, size):
+                column[i] = column[i] - lower[i, k] * scaled
+        usable = column[j] > _FLAT_PIVOT * matrix[j, j]
+        inverse.append(torch.where(usable, 1 / torch.where(usable, column[j], 1.0), 0.0))
+        lower.update({(i, j): column[i] for i in range(j, size)})
+    forward: list[Tensor] = []
+    for i in range(size):
+        value = right[i]
+        for k in range(i):
+            value = value - lower[i, k] * forward[k]
+        forward.append(value * inverse[i])
+    solution: list[Tensor] = forward
+    for i in reversed(range(size)):
+        for k in range(i + 1, size):
+            solution[i] = solution[i] - lower[k, i] * inverse[i] * solution[k]
+    return solution

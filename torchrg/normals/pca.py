@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg import covariance, eigh3, rank_tolerance
-from torchrg.normals.chunks import coordinate_resolution
-from torchrg.normals.frame import PrincipalFrame, principal_frame, root
+from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
+from torchrg.linalg.moments import coordinate_resolution
 from torchrg.structures import NormalFit
 
 

@@ -1,6 +1,7 @@
 """The accepted edges of a block of points: all criteria, the cheap ones first."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -8,19 +9,234 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._take import places_of
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import chunks_of, places_of, run_chunks
 from torchrg.config import GrowingConfig
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import gather_patches
-from torchrg.regions.cloud import GrowingCloud
 from torchrg.regions.criteria import (
     coplanarity_limits,
+    neighborhood_radii,
     patch_radii,
     plane_residuals,
     sq_chord_limit,
     sq_chords,
 )
-from torchrg.regions.graph import EdgeBlock
-from torchrg.regions.sharing import SharedNeighbors
+from torchrg.regions.shared_neighbors import SharedNeighbors
+from torchrg.structures import Neighbors
+
+_BLOCKS_A_THREAD = 4
+"""Blocks found before any is stored: threads wait for each other only so often."""
+
+
+class EdgeLists(NamedTuple):
+    """Edges of a directed graph in compressed rows.
+
+    Attributes:
+        starts: The edges of point i are ``starts[i]`` to ``starts[i + 1]``, shape ``(N + 1,)``.
+        targets: Targets (or codes of targets), shape ``(capacity,)``, of which ``starts[N]`` are
+            used: what is behind them is room for more.
+    """
+
+    starts: NDArray[np.signedinteger]
+    targets: NDArray[np.int32]
+
+
+class EdgeBlock(NamedTuple):
+    """The edges of a block of points.
+
+    Attributes:
+        targets: Targets (or codes) of accepted edges, in the order of points and columns, ``(E,)``.
+        counts: Number of edges of each point, shape ``(n,)``.
+    """
+
+    targets: NDArray[np.int32]
+    counts: NDArray[np.signedinteger]
+
+
+def pack_edges(
+    edges_of: Callable[[slice], EdgeBlock],
+    num_points: int,
+    *,
+    capacity: int,
+    chunk_size: int,
+    device: torch.device,
+) -> EdgeLists:
+    """Collect the edges of successive blocks of points, several blocks at a time.
+
+    Args:
+        edges_of: Gives the edges of a block; called from as many threads as torch uses.
+        num_points: Number of points.
+        capacity: Length of the array of targets, at least the number of edges. Memory that is not
+            used is not touched.
+        chunk_size: Points of a block.
+        device: Where the edges are found; blocks run side by side only on a CPU.
+
+    Returns:
+        The lists, the same for every chunk size.
+
+    Example:
+        >>> def to_next(rows):
+        ...     targets = np.arange(rows.start, rows.stop, dtype=np.int32) + 1
+        ...     return EdgeBlock(targets, np.ones(len(targets), dtype=np.int64))
+        >>> lists = pack_edges(
+        ...     to_next, 3, capacity=5, chunk_size=2, device=torch.device("cpu")
+        ... )
+        >>> lists.starts.tolist(), lists.targets[:3].tolist()
+        ([0, 1, 2, 3], [1, 2, 3])
+    """
+    starts: NDArray[np.signedinteger]
+    starts = np.zeros(num_points + 1, dtype=np.int32 if capacity < 2**31 else np.int64)
+    targets = np.empty(capacity, dtype=np.int32)
+    chunks = chunks_of(num_points, chunk_size)
+    at_once = _BLOCKS_A_THREAD * max(torch.get_num_threads(), 1)
+    used = 0
+    found: dict[int, EdgeBlock] = {}
+
+    def find(rows: slice) -> None:
+        found[rows.start] = edges_of(rows)
+
+    for first in range(0, len(chunks), at_once):
+        group = chunks[first : first + at_once]
+        run_chunks(find, group, device)
+        for rows in group:
+            block = found.pop(rows.start)
+            targets[used : used + len(block.targets)] = block.targets
+            starts[rows.start + 1 : rows.stop + 1] = used + np.cumsum(block.counts)
+            used += len(block.targets)
+    return EdgeLists(starts, targets)
+
+
+class GrowingCloud(NamedTuple):
+    """What growth reads: a cloud in canonical order with everything known about its points.
+
+    Coordinates and normals are fast to gather when each column is contiguous.
+
+    Attributes:
+        points: Shape ``(N, 3)``.
+        normals: Unit normals, shape ``(N, 3)``.
+        curvature: Shape ``(N,)``.
+        neighbors: Neighbours of each point.
+        valid: Points that may belong to a region, shape ``(N,)``, bool.
+        colors: Shape ``(N, C)``, floating point, or None.
+        reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
+            where that is not known, or None.
+    """
+
+    points: Tensor
+    normals: Tensor
+    curvature: Tensor
+    neighbors: Neighbors
+    valid: Tensor
+    colors: Tensor | None = None
+    reach: Tensor | None = None
+
+
+def checked_cloud(
+    points: Tensor | NDArray[np.floating],
+    normals: Tensor | NDArray[np.floating],
+    curvature: Tensor | NDArray[np.floating],
+    neighbors: Neighbors,
+    valid: Tensor | None,
+    colors: Tensor | NDArray[np.generic] | None,
+) -> GrowingCloud:
+    """Check what the user passed to ``grow_regions``, and settle which points are valid.
+
+    Returns:
+        The cloud, in the order it came in, without ``reach``.
+
+    Raises:
+        ShapeError: If a shape, dtype or device is not as :func:`torchrg.grow_regions` says.
+    """
+    caller = "grow_regions"
+    points = as_tensor(caller, "points", points).detach()
+    normals = as_tensor(caller, "normals", normals).detach()
+    curvature = as_tensor(caller, "curvature", curvature).detach()
+    valid = None if valid is None else as_tensor(caller, "valid", valid)
+    colors = None if colors is None else as_tensor(caller, "colors", colors)
+    check_shapes(
+        caller,
+        points=(points, "N 3"),
+        normals=(normals, "N 3"),
+        curvature=(curvature, "N"),
+        neighbors=(neighbors.indices, "N K"),
+        neighbors_valid=(neighbors.valid, "N K"),
+        valid=(valid, "N"),
+        colors=(colors, "N C"),
+    )
+    check_floating(caller, points=points, normals=normals, curvature=curvature)
+    if valid is not None and valid.dtype != torch.bool:
+        raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
+    if neighbors.indices.device != points.device:
+        raise ShapeError(
+            f"{caller}: expected points and neighbors on one device, got {points.device} and "
+            f"{neighbors.indices.device}."
+        )
+    finite = normals.isfinite().all(dim=1) & curvature.isfinite()
+    valid = finite if valid is None else finite & valid
+    colors = None if colors is None else _by_column(colors.to(points.dtype))
+    return GrowingCloud(
+        _by_column(points), _by_column(normals), curvature, neighbors, valid, colors
+    )
+
+
+def reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
+    """Return the cloud with its points, and the rows its neighbours name, in another order.
+
+    Args:
+        cloud: The cloud.
+        order: Old row of each new one, shape ``(N,)``.
+    """
+    row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
+    row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
+    indices = cloud.neighbors.indices[order]
+    indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
+    mask = cloud.neighbors.valid
+    return GrowingCloud(
+        _by_column(cloud.points[order]),
+        _by_column(cloud.normals[order]),
+        cloud.curvature[order],
+        Neighbors(indices, None if mask is None else mask[order]),
+        cloud.valid[order],
+        None if cloud.colors is None else _by_column(cloud.colors[order]),
+        None if cloud.reach is None else cloud.reach[order],
+    )
+
+
+def plane_reach_of(
+    cloud: GrowingCloud, residual_rms: Tensor | NDArray[np.floating] | None, config: GrowingConfig
+) -> Tensor:
+    """Return how far from each point's plane a neighbour may be.
+
+    Args:
+        cloud: The cloud.
+        residual_rms: Root mean square distance of the neighbours from the planes, shape ``(N,)``.
+        config: Settings, with ``plane_reach``.
+
+    Returns:
+        Shape ``(N,)``: so many times the residual; infinite where the fit is exact, which is to say
+        that nothing is known of the noise.
+
+    Raises:
+        ConfigError: If the residuals are missing.
+        ShapeError: If their shape or dtype is not that of the points.
+    """
+    if residual_rms is None or config.plane_reach is None:
+        raise ConfigError(
+            "grow_regions: expected residual_rms, which plane_reach needs, got None; pass that of "
+            "the normals or set plane_reach to None."
+        )
+    caller = "grow_regions"
+    residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
+    check_shapes(caller, points=(cloud.points, "N 3"), residual_rms=(residual_rms, "N"))
+    check_floating(caller, points=cloud.points, residual_rms=residual_rms)
+    floor = config.coplanarity_floor * neighborhood_radii(cloud.points, cloud.neighbors)
+    return torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
+
+
+def _by_column(vectors: Tensor) -> Tensor:
+    """Return vectors ``(N, C)`` laid out column by column."""
+    return vectors.T.contiguous().T
 
 
 class AcceptedEdges(NamedTuple):

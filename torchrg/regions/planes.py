@@ -1,6 +1,9 @@
 """The plane table: one plane fitted to each region."""
 
+import json
+import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,14 +12,206 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
+from torchrg.linalg import eigh3_of_few
+from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
-from torchrg.regions.areas import covered_areas
-from torchrg.regions.extents import fit_rectangles
-from torchrg.regions.fitting import FittedPlanes, fit_planes, shared_moments, sum_of_products
-from torchrg.regions.kinds import classify_planes
-from torchrg.regions.outline import trace_outline
-from torchrg.regions.segments import Segments
-from torchrg.structures import Neighbors, PlaneAdjacency, Planes
+from torchrg.regions.measures import covered_areas, fit_rectangles, trace_outline
+from torchrg.robust.scale import MAD_FACTOR
+from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
+
+_BISQUARE_CUT = 4.685
+"""Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
+
+_NUM_ROUNDS = 4
+_FLAT_RATIO = 4.0
+"""Where one variance is not this many times the next smaller one, rounding and noise decide between
+their directions."""
+
+
+_SAME_MAGNITUDE = 1e-6
+"""Components of a normal that differ by less than this share are equal but for rounding."""
+
+
+class FittedPlanes(NamedTuple):
+    """Planes of M regions, in float64.
+
+    Attributes:
+        normal: Unit normals, shape ``(M, 3)``.
+        center: A point of each plane, the weighted mean, shape ``(M, 3)``.
+        along: Unit direction of largest variance in the plane, shape ``(M, 3)``.
+        covariance: Weighted covariance, shape ``(M, 3, 3)``.
+        thickness: Robust standard deviation of the points from the plane, shape ``(M,)``.
+        residuals: Signed distance of each point, in the order of :meth:`Segments.take`.
+    """
+
+    normal: Tensor
+    center: Tensor
+    along: Tensor
+    covariance: Tensor
+    thickness: Tensor
+    residuals: Tensor
+
+
+def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPlanes:
+    r"""Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
+
+    The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
+    (1.4826 times their median), so that points of another surface do not tilt the plane.
+
+    Args:
+        segments: The regions.
+        points: Points, shape ``(N, 3)``.
+        normals: Unit normals of any sign, shape ``(N, 3)``: they decide where points do not, in
+            regions of one or two points or along a line.
+
+    Returns:
+        The planes. The normal's component of largest magnitude, of equal ones the last, is
+        positive.
+
+    References:
+        [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [0.5, 0.5, 2.5]])
+        >>> segments = Segments(torch.zeros(5, dtype=torch.int64))
+        >>> fit_planes(segments, points, torch.eye(3)[[2] * 5]).normal.tolist()
+        [[0.0, 0.0, 1.0]]
+    """
+    usual = shared_moments(segments, normals)[1][:, :, 2]
+    origin = segments.first(points).double()
+    starts = segments.spread_columns(origin)
+    local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
+    resolution = origin.abs().amax(dim=1) * (4 * torch.finfo(points.dtype).eps)
+    weights = torch.ones_like(local[0])
+    for last in range(_NUM_ROUNDS):
+        mean = _means(segments, local, weights)
+        middle = segments.spread_columns(mean)
+        centered = [x - m for x, m in zip(local, middle, strict=True)]
+        covariance = _covariances(segments, centered, weights)
+        variances, axes = eigh3_of_few(covariance)
+        normal = _with_sign(_plane_normals(variances, axes, usual))
+        residuals = sum_of_products(centered, segments.spread_columns(normal))
+        thickness = MAD_FACTOR * segments.median(residuals.abs())
+        if last == _NUM_ROUNDS - 1:
+            break
+        cut = _BISQUARE_CUT * torch.maximum(thickness, resolution)
+        # A region of one place at the origin has cut 0: its residuals are 0 too.
+        ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
+        weights = (1 - ratio * ratio).clamp(min=0).square()
+    along = axes[:, :, 2]
+    return FittedPlanes(normal, origin + mean, along, covariance, thickness, residuals)
+
+
+def sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
+    """Return the scalar products of vectors given by columns."""
+    (a, b, c), (x, y, z) = first, second
+    return a * x + b * y + c * z
+
+
+def shared_moments(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return eigenvalues and eigenvectors of the normals' second moments, in ascending order.
+
+    The last eigenvector is the direction that the normals of a region share, signs aside.
+    """
+    columns = segments.take_columns(normals)
+    return eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
+
+
+def _means(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
+    """Return weighted means, shape ``(M, 3)``."""
+    total = segments.sum(weights)
+    return torch.stack([segments.sum(column * weights) / total for column in columns], dim=1)
+
+
+def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
+    """Return weighted second moments about zero, shape ``(M, 3, 3)``."""
+    total = segments.sum(weights)
+    weighted = [column * weights for column in columns]
+    entry = {
+        (i, j): segments.sum(weighted[i] * columns[j]) / total
+        for i in range(3)
+        for j in range(i, 3)
+    }
+    rows = [torch.stack([entry[min(i, j), max(i, j)] for j in range(3)], 1) for i in range(3)]
+    return torch.stack(rows, dim=1)
+
+
+def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
+    """Return the normals of planes, from the points' own normals where the points give none."""
+    low, middle, high = variances.unbind(dim=1)
+    along = axes[:, :, 2]
+    is_line = high > _FLAT_RATIO * middle
+    component = (usual * along).sum(dim=1, keepdim=True) * along
+    across = usual - torch.where(is_line[:, None], component, 0.0)
+    length = across.norm(dim=1, keepdim=True)
+    across = torch.where(length > 0, across / length, axes[:, :, 0])
+    is_flat = middle > _FLAT_RATIO * low
+    return torch.where(is_flat[:, None], axes[:, :, 0], across)
+
+
+def _with_sign(normals: Tensor) -> Tensor:
+    """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
+    magnitudes = normals.abs()
+    near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)
+    last = 2 - near.flip(1).to(torch.uint8).argmax(dim=1, keepdim=True)
+    return torch.where(normals.gather(1, last) < 0, -normals, normals)
+
+
+_MAX_TILT_DEG = 15.0
+_END_SHARE = 0.15
+"""A floor lies in this lowest share of the cloud's height, a ceiling in the highest."""
+
+_LEAST_AREA_SHARE = 0.1
+"""A floor or ceiling has at least this share of the largest horizontal plane's area."""
+
+_LEAST_WALL_SHARE = 0.5
+"""A wall reaches over at least this share of the cloud's height."""
+
+
+def classify_planes(planes: Planes, up: Tensor) -> Tensor:
+    """Return a simple class for each plane.
+
+    A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
+    planes take up, a ceiling in the highest, if it is not small beside the largest horizontal one.
+    A plane within 15 degrees of vertical is a wall if it takes up half of that height. What is
+    left, and what is curved, is "other". A single horizontal plane is a floor.
+
+    Args:
+        planes: The plane table.
+        up: The upward direction, shape ``(3,)``.
+
+    Returns:
+        Places in :data:`torchrg.structures.PLANE_KINDS`, shape ``(M,)``, int64.
+
+    Example:
+        >>> from torchrg.regions.planes import summarize_planes
+        >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
+        >>> cloud = torch.cat([grid, grid[:, [2, 1, 0]], grid + torch.tensor([0.0, 0, 19])])
+        >>> normals = torch.eye(3)[[2, 0, 2]].repeat_interleave(400, dim=0)
+        >>> planes = summarize_planes(cloud, normals, torch.arange(3).repeat_interleave(400))
+        >>> [PLANE_KINDS[kind] for kind in classify_planes(planes, torch.tensor([0.0, 0, 1]))]
+        ['floor', 'wall', 'ceiling']
+    """
+    other, floor, ceiling, wall = (
+        PLANE_KINDS.index(name) for name in ("other", "floor", "ceiling", "wall")
+    )
+    kind = torch.full_like(planes.count, other)
+    if len(kind) == 0:
+        return kind
+    up = up.to(planes.normal.dtype) / up.to(planes.normal.dtype).norm()
+    steepness = (planes.normal * up).sum(dim=1).abs()
+    height = (planes.center * up).sum(dim=1)
+    reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2
+    low, high = (height - reach).amin(), (height + reach).amax()
+    level = ~planes.curved & (steepness >= math.cos(math.radians(_MAX_TILT_DEG)))
+    largest = torch.where(level, planes.area, 0).amax()
+    broad = level & (planes.area >= _LEAST_AREA_SHARE * largest)
+    upright = ~planes.curved & (steepness <= math.sin(math.radians(_MAX_TILT_DEG)))
+    kind[upright & (2 * reach >= _LEAST_WALL_SHARE * (high - low))] = wall
+    kind[broad & (height >= high - _END_SHARE * (high - low))] = ceiling
+    kind[broad & (height <= low + _END_SHARE * (high - low))] = floor
+    return kind
+
 
 _CURVED_SPREAD_DEG = 8.0
 """A smooth bend by three to four times this angle has this spread."""
@@ -185,3 +380,81 @@ def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
 def _without(vectors: Tensor, normals: Tensor) -> Tensor:
     """Return vectors less their component along the normals."""
     return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
+
+
+_COLUMNS = (
+    "normal",
+    "offset",
+    "centroid",
+    "area",
+    "count",
+    "rms",
+    "extent",
+    "axes",
+    "center",
+    "curved",
+)
+
+
+def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
+    """Return the plane table as one mapping for each plane, for ``pandas.DataFrame(rows)``.
+
+    Args:
+        planes: The table.
+
+    Returns:
+        Rows with the label and plain numbers and lists by the names of :class:`Planes`. ``kind``
+        is a word, ``outline`` a list of rings, ``neighbors`` a list of planes that this one meets
+        with ``plane``, ``boundary_length`` and ``dihedral_deg``; they are left out where the table
+        does not have them.
+
+    Example:
+        >>> import torch
+        >>> from torchrg.regions.planes import summarize_planes
+        >>> points, labels = torch.eye(3), torch.zeros(3, dtype=torch.int64)
+        >>> rows = planes_to_rows(summarize_planes(points, torch.eye(3), labels))
+        >>> rows[0]["label"], rows[0]["count"], rows[0]["curved"]
+        (0, 3, True)
+    """
+    columns = {name: getattr(planes, name).tolist() for name in _COLUMNS}
+    rows = [
+        {"label": label, **{name: values[label] for name, values in columns.items()}}
+        for label in range(len(planes.offset))
+    ]
+    for label, row in enumerate(rows):
+        if planes.kind is not None:
+            row["kind"] = PLANE_KINDS[int(planes.kind[label])]
+        if planes.outline is not None:
+            row["outline"] = [ring.tolist() for ring in planes.outline[label]]
+        if planes.adjacency is not None:
+            row["neighbors"] = []
+    if planes.adjacency is not None:
+        for (a, b), *values in zip(*(_as_list(part) for part in planes.adjacency), strict=True):
+            found = dict(zip(("boundary_length", "dihedral_deg"), values, strict=True))
+            rows[a]["neighbors"].append({"plane": b, **found})
+            rows[b]["neighbors"].append({"plane": a, **found})
+    return rows
+
+
+def planes_to_json(planes: Planes) -> str:
+    """Return the plane table as JSON text: ``{"planes": [...]}`` with the rows.
+
+    Args:
+        planes: The table.
+
+    Returns:
+        The text.
+
+    Example:
+        >>> import torch
+        >>> from torchrg.regions.planes import summarize_planes
+        >>> planes = summarize_planes(torch.eye(3), torch.eye(3), torch.zeros(3).int())
+        >>> json.loads(planes_to_json(planes))["planes"][0]["count"]
+        3
+    """
+    return json.dumps({"planes": planes_to_rows(planes)})
+
+
+def _as_list(values: Tensor) -> list[Any]:
+    listed: list[Any] = values.tolist()
+    return listed

@@ -25,11 +25,10 @@ draw them all. Where FastMCD fails it has found a smaller determinant than the p
 one place and five others. ``planes`` is :func:`fit_detmcd` with ``starts="planes"``.
 """
 
-from torchrg.robust.fastmcd import fit_fastmcd
-from torchrg.robust.mcd import fit_detmcd
+from torchrg.robust.mcd import fit_detmcd, fit_fastmcd
 from torchrg.robust.mm import fit_detmm, fit_dets
 from torchrg.robust.mve import fit_mve
-from torchrg.robust.result import RobustFit
+from torchrg.robust.patches import RobustFit
 from torchrg.robust.scale import mad, median, qn, qn_exceeds, tau
 
 __all__ = [

@@ -1,20 +1,134 @@
-"""Minimum covariance determinant: the deterministic algorithm."""
+"""Minimum covariance determinant: concentration steps from deterministic or random starts."""
 
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
+from torchrg._parallel import chunks_of
 from torchrg.errors import ConfigError
-from torchrg.robust.concentrate import Concentrated, concentrate
-from torchrg.robust.estimate import Estimate, reweight
-from torchrg.robust.lanes import join_columns
-from torchrg.robust.patchwise import CHUNK_SIZE, fit_patchwise
-from torchrg.robust.planes import plane_starts, rotate_to_axes
-from torchrg.robust.result import RobustFit
-from torchrg.robust.scatter import covariance_entries, fit_ellipsoid, sq_distances
-from torchrg.robust.starts import deterministic_starts
-from torchrg.robust.weights import consistency_factor, small_sample_factor
+from torchrg.robust.lanes import (
+    covariance_entries,
+    determinant,
+    fit_ellipsoid,
+    join_columns,
+    smallest_points,
+    sq_distances,
+    sum_points,
+    take_lanes,
+)
+from torchrg.robust.patches import CHUNK_SIZE, RobustFit, fit_patchwise
+from torchrg.robust.starts import (
+    deterministic_starts,
+    draw_seed,
+    elemental_sets,
+    plane_starts,
+    rotate_to_axes,
+)
+from torchrg.robust.weights import Estimate, consistency_factor, reweight, small_sample_factor
+
+MAX_STEPS = 100
+_MAX_COMPARED = 16
+_DIGITS = 24
+"""Points whose membership one number holds exactly, as a binary digit each."""
+
+
+class Concentrated(NamedTuple):
+    """The sets that concentration ended with.
+
+    Attributes:
+        members: 1 for a point in the set, 0 for another, shape ``(K, S, M)``.
+        determinants: Of their scatter over h - 1, shape ``(S, M)``, float64; inf for a start that
+            repeats an earlier one of its lane.
+        size: h, the number of points in each set.
+    """
+
+    members: Tensor
+    determinants: Tensor
+    size: int
+
+
+def concentrate(
+    columns: list[Tensor],
+    initial: Tensor,
+    initial_size: int,
+    size: int,
+    floor: Tensor,
+    max_steps: int = MAX_STEPS,
+) -> Concentrated:
+    """Iterate concentration steps from each start of each lane until the set stays the same.
+
+    A step takes mean and scatter of the set and keeps the ``size`` points nearest to them; the
+    determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Starts that have arrived
+    leave the batch, and so do those whose set another one has.
+
+    Args:
+        columns: P coordinates of shape ``(K, M)``.
+        initial: 1 for a point in the initial set, 0 for another, shape ``(K, S, M)``.
+        initial_size: Number of points in each initial set.
+        size: h, the number of points to keep.
+        floor: Least variance in any direction, shape ``(M,)``.
+        max_steps: Steps after the first; fewer for a quick look at many starts.
+
+    Returns:
+        The final sets and their determinants.
+    """
+    num_points, num_starts, num_lanes = initial.shape
+    shape = (num_starts, num_lanes)
+    members = initial.reshape(num_points, -1)
+    final = torch.zeros_like(members)
+    best = torch.full_like(floor, torch.inf, dtype=torch.float64).repeat(num_starts)
+    places = torch.arange(num_starts * num_lanes, device=floor.device)
+    distinct = _first_of_equal(members, places, shape)
+    places, members = places[distinct], members.index_select(1, distinct)
+    points, floors = take_lanes(columns, places % num_lanes), floor[places % num_lanes]
+    ellipsoid = fit_ellipsoid(points, members, initial_size, floors)
+    members = smallest_points(sq_distances(ellipsoid, initial_size - 1), size)
+    moving, previous = _first_of_equal(members, places, shape), best[places]
+    for step in range(max_steps + 1):
+        points, members = take_lanes(points, moving), members.index_select(1, moving)
+        floors, places, previous = floors[moving], places[moving], previous[moving]
+        ellipsoid = fit_ellipsoid(points, members, size, floors)
+        value = determinant(ellipsoid, size - 1)
+        candidate = smallest_points(sq_distances(ellipsoid, size - 1), size)
+        # Rounding may let the determinant grow, or two sets of tied points follow each other.
+        settled = (sum_points(candidate * members) >= size) | ~(value < previous)
+        settled |= step == max_steps
+        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+        final.index_copy_(1, places[done], members.index_select(1, done))
+        best[places[done]] = value[done]
+        if len(moving) == 0:
+            break
+        members, previous = candidate, value
+    return Concentrated(final.reshape(num_points, *shape), best.reshape(shape), size)
+
+
+def _first_of_equal(members: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Choose of equal sets of one lane the first.
+
+    Args:
+        members: Sets, 1 for a point in it and 0 for another, shape ``(K, n)``.
+        places: Where each is among starts and lanes, shape ``(n,)``.
+        shape: Number of starts and of lanes.
+
+    Returns:
+        The chosen of the n sets, ascending.
+    """
+    num_starts, num_lanes = shape
+    if not 1 < num_starts <= _MAX_COMPARED:
+        return torch.arange(len(places), device=places.device)
+    digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
+    weighted = members * digits.to(members.dtype)[:, None]
+    parts = [sum_points(weighted[chunk]) for chunk in chunks_of(len(members), _DIGITS)]
+    numbers = members.new_zeros(len(parts), num_starts * num_lanes)
+    numbers[:, places] = torch.stack(parts)
+    numbers = numbers.reshape(-1, num_starts, num_lanes)
+    first = torch.ones(shape, dtype=torch.bool, device=members.device)
+    for start in range(1, num_starts):
+        same = (numbers[:, :start] == numbers[:, start : start + 1]).all(dim=0)
+        first[start] = ~same.any(dim=0)
+    return torch.nonzero(first.reshape(-1)[places]).squeeze(1)
+
 
 Starts = Literal["paper", "robustbase", "planes", "more"]
 
@@ -165,3 +279,86 @@ def finish_mcd(
         objective=sets.determinants[best, lanes],
         singular=ellipsoid.singular,
     )
+
+
+NUM_KEPT = 10
+"""Sets that are concentrated to the end, as published."""
+
+
+def fit_fastmcd(
+    patches: Tensor,
+    mask: Tensor | None = None,
+    *,
+    support_fraction: float = 0.5,
+    quantile: float = 0.975,
+    num_starts: int = 500,
+    small_sample: bool = False,
+    generator: torch.Generator | None = None,
+    chunk_size: int = 16,
+) -> RobustFit:
+    r"""Fit location and scatter to the majority of each patch by the MCD with random starts.
+
+    Two concentration steps from each of many sets of P + 1 random points; the ten best distinct
+    sets are concentrated to the end, and the smallest determinant wins [1]. Unlike DetMCD it is
+    affine equivariant, and it nearly always finds the best set, at a hundred times the cost.
+
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, P)``, floating point.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all. Points with a non-finite
+            coordinate never count.
+        support_fraction: Share of the points that may be trusted, from 0.5 to 1.
+        quantile: Points within this quantile of the chi-square distribution are inliers.
+        num_starts: Random sets; all sets are taken where there are no more than five times as
+            many (up to 17 points of P = 3 with 500).
+        small_sample: Apply the factors for small samples (P = 3 only).
+        generator: Source of the random sets. Default: always the same sets. Every patch gets the
+            same ones.
+        chunk_size: Patches worked on together; bounds the memory, never changes the result.
+
+    Returns:
+        The fits; ``log_det`` is that of the covariance of the h points, without factors.
+
+    Raises:
+        ShapeError: If a shape, dtype or device is not as above.
+        ConfigError: If a setting is out of range.
+
+    References:
+        [1] P. J. Rousseeuw, K. Van Driessen. A fast algorithm for the minimum covariance
+        determinant estimator. Technometrics 41, 1999.
+
+    Example:
+        >>> points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+        >>> points[:, 2] *= 0.01
+        >>> points[:20, 2] += 1.0
+        >>> fit_fastmcd(points).support[:20].any().item()
+        False
+    """
+    if num_starts < 1:
+        raise ConfigError(f"fit_fastmcd: expected num_starts of at least 1, got {num_starts!r}.")
+    seed = draw_seed(generator)
+
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+        num_points, num_coordinates = len(columns[0]), len(columns)
+        sets = elemental_sets(num_points, num_coordinates + 1, num_starts, seed).to(floor.device)
+        marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
+        initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
+        quick = concentrate(columns, initial, num_coordinates + 1, size, floor, max_steps=1)
+        kept = _distinct_best(quick, NUM_KEPT)
+        final = concentrate(columns, kept, size, size, floor)
+        return finish_mcd(
+            columns, final, floor, quantile, support_fraction, small_sample=small_sample
+        )
+
+    return fit_patchwise(
+        "fit_fastmcd", patches, mask, support_fraction, quantile, chunk_size, estimator
+    )
+
+
+def _distinct_best(sets: Concentrated, number: int) -> Tensor:
+    """Members ``(K, number, M)`` of the best sets of each lane, of equal ones only the first."""
+    values, order = sets.determinants.sort(dim=0, stable=True)
+    repeated = torch.zeros_like(values, dtype=torch.bool)
+    repeated[1:] = values[1:] == values[:-1]
+    place = torch.where(repeated, torch.inf, values).argsort(dim=0, stable=True)[:number]
+    chosen = order.gather(0, place)
+    return sets.members.gather(1, chosen.expand(len(sets.members), -1, -1))

@@ -1,19 +1,224 @@
 """S and MM estimates of location and scatter from deterministic starts."""
 
+from collections.abc import Callable
+from functools import lru_cache
+from math import exp, lgamma, log
+from typing import Literal, NamedTuple
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.robust.bisquare import Target, bisquare_loss, breakdown_constant, efficiency_constant
-from torchrg.robust.differences import half_size
-from torchrg.robust.estimate import Estimate
-from torchrg.robust.lanes import join_columns, smallest_points, sum_points
+from torchrg.robust.lanes import (
+    Ellipsoid,
+    covariance_entries,
+    fit_ellipsoid,
+    join_columns,
+    median_points,
+    smallest_points,
+    sq_distances,
+    sum_points,
+    take_lanes,
+)
 from torchrg.robust.mcd import Starts, check_starts, initial_sets
-from torchrg.robust.patchwise import fit_patchwise
-from torchrg.robust.result import RobustFit
-from torchrg.robust.scatter import covariance_entries, fit_ellipsoid, sq_distances
-from torchrg.robust.shape import Shape, choose_shape, m_scale, reweight_shape, shape_of, volume
-from torchrg.robust.weights import chi2_quantile
+from torchrg.robust.patches import RobustFit, fit_patchwise
+from torchrg.robust.scale import half_size
+from torchrg.robust.weights import Estimate, chi2_quantile
+
+Target = Literal["shape", "location"]
+"""What the efficiency of 95 % at the normal distribution refers to."""
+
+BREAKDOWN = 0.5
+EFFICIENCY = 0.95
+
+
+def bisquare_weights(sq_ratios: Tensor) -> Tensor:
+    """Weights ``(1 - t)^2`` of squared distances in units of the cut-off, 0 beyond it."""
+    inside = 1 - sq_ratios.clamp(max=1)
+    return inside * inside
+
+
+def bisquare_loss(sq_ratios: Tensor) -> Tensor:
+    """Loss ``1 - (1 - t)^3`` of squared distances in units of the cut-off, 1 beyond it."""
+    inside = 1 - sq_ratios.clamp(max=1)
+    return 1 - inside * inside * inside
+
+
+@lru_cache(maxsize=64)
+def breakdown_constant(num_coordinates: int) -> float:
+    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal.
+
+    Example:
+        >>> round(breakdown_constant(3), 6)
+        3.452882
+    """
+
+    def excess(cutoff: float) -> float:
+        moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
+        inside = 3 * moments[1] - 3 * moments[2] + moments[3]
+        return inside + 1 - moments[0] - BREAKDOWN
+
+    return _root(excess)
+
+
+@lru_cache(maxsize=64)
+def efficiency_constant(num_coordinates: int, target: Target) -> float:
+    """Cut-off with 95 % efficiency at the normal distribution.
+
+    For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
+
+    Example:
+        >>> round(efficiency_constant(3, "shape"), 5), round(efficiency_constant(3, "location"), 5)
+        (6.09627, 5.49025)
+    """
+    p = num_coordinates
+
+    def excess(cutoff: float) -> float:
+        def mean(coefficients: dict[int, float]) -> float:
+            """Mean of a polynomial in d / cutoff over d < cutoff."""
+            return sum(a * _moment(m, p, cutoff) / cutoff**m for m, a in coefficients.items())
+
+        # With u = d / cutoff: psi(d) = d (1 - u^2)^2 and psi'(d) = (1 - u^2) (1 - 5 u^2).
+        if target == "location":
+            spread = cutoff**2 * mean({2: 1, 4: -4, 6: 6, 8: -4, 10: 1}) / p
+            slope = mean({0: 1, 2: -2 - 4 / p, 4: 1 + 4 / p})
+        else:
+            spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
+            slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
+        return slope**2 / spread - EFFICIENCY
+
+    return _root(excess)
+
+
+def _moment(power: int, num_coordinates: int, cutoff: float) -> float:
+    """Mean of d^power where d, the length of a standard normal vector, is below the cut-off."""
+    from scipy.special import gammainc
+
+    half = num_coordinates / 2
+    factor = exp(lgamma(half + power / 2) - lgamma(half) + power / 2 * log(2))
+    return factor * float(gammainc(half + power / 2, cutoff * cutoff / 2))
+
+
+def _root(excess: Callable[[float], float]) -> float:
+    from scipy.optimize import brentq
+
+    return float(brentq(excess, 0.1, 100.0, xtol=1e-13))
+
+
+MAX_STEPS = 300
+_CHECK_EVERY = 4
+
+
+class Shape(NamedTuple):
+    """A weighted fit of each lane, its scatter scaled to determinant one.
+
+    Attributes:
+        weights: Of the points, shape ``(K, M)``.
+        ellipsoid: Their factored scatter.
+        distances: Squared distances to the scatter of determinant one, shape ``(K, M)``.
+    """
+
+    weights: Tensor
+    ellipsoid: Ellipsoid
+    distances: Tensor
+
+
+def reweight_shape(
+    columns: list[Tensor],
+    start: Shape,
+    scale: Tensor,
+    floor: Tensor,
+    cutoff: float,
+    *,
+    adapt_scale: bool,
+) -> tuple[Shape, Tensor]:
+    """Reweight until the weights settle; lanes that have settled leave the batch.
+
+    With ``adapt_scale`` the scale takes one step to the M-scale before each reweighting: solving
+    for it fully can lead to another local minimum.
+    """
+    eps = torch.finfo(scale.dtype).eps
+    enough = 16 * eps if scale.dtype == torch.float32 else 4096 * eps
+    weights, scales = start.weights.clone(), scale.clone()
+    places = torch.arange(len(scale), device=scale.device)
+    points, floors = columns, floor
+    distances, previous = start.distances, start.weights
+    for step in range(1, MAX_STEPS + 1):
+        if adapt_scale:
+            scale = _m_scale_step(distances, scale, cutoff)
+        current = bisquare_weights(distances / (cutoff * scale) ** 2)
+        distances = shape_of(points, current, floors).distances
+        if step % _CHECK_EVERY and step != MAX_STEPS:
+            previous = current
+            continue
+        change = sum_points((current - previous).abs())
+        settled = change <= enough * sum_points(current)
+        if step == MAX_STEPS:
+            settled |= True
+        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+        if len(done):
+            weights.index_copy_(1, places[done], current.index_select(1, done))
+            scales[places[done]] = scale[done]
+            if len(moving) == 0:
+                break
+            points = take_lanes(points, moving)
+            places, scale, floors = places[moving], scale[moving], floors[moving]
+            distances, current = take_lanes([distances, current], moving)
+        previous = current
+    return shape_of(columns, weights, floor), scales
+
+
+def shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> Shape:
+    """Fit the weighted points of each lane, and scale the scatter to determinant one."""
+    total = sum_points(weights)
+    ellipsoid = fit_ellipsoid(columns, weights, total, floor)
+    return Shape(weights, ellipsoid, sq_distances(ellipsoid, volume(ellipsoid)))
+
+
+def volume(ellipsoid: Ellipsoid) -> Tensor:
+    """The P-th root of the determinant of each lane's sums of squares."""
+    product = torch.ones_like(ellipsoid.squares[0], dtype=torch.float64)
+    for square in ellipsoid.squares:
+        product = product * square.double()
+    root = 1 / len(ellipsoid.squares)
+    if product.device.type == "cpu":
+        # NumPy's power is the same for a value wherever it stands; torch's is not.
+        product = torch.from_numpy(np.power(product.numpy(), root))
+    else:
+        product = product**root
+    return product.to(ellipsoid.squares[0].dtype)
+
+
+def m_scale(distances: Tensor, cutoff: float) -> Tensor:
+    """Scale at which the mean loss of each lane's distances is half of its maximum."""
+    scale = (median_points(distances) / chi2_quantile(0.5, 1)).sqrt()
+    scale = scale.clamp(min=torch.finfo(scale.dtype).tiny)
+    for _ in range(50):
+        scale = _m_scale_step(distances, scale, cutoff)
+    return scale
+
+
+def _m_scale_step(distances: Tensor, scale: Tensor, cutoff: float) -> Tensor:
+    loss = sum_points(bisquare_loss(distances / (cutoff * scale) ** 2)) / len(distances)
+    return scale * (loss / BREAKDOWN).sqrt()
+
+
+def choose_shape(condition: Tensor, a: Shape, b: Shape) -> Shape:
+    """Shape a where the condition holds, otherwise b."""
+    return Shape(
+        torch.where(condition, a.weights, b.weights),
+        Ellipsoid(
+            [torch.where(condition, x, y) for x, y in zip(a[1].means, b[1].means, strict=True)],
+            [
+                torch.where(condition, x, y)
+                for x, y in zip(a[1].residuals, b[1].residuals, strict=True)
+            ],
+            [torch.where(condition, x, y) for x, y in zip(a[1].squares, b[1].squares, strict=True)],
+            a[1].singular | b[1].singular,
+        ),
+        torch.where(condition, a.distances, b.distances),
+    )
 
 
 def fit_dets(

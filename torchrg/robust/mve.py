@@ -6,13 +6,18 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.robust.elemental import draw_seed, elemental_sets
-from torchrg.robust.estimate import Estimate, reweight
-from torchrg.robust.lanes import join_columns, smallest_points, sorted_points
-from torchrg.robust.patchwise import fit_patchwise
-from torchrg.robust.result import RobustFit
-from torchrg.robust.scatter import covariance_entries, determinant, fit_ellipsoid, sq_distances
-from torchrg.robust.weights import chi2_quantile
+from torchrg.robust.lanes import (
+    covariance_entries,
+    determinant,
+    fit_ellipsoid,
+    join_columns,
+    smallest_points,
+    sorted_points,
+    sq_distances,
+)
+from torchrg.robust.patches import RobustFit, fit_patchwise
+from torchrg.robust.starts import draw_seed, elemental_sets
+from torchrg.robust.weights import Estimate, chi2_quantile, reweight
 
 _LANES_AT_ONCE = 1024
 

@@ -1,17 +1,166 @@
 """Clouds sampled from a scene: spread, noise, outliers, order."""
 
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import ConfigError
-from torchrg.scenes.frames import Array, Floats, dot
-from torchrg.scenes.labeling import label_points
-from torchrg.scenes.scans import scan_places
-from torchrg.scenes.scene import Scene, SceneModel
-from torchrg.scenes.streams import random_stream
+from torchrg.scenes.geometry import Array, Floats, cos_sin, dot, unit
+from torchrg.scenes.scene import Scene, SceneModel, label_points, random_stream
 from torchrg.structures import UNLABELED
+
+_TILE = 32  # rays on a side of the blocks that are tested against a face as one
+_MARGIN = 1e-3  # added to the angle of a block, radians
+
+
+class Hits(NamedTuple):
+    """Where rays first meet a scene.
+
+    Attributes:
+        distances: In lengths of the directions, shape ``(H, W)``; infinite where never.
+        faces: The faces met, shape ``(H, W)``; ``UNLABELED`` where none.
+    """
+
+    distances: Array
+    faces: NDArray[np.int64]
+
+
+def cast_rays(model: SceneModel, origin: Array, directions: Array) -> Hits:
+    """Return where rays from one place first meet a scene.
+
+    Args:
+        model: The scene.
+        origin: Where the rays start, shape ``(3,)``.
+        directions: A grid of rays, of any length, shape ``(H, W, 3)``. Neighbours should be
+            similar: whole blocks of rays skip the faces they cannot meet.
+
+    Returns:
+        Distance and face of each ray.
+
+    Example:
+        >>> from torchrg.scenes import build_room
+        >>> down = np.array([[[0.0, 0, -1]]])
+        >>> hits = cast_rays(build_room(), np.array([0.5, 0.5, 1.25]), down)
+        >>> hits.distances.tolist(), hits.faces.tolist()
+        ([[1.25]], [[0]])
+    """
+    height, width, _ = directions.shape
+    tile_of = _tiles(height, width)
+    order = np.argsort(tile_of, kind="stable")
+    tiles, steps = tile_of[order], directions.reshape(-1, 3)[order]
+    cones = _cones(tiles, steps)
+    distances, faces = np.full(len(steps), np.inf), np.full(len(steps), UNLABELED)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for face, surface in enumerate(model.surfaces):
+            rows = np.flatnonzero(_may_meet(cones, surface.bounds - origin)[tiles])
+            found = surface.intersect(origin[None], steps[rows])
+            nearer = found < distances[rows]
+            distances[rows[nearer]], faces[rows[nearer]] = found[nearer], face
+    back = np.argsort(order, kind="stable")
+    return Hits(distances[back].reshape(height, width), faces[back].reshape(height, width))
+
+
+def _tiles(height: int, width: int) -> NDArray[np.int64]:
+    """Return the block of each ray of a grid, shape ``(H * W,)``."""
+    rows, columns = np.arange(height) // _TILE, np.arange(width) // _TILE
+    tiles: NDArray[np.int64] = rows[:, None] * (columns[-1] + 1) + columns
+    return tiles.ravel()
+
+
+def _cones(tiles: NDArray[np.int64], steps: Array) -> tuple[Array, Array]:
+    """Return axis ``(T, 3)`` and half angle ``(T,)`` of a cone around each block of rays."""
+    starts = np.flatnonzero(np.diff(tiles, prepend=-1))
+    towards = unit(steps)
+    sums = np.add.reduceat(towards, starts)
+    # Opposite rays add up to nothing: then any axis will do, with a half angle as wide as it takes.
+    axes = unit(np.where(dot(sums, sums)[:, None] > 0, sums, towards[starts]))
+    cosines = np.minimum.reduceat(dot(towards, axes[tiles]), starts)
+    return axes, np.arccos(np.clip(cosines, -1, 1)) + _MARGIN
+
+
+def _may_meet(cones: tuple[Array, Array], bounds: Array) -> NDArray[np.bool_]:
+    """Return which cones touch the ball around a box, given relative to their tip."""
+    axes, half_angles = cones
+    middle, radius = bounds.mean(axis=0), np.sqrt(((bounds[1] - bounds[0]) ** 2).sum()) / 2
+    distance = np.sqrt(dot(middle, middle))
+    if distance <= radius:
+        return np.ones(len(axes), dtype=bool)
+    angles = np.arccos(np.clip(dot(axes, middle) / distance, -1, 1))
+    touched: NDArray[np.bool_] = angles <= half_angles + np.arcsin(radius / distance)
+    return touched
+
+
+_LOWEST, _HIGHEST = -65.0, 90.0  # elevations, degrees: a tripod hides what is below
+_MORE = 1.02
+
+
+def scan_places(
+    model: SceneModel, num_points: int, rng: np.random.Generator
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Return what a scanner sees from the viewpoints of a scene, column by column.
+
+    Args:
+        model: The scene.
+        num_points: Number of points, the same for each viewpoint up to one; a few of the rays are
+            dropped at random to meet it.
+        rng: Source of the first azimuth and of what is dropped.
+
+    Returns:
+        Points ``(N, 3)``, normals ``(N, 3)`` towards free space and faces ``(N,)``, in the order
+        of viewpoint, azimuth, elevation.
+
+    Raises:
+        ConfigError: If nothing can be seen.
+    """
+    stations = len(model.viewpoints)
+    shares = np.diff(np.arange(stations + 1) * num_points // stations)
+    scans = [
+        _scan(model, viewpoint, int(share), rng)
+        for viewpoint, share in zip(model.viewpoints, shares, strict=True)
+    ]
+    points = np.concatenate([places for places, _ in scans])
+    faces = np.concatenate([labels for _, labels in scans])
+    normals = np.empty_like(points)
+    for face, surface in enumerate(model.surfaces):
+        rows = np.flatnonzero(faces == face)
+        normals[rows] = surface.normals_at(points[rows])
+    return points, normals, faces
+
+
+def _scan(
+    model: SceneModel, viewpoint: Array, num_points: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return exactly ``num_points`` points and faces seen from one place."""
+    num_rays = num_points
+    while True:
+        directions = _angular_grid(num_rays, 2 * np.pi * rng.random())
+        hits = cast_rays(model, viewpoint, directions)
+        met = np.flatnonzero(hits.faces != UNLABELED)
+        if len(met) >= num_points:
+            break
+        if len(met) == 0 and num_rays > 10_000:
+            raise ConfigError("sample_scene: expected a scene around its viewpoints, got no hit.")
+        num_rays = int(num_rays * min(num_points / max(len(met), 1) * _MORE, 100)) + 1
+    kept = met[np.sort(rng.permutation(len(met))[:num_points])]
+    steps = directions.reshape(-1, 3)[kept]
+    return viewpoint + hits.distances.ravel()[kept, None] * steps, hits.faces.ravel()[kept]
+
+
+def _angular_grid(num_rays: int, first_azimuth: float) -> Array:
+    """Return at least ``num_rays`` directions in equal steps, shape ``(columns, rows, 3)``."""
+    span = _HIGHEST - _LOWEST
+    rows = int(np.ceil(np.sqrt(num_rays * span / 360)))
+    columns = int(np.ceil(num_rays / rows))
+    elevations = (_LOWEST + span * (np.arange(rows) + 0.5) / rows) * (np.pi / 180)
+    azimuths = first_azimuth + 2 * np.pi * np.arange(columns) / columns
+    (level, up), (east, north) = cos_sin(elevations), cos_sin(azimuths)
+    directions = np.empty((columns, rows, 3))
+    directions[..., 0] = east[:, None] * level
+    directions[..., 1] = north[:, None] * level
+    directions[..., 2] = up
+    return directions
+
 
 NoiseDirection = Literal["normal", "isotropic", "ray"]
 Density = Literal["uniform", "falloff", "scan"]

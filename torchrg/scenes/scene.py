@@ -6,12 +6,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.scenes.frames import Array
-from torchrg.scenes.solids import Solid
-from torchrg.scenes.surfaces import Surface
+from torchrg.errors import ConfigError
+from torchrg.scenes.geometry import Array, Floats
+from torchrg.scenes.surfaces import Solid, Surface
 
 _HAIR = 1e-7  # how far in front of a surface must be free for it to be seen, in scene sizes
 
@@ -140,3 +141,57 @@ def plane_table(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
     planes = [curved if surface.plane is None else surface.plane for surface in surfaces]
     normals = np.array([normal for normal, _ in planes]).reshape(-1, 3)
     return normals, np.array([offset for _, offset in planes])
+
+
+def label_points(
+    model: SceneModel,
+    points: Floats,
+    labels: NDArray[np.int64],
+    normals: Floats,
+    paint: np.random.Generator | None,
+) -> Scene:
+    """Return points of known faces as a cloud with the tables of its scene.
+
+    Args:
+        model: The scene.
+        points: Shape ``(N, 3)``, float32.
+        labels: Faces, or ``UNLABELED``, shape ``(N,)``.
+        normals: Shape ``(N, 3)``, float32.
+        paint: Generator of the colours; None for none.
+
+    Returns:
+        The cloud and its truth.
+    """
+    colors = None if paint is None else torch.from_numpy(_colors(model, labels, paint))
+    face_normals, face_offsets = model.planes
+    return Scene(
+        points=torch.from_numpy(points),
+        labels=torch.from_numpy(labels),
+        normals=torch.from_numpy(normals),
+        planar=torch.tensor([surface.plane is not None for surface in model.surfaces]),
+        face_normals=torch.from_numpy(face_normals),
+        face_offsets=torch.from_numpy(face_offsets),
+        face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),
+        kinds=tuple(surface.kind for surface in model.surfaces),
+        objects=torch.from_numpy(model.objects),
+        colors=colors,
+    )
+
+
+def _colors(
+    model: SceneModel, labels: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return a colour for each point: that of its object, grey for outliers, a little uneven."""
+    palette = rng.integers(60, 230, size=(len(model.parts) + 1, 3))
+    object_of = np.append(model.objects, len(model.parts))
+    shades: NDArray[np.int64] = palette[object_of[labels]] + rng.integers(
+        -12, 13, size=(len(labels), 1)
+    )
+    return shades.astype(np.uint8)
+
+
+def random_stream(seed: int, number: int) -> np.random.Generator:
+    """Return one of several independent random generators that belong to a seed."""
+    if seed < 0:
+        raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
+    return np.random.Generator(np.random.PCG64([seed, number]))

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrg.scenes.cones import Cone
-from torchrg.scenes.frames import Frame, Triple
+from torchrg.scenes.geometry import Frame, Triple
+from torchrg.scenes.round import Cone
 from torchrg.scenes.scene import Part
-from torchrg.scenes.solids import Drum
-from torchrg.scenes.surfaces import Surface, rectangle
+from torchrg.scenes.surfaces import Drum, Surface, rectangle
 
 Hole = tuple[float, float, float, float]
 

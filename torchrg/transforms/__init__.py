@@ -1,13 +1,13 @@
 """Modules for data pipelines: a dict of tensors (or a PyG ``Data``) in, a new one out."""
 
-from torchrg.transforms.cloud import CenterCloud, KeepFinite
+from torchrg.depth.config import DepthConfig
+from torchrg.depth.segment import segment_depth
+from torchrg.neighbors.voxels import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth
-from torchrg.transforms.depth_config import DepthConfig
-from torchrg.transforms.depth_fusion import fuse_depth
-from torchrg.transforms.depth_segment import segment_depth
+from torchrg.transforms.fusion import fuse_depth
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
-from torchrg.transforms.voxel_planes import segment_voxels
-from torchrg.transforms.voxels import SampleVoxels, restore_points, sample_voxels
+from torchrg.transforms.sample import CenterCloud, KeepFinite
+from torchrg.transforms.voxels import SampleVoxels, segment_voxels
 
 __all__ = [
     "CenterCloud",

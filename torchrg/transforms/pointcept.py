@@ -7,8 +7,8 @@ They read and return NumPy arrays there. Where Pointcept is not installed, nothi
 
 import importlib.util
 
-from torchrg.transforms.cloud import CenterCloud, KeepFinite
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
+from torchrg.transforms.sample import CenterCloud, KeepFinite
 from torchrg.transforms.voxels import SampleVoxels
 
 if importlib.util.find_spec("pointcept") is not None:

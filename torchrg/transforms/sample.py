@@ -172,3 +172,104 @@ def cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
         counts: list[int] = torch.bincount(batch).cumsum(0).tolist()
         return counts or [0]
     return [num_points]
+
+
+NOT_PER_POINT = ("offset", "origin", "pose", "inverse")
+"""Entries that have no row for each point that is there, however long they are."""
+
+
+def select_points(
+    sample: Any,  # noqa: ANN401
+    rows: Tensor,
+    *,
+    num_points: int,
+) -> dict[str, Tensor]:
+    """Return the entries of a sample that change when it is reduced to some of its points.
+
+    Args:
+        sample: The sample. Which entries have a row for each point, ``index_valid_keys`` says as
+            Pointcept does, or else their length.
+        rows: The points to keep, ascending, shape ``(n,)``.
+        num_points: Number of points of the sample.
+
+    Returns:
+        The changed entries, ``offset`` among them where the sample has it.
+
+    Raises:
+        ConfigError: If the sample has edges, or is a batch that can be taken apart again.
+    """
+    entries = entries_of(sample)
+    for key, repair in (("edge_index", "before edges are made"), ("ptr", "before batching")):
+        if key in entries:
+            raise ConfigError(
+                f"expected a sample without {key} to take points out of, got one; apply the "
+                f"transform {repair}."
+            )
+    named = entries.get("index_valid_keys")
+    chosen = {}
+    for key, value in entries.items():
+        if not isinstance(value, Tensor | np.ndarray) or key in NOT_PER_POINT:
+            continue
+        if value.ndim and len(value) == num_points and (named is None or key in named):
+            tensor = as_tensor("select_points", key, value)
+            chosen[key] = tensor[rows.to(tensor.device)]
+    if "offset" in entries:
+        offset = torch.as_tensor(entries["offset"])
+        ends = torch.tensor(cloud_ends(sample, num_points), device=rows.device)
+        chosen["offset"] = torch.searchsorted(rows, ends).to(offset)
+    return chosen
+
+
+class CenterCloud(SampleTransform):
+    """Move each cloud so that the middle of its bounding box is the origin.
+
+    Reads ``coord`` ``(N, 3)``; changes it, and adds ``origin`` ``(B, 3)``, float64, where the
+    origin of the new coordinates is in the old ones (an ``origin`` that is there is added up), so
+    that ``coord + origin`` is what it was. Points that are not finite do not count.
+
+    Example:
+        >>> corner = torch.tensor([[5.0, 5.0, 5.0], [7.0, 5.0, 5.0]])
+        >>> sample = CenterCloud()({"coord": corner})
+        >>> sample["coord"].tolist(), sample["origin"].tolist()
+        ([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[6.0, 5.0, 5.0]])
+    """
+
+    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample with moved coordinates."""
+        coord = self.read(sample, "coord")
+        ends = cloud_ends(sample, len(coord))
+        clouds = [coord[begin:end] for begin, end in zip([0, *ends], ends, strict=False)]
+        middles = torch.stack([_middle(cloud) for cloud in clouds])
+        moved = [
+            (cloud.double() - middle).to(cloud.dtype)
+            for cloud, middle in zip(clouds, middles, strict=True)
+        ]
+        key = self.key(sample, "origin")
+        if key in sample:
+            middles = middles + self.read(sample, "origin").reshape(-1, 3)
+        return self.changed(sample, {self.key(sample, "coord"): torch.cat(moved), key: middles})
+
+
+class KeepFinite(SampleTransform):
+    """Leave out points whose coordinates are not finite, from every entry with a row a point.
+
+    Example:
+        >>> sample = {"coord": torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0]]), "name": "a"}
+        >>> KeepFinite()(sample)
+        {'coord': tensor([[0., 0., 0.]]), 'name': 'a'}
+    """
+
+    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample with the finite points."""
+        coord = self.read(sample, "coord")
+        rows = coord.isfinite().all(dim=-1).nonzero().squeeze(-1)
+        return self.changed(sample, select_points(sample, rows, num_points=len(coord)))
+
+
+def _middle(cloud: Tensor) -> Tensor:
+    """Return the middle of the box around the finite points, float64; zero if there is none."""
+    finite = cloud[cloud.isfinite().all(dim=-1)].double()
+    if len(finite) == 0:
+        return torch.zeros(3, dtype=torch.float64, device=cloud.device)
+    low, high = finite.amin(dim=0), finite.amax(dim=0)
+    return low + (high - low) / 2

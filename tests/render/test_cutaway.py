@@ -1,0 +1,161 @@
+"""What is left out of a picture, on rooms whose walls are known."""
+
+import pytest
+import torch
+
+from torchrg.render.cutaway import SideView, find_outer_surface, main_directions
+from torchrg.render.grid import build_grid, surface_cells
+from torchrg.render.views import choose_viewpoint
+
+SIZE = (6.0, 4.0, 2.5)
+UP = torch.tensor([0.0, 0, 1])
+
+
+def rectangle(rng, low, high, density=900.0):
+    """Points on an axis-aligned rectangle."""
+    low, high = torch.tensor(low), torch.tensor(high)
+    sides = (high - low)[high > low]
+    count = int(density * sides.prod())
+    return low + (high - low) * torch.rand(count, 3, generator=rng)
+
+
+def box_room(rng, size=SIZE, table=True):
+    """Points of a room, and the face of each: floor, ceiling, x0, x1, y0, y1, table."""
+    x, y, z = size
+    faces = [
+        ((0.0, 0.0, 0.0), (x, y, 0.0)),
+        ((0.0, 0.0, z), (x, y, z)),
+        ((0.0, 0.0, 0.0), (0.0, y, z)),
+        ((x, 0.0, 0.0), (x, y, z)),
+        ((0.0, 0.0, 0.0), (x, 0.0, z)),
+        ((0.0, y, 0.0), (x, y, z)),
+    ]
+    if table:
+        faces.append(((0.4 * x, 0.4 * y, 0.75), (0.7 * x, 0.7 * y, 0.75)))
+    parts = [rectangle(rng, *face) for face in faces]
+    points = torch.cat(parts) + 0.003 * torch.randn(sum(map(len, parts)), 3, generator=rng)
+    return points, torch.repeat_interleave(torch.tensor([len(part) for part in parts]))
+
+
+def kept_share(points, faces, view, **settings):
+    """Share of each face that a view keeps."""
+    grid = build_grid(points)
+    viewpoint = choose_viewpoint(surface_cells(grid), view, settings.pop("up", UP), **settings)
+    kept = viewpoint.keeps(grid.points).double()
+    face = faces[grid.rows]
+    return torch.bincount(face, kept) / torch.bincount(face)
+
+
+@pytest.mark.parametrize("azimuth_deg", [30.0, 120.0, 210.0, 300.0])
+def test_cutaway_leaves_out_ceiling_and_near_walls_only(rng, azimuth_deg):
+    points, faces = box_room(rng)
+    shares = kept_share(points, faces, "cutaway", azimuth_deg=azimuth_deg)
+    assert float(shares[1]) == 0
+    assert float(shares[[0, 6]].amin()) > 0.85
+    walls = shares[2:6]
+    assert int((walls < 0.1).sum()) == 2
+    assert int((walls > 0.8).sum()) == 2
+    assert min(walls[0], walls[1]) < 0.1 < max(walls[0], walls[1])
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e3])
+@pytest.mark.parametrize("turn_deg", [0.0, 28.0])
+def test_cut_does_not_depend_on_unit_heading_or_origin(rng, scale, turn_deg):
+    points, faces = box_room(rng)
+    angle = torch.tensor(turn_deg).deg2rad()
+    cos, sin, zero, one = angle.cos(), angle.sin(), torch.tensor(0.0), torch.tensor(1.0)
+    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one]).view(3, 3)
+    moved = scale * ((points @ turn.T).double() + torch.tensor([5e5, 4e6, 100.0]))
+    shares = kept_share(moved, faces, "cutaway", azimuth_deg=30.0)
+    assert float(shares[1]) == 0
+    assert int((shares[2:6] < 0.1).sum()) == 2
+    assert float(shares[[0, 6]].amin()) > 0.85
+
+
+def test_view_from_above_leaves_out_the_ceiling_only(rng):
+    points, faces = box_room(rng)
+    shares = kept_share(points, faces, "above")
+    assert float(shares[1]) == 0
+    assert float(shares[[0, 2, 3, 4, 5, 6]].amin()) > 0.85
+
+
+def test_outside_leaves_out_nothing(rng):
+    points, faces = box_room(rng)
+    assert float(kept_share(points, faces, "outside").amin()) == 1
+
+
+def test_tables_are_no_ceilings(rng):
+    points, faces = box_room(rng)
+    open_room = faces != 1
+    shares = kept_share(points[open_room], faces[open_room], "above")
+    assert float(shares[[0, 2, 3, 4, 5, 6]].amin()) == 1
+
+
+def test_a_table_as_large_as_half_the_room_is_no_ceiling(rng):
+    points, faces = box_room(rng, table=False)
+    top = rectangle(rng, (0.9, 0.6, 0.75), (5.1, 3.4, 0.75))
+    points = torch.cat([points[faces != 1], top])
+    faces = torch.cat([faces[faces != 1], torch.full((len(top),), 6)])
+    assert float(kept_share(points, faces, "above")[6]) == 1
+
+
+def test_upward_axis_is_a_setting(rng):
+    points, faces = box_room(rng)
+    shares = kept_share(points[:, [0, 2, 1]], faces, "above", up=torch.tensor([0.0, 1, 0]))
+    assert float(shares[1]) == 0
+    assert float(shares[[0, 2, 3, 4, 5, 6]].amin()) > 0.85
+
+
+def test_two_ceilings_of_different_height_go_both(rng):
+    low, low_faces = box_room(rng, (6.0, 4.0, 2.2), table=False)
+    high, high_faces = box_room(rng, (6.0, 4.0, 2.9), table=False)
+    points = torch.cat([low, high + torch.tensor([6.2, 0.0, 0.0])])
+    shares = kept_share(points, torch.cat([low_faces, high_faces + 6]), "above")
+    assert float(shares[[1, 7]].amax()) < 0.05
+    assert float(shares[[0, 6]].amin()) > 0.95
+
+
+def test_a_room_is_seen_from_the_side_where_a_wall_is_missing(rng):
+    points, faces = box_room(rng)
+    kept = (faces != 1) & (faces != 4)
+    grid = build_grid(points[kept])
+    cells = surface_cells(grid)
+    assert float(choose_viewpoint(cells, "outside", UP).toward[1]) < 0
+
+
+def test_long_clouds_lie_across_the_picture_from_above(rng):
+    for order in ([0, 1, 2], [1, 0, 2]):
+        points = box_room(rng)[0][:, order]
+        viewpoint = choose_viewpoint(surface_cells(build_grid(points)), "above", UP)
+        extent = points.amax(0) - points.amin(0)
+        right = torch.linalg.cross(viewpoint.up, viewpoint.toward)
+        assert int(right.abs().argmax()) == int(extent.argmax())
+
+
+def test_directions_are_the_normals_of_the_faces(rng):
+    cells = surface_cells(build_grid(box_room(rng)[0]))
+    found = main_directions(cells)[:3].abs()
+    torch.testing.assert_close(found.amax(dim=1), torch.ones(3), atol=1e-3, rtol=0)
+    assert sorted(found.argmax(dim=1).tolist()) == [0, 1, 2]
+    assert int(found[0].argmax()) == 2
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_clouds_of_few_points_have_no_walls(rng, count):
+    cells = surface_cells(build_grid(torch.rand(count, 3, generator=rng)))
+    assert len(main_directions(cells)) == 0
+    assert find_outer_surface(cells, UP, is_ceiling=True) is None
+    assert choose_viewpoint(cells, "cutaway", UP).cut == ()
+
+
+def test_side_view_counts_neighbours_at_the_same_height():
+    points = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.zeros(1)) + 0.5
+    points = torch.cat([points, torch.tensor([[4.5, 4.5, 9.0]])])
+    view = SideView(points, UP, 1.0)
+    share = view.share_at_height(
+        view.pixels(points), points[:, 2], torch.ones(82, dtype=torch.bool), size=3, step=1.0
+    )
+    grid = share[:81].view(9, 9)
+    assert float(grid[4, 4]) == pytest.approx(1)
+    assert float(grid[0, 0]) == pytest.approx(4 / 9)
+    assert float(share[81]) == pytest.approx(1 / 9)

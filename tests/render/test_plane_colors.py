@@ -1,0 +1,202 @@
+"""Colours: OKLab against published values, planes that touch against brute force."""
+
+import pytest
+import torch
+
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
+from torchrg.render.colors import oklab_to_rgb, rgb_to_oklab, touching_planes
+from torchrg.render.grid import build_grid, gather_bits
+from torchrg.scenes import make_room
+
+CLEARLY = 0.08  # in OKLab; neighbouring tones of a good screen differ by about 0.02
+
+
+def lab_of(colors):
+    return rgb_to_oklab(colors.double() / 255)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "lab"),
+    [
+        ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0)),
+        ((1.0, 0.0, 0.0), (0.62796, 0.22486, 0.12585)),
+        ((0.0, 1.0, 0.0), (0.86644, -0.23389, 0.17950)),
+        ((0.0, 0.0, 1.0), (0.45201, -0.03246, -0.31153)),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_oklab_has_the_published_values(rgb, lab):
+    color = torch.tensor(rgb, dtype=torch.float64)
+    torch.testing.assert_close(
+        rgb_to_oklab(color), torch.tensor(lab, dtype=torch.float64), atol=2e-5, rtol=0
+    )
+
+
+def test_oklab_and_back_is_the_same_color(rng):
+    colors = torch.rand(500, 3, generator=rng, dtype=torch.float64)
+    torch.testing.assert_close(oklab_to_rgb(rgb_to_oklab(colors)), colors, atol=1e-7, rtol=0)
+
+
+def test_touching_planes_are_those_with_points_in_neighbouring_cubes(rng):
+    points = torch.rand(400, 3, generator=rng)
+    labels = (points * 2).long() @ torch.tensor([4, 2, 1]) - 1
+    grid = build_grid(points)
+    level = next(level for level in grid.levels if len(level.codes) <= 80)
+    cell_of = grid.cell_of
+    for finer in grid.levels[: grid.levels.index(level)]:
+        cell_of = finer.parents[cell_of]
+    # codes hold the cube's place in its own level
+    cubes = torch.stack([gather_bits(level.codes >> axis) for axis in range(3)], dim=1)[cell_of]
+    own = labels[grid.rows]
+    steps = (cubes[:, None] - cubes[None]).abs().sum(dim=2)
+    expected = {
+        (min(a, b), max(a, b))
+        for a, b in zip(
+            own[:, None].expand(-1, 400)[steps <= 1].tolist(),
+            own[None].expand(400, -1)[steps <= 1].tolist(),
+            strict=True,
+        )
+        if a != b and min(a, b) >= 0
+    }
+    found = {tuple(pair) for pair in touching_planes(grid, labels, max_cells=80).tolist()}
+    assert expected <= found
+    between = found - expected
+    # a cube between two others, or at their common corner, pairs what is in both
+    near = steps <= 2
+    wide = {
+        (min(a, b), max(a, b))
+        for a, b in zip(
+            own[:, None].expand(-1, 400)[near].tolist(),
+            own[None].expand(400, -1)[near].tolist(),
+            strict=True,
+        )
+    }
+    assert between <= wide
+
+
+def test_planes_that_touch_look_clearly_different():
+    room = make_room(60_000, seed=3)
+    colors = color_planes(room.labels, room.points)
+    grid = build_grid(room.points)
+    table = torch.zeros(int(room.labels.max()) + 1, 3, dtype=torch.uint8)
+    table[room.labels[room.labels >= 0]] = colors[room.labels >= 0]
+    first, second = touching_planes(grid, room.labels, max_cells=60_000).T
+    distances = (lab_of(table[first]) - lab_of(table[second])).norm(dim=1)
+    assert len(distances) > 200
+    assert float(distances.amin()) > CLEARLY
+    assert float(distances.median()) > 0.2
+
+
+def test_colors_do_not_depend_on_the_order_of_the_points():
+    room = make_room(20_000, seed=1)
+    order = torch.randperm(20_000, generator=torch.Generator().manual_seed(0))
+    colors = color_planes(room.labels, room.points)
+    assert torch.equal(color_planes(room.labels[order], room.points[order]), colors[order])
+
+
+def test_equal_labels_have_equal_colors_and_no_plane_is_gray():
+    labels = torch.arange(300).repeat(3) % 150 - 1
+    colors = color_planes(labels)
+    for label in range(-1, 149):
+        assert len(colors[labels == label].unique(dim=0)) == 1
+    gray = torch.full((3,), 176, dtype=torch.uint8)
+    assert bool((colors[labels == -1] == gray).all())
+    distances = (lab_of(colors[labels >= 0]) - lab_of(gray)).norm(dim=1)
+    assert float(distances.amin()) > 0.05
+
+
+def test_matched_planes_have_the_colors_of_the_reference(rng):
+    points = torch.rand(9000, 3, generator=rng)
+    reference = (points[:, 0] * 9).long()
+    labels = 8 - reference  # the same planes under other names
+    labels[reference == 4] = -1
+    expected = color_planes(reference, points)
+    expected[reference == 4] = 176
+    assert torch.equal(color_planes(labels, points, reference=reference), expected)
+
+
+def test_split_planes_get_colors_of_their_own(rng):
+    points = torch.rand(9000, 3, generator=rng)
+    reference = (points[:, 0] * 3).long()
+    split = reference + 3 * ((reference == 1) & (points[:, 1] < 0.3)).long()
+    colors = color_planes(split, points, reference=reference)
+    whole = color_planes(reference, points)
+    assert torch.equal(colors[split == 1], whole[split == 1])
+    distance = (lab_of(colors[split == 4][:1]) - lab_of(whole)).norm(dim=1)
+    assert float(distance.amin()) > CLEARLY
+
+
+def test_images_of_labels_keep_their_shape():
+    labels = torch.arange(12).view(3, 4) // 6 - 1
+    assert color_planes(labels).shape == (3, 4, 3)
+    assert color_planes(labels, torch.rand(3, 4, 3), reference=labels).shape == (3, 4, 3)
+    assert color_planes(labels.numpy()).shape == (3, 4, 3)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_clouds_without_planes_are_gray(count):
+    colors = color_planes(torch.full((count,), -1), torch.rand(count, 3))
+    assert colors.tolist() == [[176] * 3] * count
+
+
+def test_nonfinite_points_keep_the_color_of_their_plane():
+    points = torch.rand(50, 3)
+    points[7] = torch.nan
+    colors = color_planes(torch.arange(50) // 25, points)
+    assert torch.equal(colors[7], colors[8])
+
+
+def test_normals_and_their_opposites_have_one_color(rng):
+    normals = torch.nn.functional.normalize(torch.randn(200, 3, generator=rng), dim=1)
+    assert torch.equal(color_normals(normals), color_normals(-normals))
+
+
+def test_walls_at_a_right_angle_and_the_floor_look_clearly_different(rng):
+    for up in ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)):
+        axis = torch.tensor(up)
+        wall = torch.linalg.cross(axis, torch.randn(3, generator=rng))
+        wall = wall / wall.norm()
+        normals = torch.stack([axis, wall, torch.linalg.cross(axis, wall)])
+        lab = lab_of(color_normals(normals, up=up))
+        distances = torch.pdist(lab)
+        assert float(distances.amin()) > 0.15
+        assert float(lab[0, 0]) > float(lab[1:, 0].amax())
+
+
+def test_missing_normals_are_gray():
+    assert color_normals(torch.zeros(2, 3)).tolist() == [[176] * 3] * 2
+
+
+def test_curvature_darkens_all_the_way():
+    lightness = lab_of(color_curvature(torch.linspace(0, 0.1, 100)))[:, 0]
+    assert bool((lightness.diff() < 0.004).all())
+    assert float(lightness[0] - lightness[-1]) > 0.5
+
+
+def test_curvature_scale_ends_where_it_is_told():
+    ends = color_curvature(torch.tensor([0.02, 0.3, torch.nan]), max_curvature=0.02)
+    assert torch.equal(ends[0], ends[1])
+    assert ends[2].tolist() == color_curvature(torch.zeros(1))[0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: color_planes(torch.zeros(3)), ShapeError, "labels of integers"),
+        (lambda: color_planes(torch.zeros(3).long(), torch.rand(4, 3)), ShapeError, "points of"),
+        (
+            lambda: color_planes(torch.zeros(3).long(), reference=torch.zeros(2).long()),
+            ShapeError,
+            "reference of",
+        ),
+        (lambda: color_normals(torch.zeros(3, 2)), ShapeError, "normals of shape"),
+        (lambda: color_normals(torch.zeros(3, 3), up=(0, 0, 0)), ConfigError, "up to be"),
+        (lambda: color_curvature(torch.zeros(3).long()), ShapeError, "curvature of float32"),
+        (lambda: color_curvature(torch.zeros(3), max_curvature=0), ConfigError, "positive"),
+        (lambda: color_sharp(torch.zeros(3)), ShapeError, "sharp of bool"),
+    ],
+)
+def test_wrong_arguments_are_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

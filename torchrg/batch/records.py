@@ -1,0 +1,159 @@
+"""When a scan is done: its record is there, says what would be done now, and its files agree."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+import torch
+
+from torchrg.batch.scans import Converted, Job
+from torchrg.config import NormalsConfig, PipelineConfig
+from torchrg.io import atomic_path
+
+
+def describe_run(source: Path, settings: PipelineConfig | NormalsConfig) -> dict[str, Any]:
+    """Return what is needed to make a result of one file again, ready for JSON.
+
+    Args:
+        source: The input file.
+        settings: The resolved settings.
+
+    Returns:
+        Versions, settings, name and SHA-256 of the input, device.
+    """
+    return {
+        "versions": describe_versions(),
+        "config": dataclasses.asdict(settings),
+        "input": {"name": source.name, "sha256": hash_file(source)},
+        "device": "cpu",
+    }
+
+
+def describe_versions() -> dict[str, str]:
+    """Return the versions of what decides a result.
+
+    Example:
+        >>> sorted(describe_versions())
+        ['numpy', 'scipy', 'torch', 'torchrg']
+    """
+    from torchrg import __version__
+
+    return {
+        "torchrg": __version__,
+        "torch": str(torch.__version__),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+    }
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes as hexadecimal digits."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+RECORD = "provenance.json"
+"""Written last beside the results of a scan, so that a scan without it is not done."""
+
+
+def describe_job(job: Job) -> dict[str, Any]:
+    """Return what decides the results of a job, ready for JSON.
+
+    Args:
+        job: The job.
+
+    Returns:
+        Versions, settings, source with its options, and name, size and SHA-256 of each input.
+
+    Raises:
+        OSError: If an input cannot be read.
+    """
+    settings = dataclasses.asdict(job.source.settings)
+    # It never changes a result, and lowering it after running out of memory must cost nothing.
+    settings.pop("chunk_size", None)
+    return {
+        "versions": describe_versions(),
+        "config": settings,
+        "source": job.source.describe(),
+        "inputs": [
+            {"name": _name_below(job.source.root, path), **_fingerprint(path)}
+            for path in job.scan.inputs
+        ],
+        "device": "cpu",
+    }
+
+
+def write_record(job: Job, description: dict[str, Any], converted: Converted) -> None:
+    """Write the record of a scan whose files are complete.
+
+    Args:
+        job: The job.
+        description: Its description from before the work.
+        converted: What was written.
+
+    Raises:
+        FormatError: If the record cannot be written.
+    """
+    record = {
+        **description,
+        "points": converted.num_points,
+        "regions": converted.num_regions,
+        "repairs": list(converted.repairs),
+        "warnings": list(converted.warnings),
+        "outputs": {name: _fingerprint(job.folder / name) for name in converted.files},
+    }
+    with atomic_path(job.folder / RECORD) as beside:
+        beside.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def read_record(job: Job) -> dict[str, Any] | None:
+    """Return the record of a scan, or None if there is none that can be read."""
+    try:
+        record = json.loads((job.folder / RECORD).read_bytes())
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("outputs"), dict) else None
+
+
+def reason_to_convert(job: Job) -> str:
+    """Return why a scan is not done, or nothing if it is.
+
+    Args:
+        job: The job.
+
+    Returns:
+        ``"new"`` without a record; else which of input, settings, version or results is another
+        than the record says; empty if all agree.
+    """
+    record = read_record(job)
+    if record is None:
+        return "new"
+    try:
+        description = json.loads(json.dumps(describe_job(job)))
+    except OSError:
+        return "input cannot be read"
+    changes = {"versions": "version", "config": "settings", "source": "options", "inputs": "input"}
+    for part, name in changes.items():
+        if record.get(part) != description[part]:
+            return f"{name} changed"
+    for name, noted in record["outputs"].items():
+        try:
+            if _fingerprint(job.folder / name) != noted:
+                return f"{name} changed"
+        except OSError:
+            return f"{name} missing"
+    return ""
+
+
+def _fingerprint(path: Path) -> dict[str, Any]:
+    """Return the size and the hash of a file."""
+    return {"bytes": path.stat().st_size, "sha256": hash_file(path)}
+
+
+def _name_below(root: Path, path: Path) -> str:
+    """Return a path below the root with forward slashes, or the last part of one elsewhere."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name

@@ -1,0 +1,325 @@
+"""A folder of clouds as a source: one result folder for each cloud."""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from torchrg._optional import require
+from torchrg.batch.scans import Converted, Scan, check_finite, write_results
+from torchrg.config import PipelineConfig
+from torchrg.datasets import (
+    S3DIS,
+    FolderOfClouds,
+    RoomReport,
+    Scene,
+    read_pointcept_scene,
+    read_room,
+    write_pointcept_scene,
+)
+from torchrg.datasets.rgbd import RGBDFrames
+from torchrg.datasets.rgbd_layouts import RGBDFrame
+from torchrg.depth.camera import depth_to_points
+from torchrg.errors import ConfigError, FormatError
+from torchrg.io import read_cloud
+from torchrg.io.counts import estimate_points
+from torchrg.pipeline import segment_planes
+from torchrg.structures import Cloud
+from torchrg.transforms import DepthConfig, segment_depth
+
+COPIED = ("coord", "color", "strength", "segment", "instance")
+"""Arrays of a folder in Pointcept's layout that go along with its results."""
+
+
+@dataclass(frozen=True)
+class FolderSource:
+    """Every readable cloud below a folder; folders in Pointcept's layout are clouds too.
+
+    Files: ``coord``, ``normal``, ``curvature`` and ``plane`` as ``.npy``, ``color`` too where the
+    cloud has colours, and ``planes.json``. Coordinates are the input's own, points that are not
+    finite included. Folders in Pointcept's layout: see
+    :func:`torchrg.datasets.write_pointcept_scene`.
+
+    Args:
+        root: The folder.
+        settings: How to segment.
+        out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
+            no other folder below it can be.
+        superpoint: Whether the planes of folders in Pointcept's layout are written as
+            ``superpoint`` too.
+    """
+
+    root: Path
+    settings: PipelineConfig
+    out: Path
+    superpoint: bool = False
+    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4
+
+    @property
+    def in_place(self) -> bool:
+        """Whether results go into the folders of the clouds."""
+        return self.out == self.root
+
+    def describe(self) -> dict[str, Any]:
+        """Return kind and options."""
+        return {"kind": "folder", "superpoint": self.superpoint}
+
+    def list_scans(self) -> list[Scan]:
+        """Return the clouds in natural order.
+
+        Raises:
+            FormatError: If there is none.
+            ConfigError: If results would go in among clouds that are files.
+        """
+        scenes = FolderOfClouds(self.root).scenes
+        file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
+        if file is not None and self.in_place:
+            raise ConfigError(
+                f"{self.out}: expected a directory outside {self.root} for the results of "
+                f"{file.name}; choose another."
+            )
+        return [self._scan(scene) for scene in scenes]
+
+    def _scan(self, scene: Scene) -> Scan:
+        """Return a cloud with its input files."""
+        if not scene.path.is_dir():
+            return Scan(scene.name, (scene.path,), estimate_points(scene.path))
+        # In place, nothing but the coordinates decides what is added.
+        used = COPIED if not self.in_place else ("coord",)
+        files = tuple(file for file in scene.files if file.stem in used)
+        return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
+
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
+        """Read, segment and write one cloud.
+
+        Raises:
+            FormatError: If it cannot be read or has no finite point, or a result not be written.
+        """
+        begin("read")
+        first = scan.inputs[0]
+        is_file = first.parent.relative_to(self.root).as_posix() != scan.name
+        if is_file:
+            cloud = read_cloud(first)
+        else:
+            sample = read_pointcept_scene(first.parent)
+            cloud = Cloud(sample["coord"].numpy(), source=str(first.parent))
+        warnings = check_finite(cloud)
+        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
+        begin("write")
+        origin = cloud.origin.tolist()
+        if is_file:
+            colors = {name: cloud.fields[name] for name in ("color",) if name in cloud.fields}
+            files = write_results(folder, cloud.coordinates, seg, fields=colors, origin=origin)
+        else:
+            kept = {name: sample[name] for name in COPIED if name in sample}
+            files = write_pointcept_scene(
+                folder, kept, seg, superpoint=self.superpoint, origin=origin
+            )
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
+
+
+@dataclass(frozen=True)
+class S3DISSource:
+    """The rooms of S3DIS, ``ROOT/Area_i/<room>/Annotations/*.txt``.
+
+    Writes ``OUT/Area_i/<room>`` as :func:`torchrg.datasets.write_pointcept_scene` does.
+
+    Args:
+        root: The folder that holds ``Area_1`` to ``Area_6``.
+        settings: How to segment.
+        areas: Numbers of the areas.
+        class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
+        superpoint: Whether planes are written as ``superpoint`` too.
+    """
+
+    root: Path
+    settings: PipelineConfig
+    areas: tuple[int, ...]
+    class_order: str = "pointcept"
+    superpoint: bool = False
+    in_place: ClassVar[bool] = False
+    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
+
+    def describe(self) -> dict[str, Any]:
+        """Return kind and options."""
+        return {
+            "kind": "s3dis",
+            "class_order": self.class_order,
+            "superpoint": self.superpoint,
+        }
+
+    def list_scans(self) -> list[Scan]:
+        """Return the rooms in natural order.
+
+        Raises:
+            FormatError: If an area is missing, or a room has no objects.
+            MissingDependencyError: If what reads rooms is not installed.
+
+        Warns:
+            UserWarning: If an area has not as many rooms as the release.
+        """
+        require("pyarrow", extra="s3dis", purpose="read S3DIS")
+        rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
+        return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
+
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
+        """Read, segment and write one room.
+
+        Raises:
+            FormatError: If it cannot be read, or a result not be written.
+        """
+        begin("read")
+        room = read_room(self.root / scan.name, class_order=self.class_order)
+        cloud = Cloud(room.coord, source=scan.name)
+        notes = (*check_finite(cloud), *_notes(room.report))
+        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
+        begin("write")
+        sample = {
+            "coord": room.coord,
+            "color": room.color,
+            "segment": room.segment,
+            "instance": room.instance,
+        }
+        files = write_pointcept_scene(
+            folder, sample, seg, superpoint=self.superpoint, origin=cloud.origin.tolist()
+        )
+        repairs = tuple(
+            f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
+            for r in room.report.repairs
+        )
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, notes)
+
+
+def find_areas(root: Path) -> tuple[int, ...]:
+    """Return the numbers of the areas that are there; all six if none is, to be told so."""
+    return tuple(n for n in range(1, 7) if (root / f"Area_{n}").is_dir()) or tuple(range(1, 7))
+
+
+def _estimate(scene: Scene) -> int:
+    """Return the number of points by the size of the files and the lines of the largest."""
+    sizes = {file: file.stat().st_size for file in scene.files}
+    largest = max(sizes, key=lambda file: sizes[file])
+    return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
+
+
+def _notes(report: RoomReport) -> tuple[str, ...]:
+    """Return what was passed over in a room, a line each."""
+    skipped = [f"{item.file.name} not read: {item.reason}" for item in report.skipped]
+    return (*skipped, *(f"{file.name} taken as clutter" for file in report.as_clutter))
+
+
+PNG_SIZE = struct.Struct(">II")
+PNG_SIZE_AT = 16
+
+
+@dataclass(frozen=True)
+class RGBDSource:
+    """The depth frames of a folder.
+
+    Files of each frame, all of its height and width: ``coord`` ``(H, W, 3)``, ``normal``
+    ``(H, W, 3)``, ``curvature`` and ``plane`` ``(H, W)`` as ``.npy``, and ``planes.json``. In world
+    coordinates where the pose is known, else in camera coordinates; pixels without depth have zeros
+    and plane -1.
+
+    Args:
+        root: The folder.
+        settings: How to segment.
+        layout: Its shape; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
+        intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
+        depth_scale: Stored value of one metre. Default: the layout's.
+    """
+
+    root: Path
+    settings: DepthConfig
+    layout: str
+    intrinsics: tuple[float, float, float, float] | None = None
+    depth_scale: float | None = None
+    in_place: ClassVar[bool] = False
+    bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
+
+    def describe(self) -> dict[str, Any]:
+        """Return kind, shape of the folder and what was said about the camera."""
+        return {
+            "kind": "rgbd",
+            "layout": self.layout,
+            "intrinsics": None if self.intrinsics is None else list(self.intrinsics),
+            "depth_scale": self.depth_scale,
+        }
+
+    def list_scans(self) -> list[Scan]:
+        """Return the frames in natural order.
+
+        Raises:
+            FormatError: If there is none, or a file that says where they are is damaged.
+            ConfigError: If the layout has no intrinsics or scale, and they are not given.
+        """
+        matrix = None
+        if self.intrinsics is not None:
+            fx, fy, cx, cy = self.intrinsics
+            matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+        frames = RGBDFrames.from_folder(
+            self.root, self.layout, intrinsics=matrix, depth_scale=self.depth_scale
+        ).frames
+        return [
+            Scan(frame.name, (frame.depth, *frame.sources), _num_pixels(frame.depth), _plain(frame))
+            for frame in frames
+        ]
+
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
+        """Read, segment and write one frame.
+
+        Raises:
+            FormatError: If it cannot be read or has no depth, or a result not be written.
+        """
+        begin("read")
+        frame = _frame(scan.item)
+        sample = RGBDFrames([frame])[0]
+        depth, intrinsics = sample["depth"][0], sample["intrinsics"]
+        if not bool((depth > 0).any()):
+            raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
+        begin("planes")
+        found = segment_depth(depth, intrinsics, self.settings, pose=frame.pose)
+        points = depth_to_points(depth[None].double(), intrinsics[None])[0]
+        if frame.pose is not None:
+            pose = frame.pose.to(points)
+            points = points @ pose[:3, :3].T + pose[:3, 3]
+        coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
+        begin("write")
+        files = write_results(folder, coord, found)
+        num_points, num_planes = depth.numel(), len(found.planes.count)
+        notes = () if num_planes else ("no plane found",)
+        return Converted(num_points, num_planes, tuple(files), warnings=notes)
+
+
+def _num_pixels(path: Path) -> int:
+    """Return the number of pixels of a depth image from its header, 0 if it is damaged."""
+    if path.suffix.lower() != ".png":
+        return estimate_points(path) if path.stat().st_size == 0 else path.stat().st_size // 2
+    with path.open("rb") as stream:
+        head = stream.read(PNG_SIZE_AT + PNG_SIZE.size)
+    return int(np.prod(PNG_SIZE.unpack_from(head, PNG_SIZE_AT))) if len(head) == 24 else 0
+
+
+def _plain(frame: RGBDFrame) -> dict[str, Any]:
+    """Return a frame as plain values."""
+    return {
+        "depth": frame.depth,
+        "intrinsics": frame.intrinsics.tolist(),
+        "depth_scale": frame.depth_scale,
+        "name": frame.name,
+        "pose": None if frame.pose is None else frame.pose.tolist(),
+        "no_depth": frame.no_depth,
+    }
+
+
+def _frame(values: dict[str, Any]) -> RGBDFrame:
+    """Return the frame that plain values describe."""
+    matrices = {
+        name: None if values[name] is None else torch.tensor(values[name], dtype=torch.float64)
+        for name in ("intrinsics", "pose")
+    }
+    return RGBDFrame(**(values | matrices))

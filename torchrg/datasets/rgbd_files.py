@@ -1,0 +1,250 @@
+"""Depth, colour and poses from files."""
+
+import os
+from bisect import bisect_left
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg.errors import ConfigError, FormatError
+
+DEPTH_SUFFIXES = (".png", ".npy")
+"""Suffixes of depth images."""
+
+
+def read_depth(
+    path: str | os.PathLike[str], *, depth_scale: float, no_depth: int | None = None
+) -> Tensor:
+    """Read a depth image.
+
+    Args:
+        path: A gray PNG of 16 bits, or a ``.npy`` of shape ``(H, W)`` with numbers.
+        depth_scale: Stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for metres. It
+            is not in the files, and never guessed.
+        no_depth: Stored value that means "no depth" beside 0 (65535 in 7-Scenes).
+
+    Returns:
+        Depth in metres, shape ``(H, W)``, float32; 0 where there is none (0, negative, not finite).
+
+    Raises:
+        FormatError: If the file is missing, damaged, or not a depth image.
+        ConfigError: If ``depth_scale`` is not positive.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "depth.npy"
+        >>> np.save(path, np.array([[1500, 0]], dtype=np.uint16))
+        >>> read_depth(path, depth_scale=1000)
+        tensor([[1.5000, 0.0000]])
+    """
+    if not 0 < depth_scale < float("inf"):
+        raise ConfigError(f"read_depth: expected depth_scale > 0, got {depth_scale}.")
+    source = Path(path)
+    if source.suffix.lower() not in DEPTH_SUFFIXES:
+        known = " ".join(DEPTH_SUFFIXES)
+        raise FormatError(
+            f"{source}: expected a depth image that ends in one of {known}, got {source.suffix!r}."
+        )
+    stored = _read_npy(source) if source.suffix.lower() == ".npy" else _read_png16(source)
+    depth = stored.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        bad = ~(np.isfinite(depth) & (depth > 0))
+    if no_depth is not None:
+        bad |= stored == no_depth
+    return torch.from_numpy((np.where(bad, 0, depth) / depth_scale).astype(np.float32))
+
+
+def read_color(path: str | os.PathLike[str]) -> Tensor:
+    """Read a colour image.
+
+    Args:
+        path: PNG or JPEG of 8 bits a channel.
+
+    Returns:
+        Red, green and blue, shape ``(3, H, W)``, uint8; a gray image has three equal channels.
+
+    Raises:
+        FormatError: If the file is missing, damaged, or not such an image.
+
+    Example:
+        >>> read_color("missing.png")
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.FormatError: missing.png: cannot be read: No such file or directory.
+    """
+    from kornia_rs import io
+
+    source = _existing(Path(path))
+    try:
+        image = np.asarray(io.read_image(str(source)))
+    except Exception as error:
+        raise FormatError(f"{source}: expected a PNG or JPEG image, got {error}.") from error
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise FormatError(
+            f"{source}: expected a colour image of 8 bits a channel, got shape {image.shape} and "
+            f"{image.dtype}."
+        )
+    channels = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
+    return torch.from_numpy(np.ascontiguousarray(channels.transpose(2, 0, 1)))
+
+
+def _read_png16(source: Path) -> NDArray[np.uint16]:
+    """Return the values of a gray PNG of 16 bits, shape ``(H, W)``."""
+    from kornia_rs import io
+
+    _existing(source)
+    try:
+        # Without a mode, the library says how many bits and channels there are.
+        image = np.asarray(io.read_image(str(source)))
+    except Exception as error:
+        raise FormatError(f"{source}: expected a PNG image, got {error}.") from error
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 1:
+        raise FormatError(
+            f"{source}: expected a gray PNG of 16 bits, got shape {image.shape} and {image.dtype}; "
+            "depth does not fit into 8 bits or colours."
+        )
+    values: NDArray[np.uint16] = image[..., 0]
+    return values
+
+
+def _read_npy(source: Path) -> NDArray[np.number]:
+    """Return the values of a ``.npy`` file, shape ``(H, W)``."""
+    _existing(source)
+    try:
+        values: NDArray[np.number] = np.load(source, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise FormatError(f"{source}: expected an array of numbers, got {error}.") from error
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
+        raise FormatError(
+            f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}."
+        )
+    return values
+
+
+def _existing(source: Path) -> Path:
+    """Return a path to a file that can be opened.
+
+    Raises:
+        FormatError: If it cannot.
+    """
+    try:
+        with source.open("rb"):
+            return source
+    except OSError as error:
+        raise FormatError(f"{source}: cannot be read: {error.strerror}.") from error
+
+
+MOST_SECONDS = 0.02
+"""Images and poses further apart in time do not belong together."""
+
+
+def read_matrix(path: Path) -> Tensor:
+    """Read a matrix of four rows of four numbers.
+
+    Args:
+        path: A text file.
+
+    Returns:
+        Shape ``(4, 4)``, float64.
+
+    Raises:
+        FormatError: If the file is missing or holds something else.
+    """
+    rows = _rows(path)
+    if [len(row) for row in rows] != [4] * 4:
+        raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
+    return torch.tensor(_numbers(path, rows), dtype=torch.float64)
+
+
+def read_timed(path: Path) -> tuple[list[float], list[str]]:
+    """Read a list of times and file names.
+
+    Args:
+        path: A text file with a time and a name in each row; ``#`` begins a comment.
+
+    Returns:
+        Times, ascending, and names.
+
+    Raises:
+        FormatError: If the file is missing or holds something else.
+    """
+    rows = _rows(path)
+    if not rows or any(len(row) != 2 for row in rows):
+        raise FormatError(f"{path}: expected a time and a file name in each row.")
+    times = [row[0] for row in _numbers(path, [[row[0]] for row in rows])]
+    order = sorted(range(len(times)), key=times.__getitem__)
+    return [times[i] for i in order], [rows[i][1] for i in order]
+
+
+def read_trajectory(path: Path) -> tuple[list[float], Tensor]:
+    """Read poses by time.
+
+    Args:
+        path: A text file with ``time tx ty tz qx qy qz qw`` in each row; ``#`` begins a comment.
+
+    Returns:
+        Times, ascending, and matrices from camera to world, shape ``(n, 4, 4)``, float64.
+
+    Raises:
+        FormatError: If the file is missing or holds something else.
+    """
+    rows = _rows(path)
+    if not rows or any(len(row) != 8 for row in rows):
+        raise FormatError(f"{path}: expected time tx ty tz qx qy qz qw in each row.")
+    values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
+    values = values[values[:, 0].argsort(stable=True)]
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
+    poses[:, :3, :3] = _rotations(values[:, 4:])
+    poses[:, :3, 3] = values[:, 1:4]
+    return values[:, 0].tolist(), poses
+
+
+def nearest_times(times: list[float], others: list[float]) -> list[int | None]:
+    """Return the place of the nearest of ascending times, None where it is too far.
+
+    Example:
+        >>> nearest_times([1.0, 2.0], [0.5, 0.99, 1.0625, 2.5])
+        [1, None]
+    """
+    found: list[int | None] = []
+    for time in times:
+        place = bisect_left(others, time)
+        around = [i for i in (place - 1, place) if 0 <= i < len(others)]
+        best = min(around, key=lambda i: abs(others[i] - time), default=None)
+        near = best is not None and abs(others[best] - time) <= MOST_SECONDS
+        found.append(best if near else None)
+    return found
+
+
+def _rotations(quaternions: Tensor) -> Tensor:
+    """Return rotation matrices of quaternions x y z w of any length, shape ``(n, 3, 3)``."""
+    x, y, z, w = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(dim=1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def _rows(path: Path) -> list[list[str]]:
+    """Return the words of each row that is not a comment."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: expected text, got other bytes.") from error
+    words = (line.split("#")[0].replace(",", " ").split() for line in lines)
+    return [row for row in words if row]
+
+
+def _numbers(path: Path, rows: list[list[str]]) -> list[list[float]]:
+    """Return words as numbers."""
+    try:
+        return [[float(word) for word in row] for row in rows]
+    except ValueError as error:
+        raise FormatError(f"{path}: expected numbers: {error}.") from error

@@ -1,0 +1,163 @@
+"""From one depth image to planes."""
+
+import torch
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.depth.camera import depth_to_points, has_depth
+from torchrg.depth.config import DepthConfig
+from torchrg.depth.growth import grow_pixels
+from torchrg.depth.normals import PixelPlanes, fit_pixels
+from torchrg.depth.refine import InverseCloud
+from torchrg.regions import summarize_planes
+from torchrg.structures import Segmentation
+
+
+@torch.no_grad()
+def segment_depth(
+    depth: Tensor,
+    intrinsics: Tensor,
+    config: DepthConfig | None = None,
+    *,
+    pose: Tensor | None = None,
+) -> Segmentation:
+    """Segment a depth image into planes.
+
+    All is decided in inverse depth, where planes stay planes and the noise of a sensor that
+    triangulates does not depend on depth; see :func:`torchrg.depth.normals.fit_pixels`
+    and :func:`torchrg.depth.growth.grow_pixels`.
+
+    Convention:
+        Pixels without depth (0, negative, not finite, beyond ``max_depth``) belong to nothing, and
+        no neighbourhood crosses a step of the depth. The unit of the depth does not matter. Normals
+        point towards the camera.
+
+    Args:
+        depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
+        intrinsics: Camera matrix, shape ``(3, 3)``; see :func:`depth_to_points`.
+        config: Settings. Default: :class:`DepthConfig`.
+        pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
+            the world. Default: they are in camera coordinates.
+
+    Returns:
+        A segmentation whose ``labels``, ``normals``, ``curvature``, ``sharp`` and ``valid`` are
+        images: shapes ``(H, W)`` and ``(H, W, 3)``. Sharp are the pixels so near to an edge that no
+        flat window lies around them. An image without depth has no planes and is nowhere valid.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+
+    Example:
+        >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+        >>> depth = torch.full((30, 40), 2.0)
+        >>> depth[:, 20:] = 3.0
+        >>> found = segment_depth(depth, intrinsics)
+        >>> found.labels[0, ::13].tolist(), found.planes.offset.tolist()
+        ([0, 0, 1, 1], [2.0, 3.0])
+    """
+    depth = as_tensor("segment_depth", "depth", depth)
+    intrinsics = as_tensor("segment_depth", "intrinsics", intrinsics)
+    check_shapes(
+        "segment_depth",
+        depth=(depth, "H W"),
+        intrinsics=(intrinsics, "3 3"),
+        pose=(pose, "4 4"),
+    )
+    check_floating("segment_depth", depth=depth)
+    config = config or DepthConfig()
+    if config.max_depth is not None:
+        depth = torch.where(depth <= config.max_depth, depth, 0.0)
+    seen = has_depth(depth)
+    inverse = torch.where(seen, 1 / depth.double(), 0.0)
+    fx, fy, cx, cy = (float(intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    u = torch.arange(depth.shape[1], device=depth.device).double() - cx
+    v = torch.arange(depth.shape[0], device=depth.device).double()[:, None] - cy
+    pixels = fit_pixels(inverse, seen, u, v, noise=config.noise, dtype=depth.dtype)
+    normals, distance = _normals(pixels, fx, fy)
+    valid = seen & (pixels.radius > 0)
+    cloud = _inverse_cloud(inverse, seen, pixels, u / fx, v / fy, (fx, fy))
+    regions = grow_pixels(cloud, pixels, normals, u, v, config)
+    labels = regions.labels
+    curvature = torch.where(valid, _curvature(pixels, inverse, distance, u, v, (fx, fy)), 0.0)
+    normals = torch.where(valid[..., None], normals, 0.0).view(-1, 3)
+    # A window at a border that is not flat has no normal of its own; the region has.
+    borders = (~pixels.flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    borders = borders[~regions.curved[labels[borders]]]
+    normals[borders] = regions.normals[labels[borders]]
+    valid.view(-1)[borders] = True
+
+    points = depth_to_points(depth[None].double(), intrinsics[None].double())[0]
+    if pose is not None:
+        pose = pose.to(points)
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+        normals = normals @ pose[:3, :3].T
+    rows = seen.flatten().nonzero().squeeze(1)
+    planes = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
+    return Segmentation(
+        labels.view(depth.shape),
+        normals.view(*depth.shape, 3).to(depth.dtype),
+        curvature.to(depth.dtype),
+        pixels.edge,
+        valid,
+        planes._replace(curved=regions.curved),
+    )
+
+
+def _normals(pixels: PixelPlanes, fx: float, fy: float) -> tuple[Tensor, Tensor]:
+    """Return unit normals towards the camera ``(H, W, 3)``, and the planes' distance from it."""
+    planes = pixels.planes
+    away = torch.stack([planes.u_slope * fx, planes.v_slope * fy, planes.origin], dim=-1)
+    length = away.norm(dim=-1)
+    length = torch.where(length > 0, length, 1.0)
+    return -away / length[..., None], 1 / length
+
+
+def _inverse_cloud(
+    inverse: Tensor,
+    seen: Tensor,
+    pixels: PixelPlanes,
+    x: Tensor,
+    y: Tensor,
+    focal: tuple[float, float],
+) -> InverseCloud:
+    """Return the image as the cloud that regions grow in."""
+    unit = inverse[seen].median() if bool(seen.any()) else inverse.new_ones(())
+    points = torch.stack([x.expand_as(inverse), y.expand_as(inverse), inverse / unit], dim=-1)
+    fx, fy = focal
+    slopes = [pixels.planes.u_slope * (fx / unit), pixels.planes.v_slope * (fy / unit)]
+    normals = torch.stack([*slopes, -torch.ones_like(inverse)], dim=-1)
+    normals = normals / normals.norm(dim=-1, keepdim=True)
+    return InverseCloud(
+        points.view(-1, 3),
+        normals.view(-1, 3),
+        (pixels.noise / unit).flatten(),
+        seen.flatten(),
+    )
+
+
+def _curvature(
+    pixels: PixelPlanes,
+    inverse: Tensor,
+    distance: Tensor,
+    u: Tensor,
+    v: Tensor,
+    focal: tuple[float, float],
+) -> Tensor:
+    """Return the surface variation of the windows: their variance across the plane, of all.
+
+    A deviation e of inverse depth is one of ``distance * z * e`` from the plane; a step of a column
+    is one of ``(x_step - x_slope * z * ray) z`` along it.
+    """
+    z = 1 / torch.where(inverse > 0, inverse, 1.0)
+    across = distance * z * torch.where(pixels.radius > 0, pixels.planes.deviation, 0.0)
+    fx, fy = focal
+    ray = torch.stack([(u / fx).expand_as(z), (v / fy).expand_as(z), torch.ones_like(z)], dim=-1)
+    spread = pixels.radius.double() * (pixels.radius + 1) / 3
+    along = torch.zeros_like(z)
+    slopes = (pixels.planes.u_slope, pixels.planes.v_slope)
+    for axis, (slope, length) in enumerate(zip(slopes, focal, strict=True)):
+        step = -(slope * z)[..., None] * ray
+        step[..., axis] += 1 / length
+        along += spread * z * z * (step * step).sum(dim=-1)
+    total = across * across + along
+    return (across * across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)

@@ -1,0 +1,369 @@
+"""External indices: predicted plane labels against true ones."""
+
+from typing import Any, NamedTuple
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg.errors import ConfigError
+from torchrg.metrics.contingency import ContingencyTable, check_labels, contingency_table
+from torchrg.metrics.protocols import count_segcomp, score_evops, share
+
+
+def match_regions(table: ContingencyTable) -> Tensor:
+    """Pair each region with the face that it overlaps most and that it is overlapped most by.
+
+    A region and a face correspond when each is the other's largest overlap, in points [1].
+
+    Convention:
+        Equal overlaps are decided by the larger intersection over union, that is the smaller
+        partner; then by the lower label. The order of the points plays no part.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        The rows of the table's overlaps that are pairs, shape ``(P,)``, int64; no region and no
+        face occurs twice. Empty if nothing overlaps.
+
+    References:
+        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
+        Normal Estimation, section III.B.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([4, 4, 4, 5, 5]), torch.tensor([0, 0, 1, 1, 1]))
+        >>> pairs = match_regions(table)
+        >>> table.region_labels[table.regions[pairs]].tolist()
+        [4, 5]
+        >>> table.face_labels[table.faces[pairs]].tolist()
+        [0, 1]
+    """
+    face_sizes, region_sizes = table.face_sizes[table.faces], table.region_sizes[table.regions]
+    of_region = _first_of_each(table.regions, (-table.overlaps, face_sizes, table.faces))
+    of_face = _first_of_each(table.faces, (-table.overlaps, region_sizes, table.regions))
+    return (of_region & of_face).nonzero().squeeze(1)
+
+
+def best_iou(groups: Tensor, iou: Tensor, num_groups: int) -> Tensor:
+    """Return the largest IoU of each group, 0 for a group without overlaps, shape ``(G,)``."""
+    return iou.new_zeros(num_groups).scatter_reduce(0, groups, iou, "amax")
+
+
+def _first_of_each(groups: Tensor, keys: tuple[Tensor, ...]) -> Tensor:
+    """Mark the entry of each group that comes first by the keys, shape ``(E,)``, bool."""
+    order = torch.arange(len(groups), device=groups.device)
+    for key in (*reversed(keys), groups):
+        order = order[key[order].argsort(stable=True)]
+    ordered = groups[order]
+    first = torch.ones_like(ordered, dtype=torch.bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return torch.zeros_like(first).index_put((order,), first)
+
+
+class Partitions(NamedTuple):
+    """Sizes of the cells, rows and columns of two partitions of all points.
+
+    Attributes:
+        cells: Points that a part of the one and a part of the other share, int64.
+        rows: Points of each part of the prediction, int64.
+        columns: Points of each part of the truth, int64.
+        num_points: Number of points.
+    """
+
+    cells: Tensor
+    rows: Tensor
+    columns: Tensor
+    num_points: int
+
+
+def adjusted_rand_index(table: ContingencyTable) -> float:
+    r"""Return the Rand index corrected for chance [1].
+
+    Convention:
+        The unlabelled points of a side are one more part of it: the value is that of
+        scikit-learn's ``adjusted_rand_score`` for the same labels, -1 included.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        At most 1 (equal partitions), about 0 for independent ones, negative for worse. 1 for two
+        partitions without any pair of points to judge, one point or no point included.
+
+    References:
+        [1] L. Hubert, P. Arabie. Comparing partitions. Journal of Classification, 1985, eq. 5.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([5, 5, -1, 2]), torch.tensor([0, 0, 1, 3]))
+        >>> adjusted_rand_index(table)
+        1.0
+    """
+    parts = _with_unlabeled(table)
+    # Python's integers: products of two counts of pairs exceed 64 bits beyond 50,000 points.
+    together, predicted, true = (
+        int((sizes * (sizes - 1) // 2).sum()) for sizes in (parts.cells, parts.rows, parts.columns)
+    )
+    pairs = parts.num_points * (parts.num_points - 1) // 2
+    scale = pairs * (predicted + true) - 2 * predicted * true
+    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
+
+
+def normalized_mutual_information(table: ContingencyTable) -> float:
+    r"""Return ``2 I(C, G) / (H(C) + H(G))``, the information that two labellings share [1].
+
+    Convention:
+        The unlabelled points of a side are one more part of it: the value is that of
+        scikit-learn's ``normalized_mutual_info_score`` (arithmetic mean of the entropies).
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        In [0, 1]; 1 where both sides have one part only, or no point at all.
+
+    References:
+        [1] N. Vinh, J. Epps, J. Bailey. Information theoretic measures for clusterings comparison.
+        JMLR, 2010, table 2 (NMI_sum).
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]))
+        >>> normalized_mutual_information(table)
+        0.0
+    """
+    parts = _with_unlabeled(table)
+    n = max(parts.num_points, 1)
+    cells, rows, columns = (
+        -float(torch.special.xlogy(sizes / n, sizes / n).sum())
+        for sizes in (part.double() for part in (parts.cells, parts.rows, parts.columns))
+    )
+    if len(parts.rows) <= 1 and len(parts.columns) <= 1:
+        return 1.0
+    shared = rows + columns - cells
+    return min(max(2 * shared / (rows + columns), 0.0), 1.0)
+
+
+def segmentation_covering(table: ContingencyTable) -> float:
+    r"""Return the covering of the faces by the regions [1].
+
+    ``sum_j |G_j| max_i IoU(C_i, G_j) / sum_j |G_j|``: the mean best IoU weighted by size.
+
+    Convention:
+        Unlabelled points are no region and no face: truth without a face has no weight.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        In [0, 1]; 0 where there is no face.
+
+    References:
+        [1] P. Arbelaez et al. Contour detection and hierarchical image segmentation. TPAMI, 2011,
+        eq. 8.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([0, 0, 1, -1]), torch.tensor([3, 3, 4, 4]))
+        >>> segmentation_covering(table)
+        0.75
+    """
+    best = best_iou(table.faces, table.iou, len(table.face_sizes))
+    return float((best * table.face_sizes).sum() / table.face_sizes.sum().clamp(min=1))
+
+
+def _with_unlabeled(table: ContingencyTable) -> Partitions:
+    """Return the partitions in which the unlabelled points of each side are one more part."""
+    in_faces = table.overlaps.new_zeros(len(table.region_sizes))
+    in_faces.index_add_(0, table.regions, table.overlaps)
+    in_regions = table.overlaps.new_zeros(len(table.face_sizes))
+    in_regions.index_add_(0, table.faces, table.overlaps)
+    bare_regions = table.region_sizes - in_faces
+    bare_faces = table.face_sizes - in_regions
+    no_region = table.num_points - table.region_sizes.sum()
+    no_face = table.num_points - table.face_sizes.sum()
+    neither = no_region - bare_faces.sum()
+    cells = torch.cat([table.overlaps, bare_regions, bare_faces, neither[None]])
+    rows = torch.cat([table.region_sizes, no_region[None]])
+    columns = torch.cat([table.face_sizes, no_face[None]])
+    return Partitions(cells[cells > 0], rows[rows > 0], columns[columns > 0], table.num_points)
+
+
+class LabelScore(NamedTuple):
+    """External indices of a labelling; see :func:`score_labels`.
+
+    ``precision``, ``recall`` and ``f1`` are percentages as in the paper; counts are integers;
+    everything else is a share in [0, 1] (``ari`` can be negative). ``METRICS["labels"]`` holds
+    unit and direction of each.
+
+    Attributes:
+        precision: Mean over the pairs of ``100 |C & G| / |C|`` (section III.B), percent.
+        recall: Mean over the pairs of ``100 |C & G| / |G|`` (section III.B), percent.
+        f1: Harmonic mean of precision and recall (section III.B), percent.
+        pairs: Regions and faces that are each other's largest overlap.
+        regions: Predicted regions with a scored point.
+        faces: True faces with a scored point.
+        points: Scored points: all but those of the ignored label.
+        mean_best_iou: Mean over all faces of the largest IoU with a region.
+        precision_iou50: Regions with a face at IoU > 0.5, of all regions.
+        recall_iou50: Faces with a region at IoU > 0.5, of all faces.
+        precision_iou80: The same at IoU > 0.8.
+        recall_iou80: The same at IoU > 0.8.
+        correct: Correctly found faces by SegComp at 80 %.
+        over_segmented: Faces split into several regions by SegComp at 80 %.
+        under_segmented: Regions that merge several faces by SegComp at 80 %.
+        missed: Faces in none of these three by SegComp at 80 %.
+        noise: Regions in none of these three by SegComp at 80 %.
+        evops_precision: Regions that match a face by EVOPS (IoU >= 0.75), of all regions.
+        evops_recall: Faces that match a region by EVOPS, of all faces.
+        evops_f1: Harmonic mean of the two.
+        evops_mean_iou: Mean IoU of EVOPS' matches.
+        evops_mean_dice: Mean Dice coefficient of EVOPS' matches.
+        evops_over_segmented: Faces with several regions at IoU >= 0.2, of all faces.
+        evops_under_segmented: Regions with several faces at IoU >= 0.2, of all regions.
+        evops_missed: Faces without a counterpart by EVOPS, of all faces.
+        evops_noise: Regions without a counterpart by EVOPS, of all regions.
+        share_labeled: Scored points that lie in a region.
+        covering: Segmentation covering: mean best IoU weighted by the size of the face.
+        ari: Adjusted Rand index.
+        nmi: Normalised mutual information, arithmetic mean.
+    """
+
+    precision: float
+    recall: float
+    f1: float
+    pairs: int
+    regions: int
+    faces: int
+    points: int
+    mean_best_iou: float
+    precision_iou50: float
+    recall_iou50: float
+    precision_iou80: float
+    recall_iou80: float
+    correct: int
+    over_segmented: int
+    under_segmented: int
+    missed: int
+    noise: int
+    evops_precision: float
+    evops_recall: float
+    evops_f1: float
+    evops_mean_iou: float
+    evops_mean_dice: float
+    evops_over_segmented: float
+    evops_under_segmented: float
+    evops_missed: float
+    evops_noise: float
+    share_labeled: float
+    covering: float
+    ari: float
+    nmi: float
+
+
+def score_labels(
+    labels: Tensor | NDArray[Any],
+    truth: Tensor | NDArray[Any],
+    *,
+    min_size: int = 1,
+    ignore: int | None = None,
+) -> LabelScore:
+    """Score predicted plane labels against true ones.
+
+    Precision, recall and F1 are the paper's [1]: means over the one-to-one pairs that
+    :func:`match_regions` finds. They say nothing about regions and faces without a partner, so
+    the counts and the indices over all faces stand beside them.
+
+    Convention:
+        Labels are integers of any value and order; ``UNLABELED`` (-1) is "no region" in
+        ``labels`` and "no face" in ``truth``. How such points count:
+
+        * They belong to no region, or to no face, so none is matched, missed or noise.
+        * A point of no face still counts in its region's size, and lowers its precision and IoU;
+          a point of no region counts in its face's size, and lowers its recall and IoU.
+        * For ``ari`` and ``nmi`` the unlabelled points of each side are one more part, as when
+          the labels are given to scikit-learn. Pass ``ignore=-1`` to leave out the points of no
+          face altogether.
+        * ``covering`` and ``mean_best_iou`` are over faces only.
+
+    Args:
+        labels: Predicted label of each point, shape ``(N,)``, integers.
+        truth: True label of each point, shape ``(N,)``, integers.
+        min_size: Regions of fewer points count as unlabelled (the paper draws those of 50 and
+            more). Faces of any size count.
+        ignore: Points with this true label are left out of everything. Default: none is.
+
+    Returns:
+        The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
+        the counts tell it from a real 0. ``ari`` and ``nmi`` are 1 where neither side divides
+        the points.
+
+    Raises:
+        ShapeError: If the labels are not integers, or differ in length or device.
+        ConfigError: If ``min_size`` is below 1.
+
+    References:
+        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
+        Normal Estimation, section III.B. The other indices name theirs: :func:`count_segcomp`,
+        :func:`score_evops`, :func:`adjusted_rand_index`, :func:`normalized_mutual_information`,
+        :func:`segmentation_covering`.
+
+    Example:
+        >>> import torch
+        >>> score = score_labels(torch.tensor([8, 8, 8, 3, -1]), torch.tensor([0, 0, 1, 1, 1]))
+        >>> score.pairs, round(score.precision, 1), round(score.recall, 1), round(score.f1, 1)
+        (2, 83.3, 66.7, 74.1)
+        >>> score.recall_iou50, score.share_labeled
+        (0.5, 0.8)
+    """
+    labels, truth = check_labels("score_labels", labels=labels, truth=truth)
+    if min_size < 1:
+        raise ConfigError(f"score_labels: expected min_size >= 1, got {min_size!r}.")
+    table = contingency_table(labels, truth, min_size=min_size, ignore=ignore)
+    num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
+    precision, recall, num_pairs = pair_precision_recall(table)
+    matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))
+    best = best_iou(table.faces, table.iou, num_faces)
+    segcomp, evops = count_segcomp(table), score_evops(table)
+    return LabelScore(
+        precision=precision,
+        recall=recall,
+        f1=share(2 * precision * recall, precision + recall),
+        pairs=num_pairs,
+        regions=num_regions,
+        faces=num_faces,
+        points=table.num_points,
+        mean_best_iou=share(float(best.sum()), num_faces),
+        precision_iou50=share(matched50, num_regions),
+        recall_iou50=share(matched50, num_faces),
+        precision_iou80=share(matched80, num_regions),
+        recall_iou80=share(matched80, num_faces),
+        **segcomp._asdict(),
+        **{f"evops_{name}": value for name, value in evops._asdict().items()},
+        share_labeled=share(int(table.region_sizes.sum()), table.num_points),
+        covering=segmentation_covering(table),
+        ari=adjusted_rand_index(table),
+        nmi=normalized_mutual_information(table),
+    )
+
+
+def pair_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
+    """Return the mean precision and recall of the pairs, in percent, and how many pairs there are.
+
+    Section III.B of the paper: ``P = 100 TP / (TP + FP)``, ``R = 100 TP / (TP + FN)`` with TP the
+    points that region and face share. 0 where there is no pair.
+
+    Example:
+        >>> import torch
+        >>> table = contingency_table(torch.tensor([0, 0, 0, 0]), torch.tensor([5, 5, 5, -1]))
+        >>> pair_precision_recall(table)
+        (75.0, 100.0, 1)
+    """
+    pairs = match_regions(table)
+    shared = 100 * table.overlaps[pairs].double()
+    precision = shared / table.region_sizes[table.regions[pairs]]
+    recall = shared / table.face_sizes[table.faces[pairs]]
+    count = len(pairs)
+    return share(float(precision.sum()), count), share(float(recall.sum()), count), count

@@ -1,0 +1,360 @@
+"""Hypotheses at a broken point: the plane with the most votes, two planes that meet, and three."""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg._parallel import chunks_of
+from torchrg.linalg import above, at_most
+from torchrg.linalg.moments import (
+    Columns,
+    along,
+    fit_planes,
+    fit_planes_to_each,
+    residuals,
+    sq_lengths,
+)
+
+_NUM_PAIRS = 32
+_THINNEST_TRIANGLE = 0.1
+_VOTE_TOLERANCE = 2.0
+_FIT_TOLERANCE = 3.5
+_ROWS = 8192
+"""Points times candidates that are scored in one step."""
+
+
+def vote_planes(
+    columns: Columns, noise: Tensor, start: Tensor, counted: Tensor
+) -> tuple[Tensor, Tensor]:
+    r"""Find the plane through each point that the most neighbours support on one side.
+
+    Candidates are the plane of normal ``start`` and 32 planes through the point and two neighbours
+    of fixed ranks. With residuals ``r_j`` in units of twice the noise and weights
+    ``w_j = 1 - 0.9 d_j^2 / d_max^2``, the score of a candidate is
+
+    .. math:: \sum_j w_j \max(0, 1 - r_j^2) - \min\big(\sum_{r_j > 1} w_j,\ \sum_{r_j < -1} w_j\big)
+
+    The second term prefers planes that have everything else on one side, as every face of an edge,
+    of a corner and of a plate has. The best candidate is fitted anew to the neighbours within reach
+    of it, first closely, then with the bisquare weights that use nearly all the points of a face.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        noise: Standard deviation of the noise, shape ``(n,)``, positive.
+        start: Normals to try first, shape ``(n, 3)``.
+        counted: Weights 0 or 1, shape ``(n, K)``.
+
+    Returns:
+        Unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes ``normal . q = offset``.
+
+    Example:
+        >>> from torchrg.linalg.moments import split_columns
+        >>> x, y = torch.arange(-2.0, 3), torch.arange(0.0, 4)
+        >>> floor = torch.cartesian_prod(x, y, torch.zeros(1))
+        >>> wall = floor[:, [0, 2, 1]]
+        >>> corner = torch.cat([floor, wall]).sub_(torch.tensor([0.0, 1.0, 0.0]))[None]
+        >>> up = torch.tensor([[0.0, 0.7071, 0.7071]])
+        >>> columns, noise = split_columns(corner), torch.tensor([0.01])
+        >>> vote_planes(columns, noise, up, torch.ones(1, 40))[0].abs()
+        tensor([[0., 0., 1.]])
+    """
+    sq_distances = sq_lengths(columns)
+    farthest = (sq_distances * counted).amax(dim=1, keepdim=True)
+    nearness = sq_distances / torch.where(farthest > 0, farthest, 1.0)
+    weights = (1 - 0.9 * nearness) * counted
+    reach = _VOTE_TOLERANCE * noise
+    best, normals = _score(columns, weights, start, reach), start
+    candidates, broad = _planes_through(columns, _pairs(sq_distances.shape[1]))
+    # Few points are scored for several candidates in one step.
+    for some in chunks_of(len(candidates), max(1, _ROWS // max(len(noise), 1))):
+        scores = _score(columns, weights, candidates[some], reach)
+        scores = torch.where(broad[some], scores, -torch.inf)
+        for candidate, score in zip(candidates[some], scores, strict=True):
+            better = score > best
+            best = torch.where(better, score, best)
+            normals = torch.where(better[:, None], candidate, normals)
+    offsets = torch.zeros_like(noise)
+    for _ in range(2):
+        near = _within(residuals(columns, normals, offsets), reach)
+        normals, offsets = _refit(columns, weights * near, normals, offsets)
+    weights = (1 - 0.5 * nearness) * counted
+    for _ in range(2):
+        near = _within(residuals(columns, normals, offsets), _FIT_TOLERANCE * noise).square_()
+        normals, offsets = _refit(columns, weights * near, normals, offsets)
+    return normals, offsets
+
+
+def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
+    """Return the score of planes by their residuals in units of the reach.
+
+    Args:
+        rests: Residuals, shape ``(*, n, K)``.
+        weights: Weights, shape ``(n, K)``.
+
+    Returns:
+        Shape ``(*, n)``.
+    """
+    support = (1 - rests * rests).clamp_(min=0).mul_(weights).sum(dim=-1)
+    over = above(rests, 1).mul_(weights).sum(dim=-1)
+    under = above(-rests, 1).mul_(weights).sum(dim=-1)
+    return support - torch.minimum(over, under)
+
+
+def _score(columns: Columns, weights: Tensor, normals: Tensor, reach: Tensor) -> Tensor:
+    """Return the score of planes through the points."""
+    scaled = normals / reach[:, None]
+    return support_scores(along(columns, scaled), weights)
+
+
+def _within(rests: Tensor, reach: Tensor) -> Tensor:
+    """Return ``max(0, 1 - (r / reach)^2)``."""
+    rests = rests / reach[:, None]
+    return (1 - rests * rests).clamp_(min=0)
+
+
+def _refit(
+    columns: Columns, weights: Tensor, normals: Tensor, offsets: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return fitted planes; the given ones where the weighted points span none."""
+    fitted, moved, values = fit_planes(columns, weights)
+    spread = values[:, 1] > 1e-6 * values[:, 2]
+    return (
+        torch.where(spread[:, None], fitted, normals),
+        torch.where(spread, moved, offsets),
+    )
+
+
+def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor]:
+    """Return planes through the points and two neighbours, and whether the triangles are broad.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        pairs: Ranks of the two neighbours.
+
+    Returns:
+        Unit normals ``(P, n, 3)`` and flags ``(P, n)``.
+    """
+    ranks = torch.tensor(pairs, dtype=torch.int64, device=columns[0].device).view(-1, 2)
+    by_rank = [column.t() for column in columns]
+    a, b, c = (column.index_select(0, ranks[:, 0]) for column in by_rank)
+    d, e, f = (column.index_select(0, ranks[:, 1]) for column in by_rank)
+    x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
+    sq_area = x * x + y * y + z * z
+    sq_sides = (a * a + b * b + c * c) * (d * d + e * e + f * f)
+    broad = sq_area > _THINNEST_TRIANGLE**2 * sq_sides
+    length = torch.where(broad, sq_area, 1.0).sqrt_()
+    return torch.stack([x / length, y / length, z / length], dim=-1), broad
+
+
+@cache
+def _pairs(num_neighbors: int) -> tuple[tuple[int, int], ...]:
+    """Return pairs of ranks: spread over all neighbours, the near ones more often."""
+    last = num_neighbors - 1
+    if last < 2:
+        return ()
+    # The plastic number's low-discrepancy sequence covers the square of pairs evenly.
+    steps = np.arange(1, 8 * _NUM_PAIRS)[:, None] * np.array([0.7548776662466927, 0.569840290998])
+    ranks = 1 + np.floor(last * (steps % 1.0) ** 1.5).astype(int)
+    pairs = dict.fromkeys((min(a, b), max(a, b)) for a, b in ranks.tolist() if a != b)
+    return tuple(pairs)[:_NUM_PAIRS]
+
+
+_NUM_ROUNDS = 4
+_GAP = 2.0
+_LEAST_POINTS = 5
+_PLANE_PARAMETERS = 3
+
+
+class Pieces(NamedTuple):
+    """The plane of each point, one of several that explain its neighbourhood.
+
+    Attributes:
+        normals: Unit normals, shape ``(n, 3)``.
+        offsets: Of the planes ``normal . q = offset`` about the point, shape ``(n,)``.
+        deviations: Standard deviation of all neighbours from the planes, three degrees of freedom
+            less for each, shape ``(n,)``; infinite where a plane has fewer than five points.
+    """
+
+    normals: Tensor
+    offsets: Tensor
+    deviations: Tensor
+
+
+class Wedge(NamedTuple):
+    """Two planes that meet.
+
+    Attributes:
+        pieces: The plane of each point.
+        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``.
+        second: Points of the second plane, likewise.
+        outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
+    """
+
+    pieces: Pieces
+    first: Tensor
+    second: Tensor
+    outer: Tensor
+
+
+def fit_wedges(
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
+) -> Wedge:
+    r"""Fit the surface of the intersection of two half-spaces to each neighbourhood.
+
+    Let ``e_1`` and ``e_2`` be the distances of a point inside the two planes, each towards the side
+    where the points of the other plane are. The solid between them has the signed distance
+    ``min(e_1, e_2)``: each point belongs to the plane where it is least inside (ridges and valleys,
+    sharp or blunt, alike). Planes and sides are fitted in turn, from one plane and the points
+    beyond twice the noise on its fuller side. The point itself belongs to a plane by the same rule,
+    which, unlike the nearest of two unbounded planes, is right for points that noise has moved out
+    of the solid.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        normals: One plane of each neighbourhood, shape ``(n, 3)``.
+        offsets: Its offsets, shape ``(n,)``.
+        noise: Standard deviation of the noise, shape ``(n,)``.
+        counted: Weights 0 or 1, shape ``(n, K)``.
+
+    Returns:
+        The plane of each point, and how well the two explain all points.
+
+    Example:
+        >>> from torchrg.linalg.moments import split_columns
+        >>> x, y = torch.arange(-2.0, 3), torch.arange(0.0, 4)
+        >>> floor = torch.cartesian_prod(x, y, torch.zeros(1))
+        >>> corner = torch.cat([torch.tensor([[0.0, 1, 0]]), floor, floor[:, [0, 2, 1]]])
+        >>> columns = split_columns((corner - corner[:1])[None])
+        >>> start, zero, noise = torch.tensor([[0.0, 1, 0]]), torch.zeros(1), torch.tensor([0.1])
+        >>> pieces = fit_wedges(columns, start, zero - 1, noise, torch.ones(1, 41)).pieces
+        >>> pieces.normals.abs(), bool(pieces.deviations < 0.01)
+        (tensor([[0., 0., 1.]]), True)
+    """
+    rests = residuals(columns, normals, offsets)
+    second = _beyond(rests, noise, counted)
+    first = _near(rests, noise) * counted
+    present = torch.ones_like(noise, dtype=torch.bool)
+    for _ in range(_NUM_ROUNDS):
+        present &= _all_present((first, second))
+        planes = fit_planes_to_each(columns, (first, second))
+        inside = (
+            _inside(residuals(columns, *planes[0]), second),
+            _inside(residuals(columns, *planes[1]), first),
+        )
+        outer = torch.minimum(*inside)
+        first = above(inside[1], inside[0]).mul_(counted)
+        second = counted - first
+    return Wedge(_summary(planes, (first, second), outer, present, counted), first, second, outer)
+
+
+def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> Pieces:
+    r"""Fit three half-spaces, from a first guess which points lie on which.
+
+    Corners where three faces meet; rims of plates, where both faces of the plate are among the
+    neighbours; steps and reveals. The first two planes are a wedge, as in :func:`fit_wedges`. If
+    the third group begins inside of it, its half-space cuts the wedge, ``min(e_1, e_2, e_3)``;
+    otherwise it is added, ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of
+    the first two groups.
+
+    Args:
+        columns: Coordinates of the neighbours about each point.
+        groups: Points of three planes, weights 0 or 1, each of shape ``(n, K)``.
+        counted: Weights 0 or 1, shape ``(n, K)``.
+
+    Returns:
+        The plane of each point, and how well the three explain all points.
+    """
+    first, second, third = groups
+    present = torch.ones_like(counted[:, 0], dtype=torch.bool)
+    side: Tensor | None = None
+    for _ in range(_NUM_ROUNDS):
+        present &= _all_present((first, second, third))
+        planes = fit_planes_to_each(columns, (first, second, third))
+        rests = [residuals(columns, *plane) for plane in planes]
+        inside = _inside(rests[0], second), _inside(rests[1], first)
+        wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
+        if side is None:
+            side = _side((wedge * third).sum(dim=1))
+        wedge *= side
+        outer = torch.minimum(added, wedge) * side
+        third = above(wedge, added).mul_(counted)
+        first = above(inside[1], inside[0]).mul_(counted - third)
+        second = counted - third - first
+    return _summary(planes, (first, second, third), outer, present, counted)
+
+
+def split_off(wedge: Wedge, noise: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the two groups of a wedge, and as a third the points off it on its fuller side."""
+    third = _beyond(wedge.outer, noise, counted)
+    return wedge.first * (1 - third), wedge.second * (1 - third), third
+
+
+def split_by_votes(
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the points near a plane, those near the most voted plane of the rest, and the others.
+
+    The plane of the rest passes through the nearest of its points.
+    """
+    first = _near(residuals(columns, normals, offsets), noise) * counted
+    rest = counted - first
+    anchor = rest.argmax(dim=1, keepdim=True)
+    moved = tuple(column - column.gather(1, anchor) for column in columns)
+    about: Columns = (moved[0], moved[1], moved[2])
+    plane = vote_planes(about, noise, fit_planes(about, rest)[0], rest)
+    second = _near(residuals(about, *plane), noise) * rest
+    return first, second, rest - second
+
+
+def _near(rests: Tensor, noise: Tensor) -> Tensor:
+    """Return which points are within twice the noise of a plane, as 0 or 1."""
+    return at_most(rests.abs(), (_GAP * noise)[:, None])
+
+
+def _beyond(rests: Tensor, noise: Tensor, counted: Tensor) -> Tensor:
+    """Return the points off a surface by more than twice the noise, on the side with more."""
+    gap = _GAP * noise[:, None]
+    over, under = above(rests, gap).mul_(counted), above(-rests, gap).mul_(counted)
+    more = at_most(under.sum(dim=1), over.sum(dim=1))[:, None]
+    return over.mul_(more).add_(under.mul_(1 - more))
+
+
+def _inside(rests: Tensor, others: Tensor) -> Tensor:
+    """Return distances from a plane, positive on the side where other points are."""
+    return rests * _side((rests * others).sum(dim=1))
+
+
+def _side(totals: Tensor) -> Tensor:
+    """Return 1 or, for a negative total, -1, shape ``(n, 1)``."""
+    return torch.where(totals >= 0, 1.0, -1.0).to(totals.dtype)[:, None]
+
+
+def _all_present(groups: Sequence[Tensor]) -> Tensor:
+    """Return where every group has enough points for a plane of its own."""
+    present = groups[0].sum(dim=1) >= _LEAST_POINTS
+    for group in groups[1:]:
+        present &= group.sum(dim=1) >= _LEAST_POINTS
+    return present
+
+
+def _summary(
+    planes: Sequence[tuple[Tensor, Tensor]],
+    groups: Sequence[Tensor],
+    outer: Tensor,
+    present: Tensor,
+    counted: Tensor,
+) -> Pieces:
+    """Return the plane whose group each point is in, and the deviation from all planes."""
+    normals, offsets = planes[0]
+    for (normal, offset), group in zip(planes[1:], groups[1:], strict=True):
+        own = group[:, 0] > 0
+        normals = torch.where(own[:, None], normal, normals)
+        offsets = torch.where(own, offset, offsets)
+    freedom = (counted.sum(dim=1) - _PLANE_PARAMETERS * len(planes)).clamp_(min=1)
+    deviations = ((outer * outer * counted).sum(dim=1) / freedom).sqrt_()
+    deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
+    return Pieces(normals, offsets, deviations)

@@ -1,0 +1,197 @@
+"""How noisy the points are, from neighbourhoods of several sizes."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg._parallel import each_block
+from torchrg.linalg import covariance
+from torchrg.linalg.moments import (
+    coordinate_resolution,
+    fit_planes,
+    residuals,
+    split_columns,
+    sq_lengths,
+)
+from torchrg.neighbors import gather_patches
+from torchrg.structures import Neighbors, NormalFit
+
+_BLOCK = 8192
+_QUANTILE = 0.35
+_COMMON_QUANTILE = 0.15
+_MOST_ABOVE = 3.0
+_NARROW = 0.03
+
+
+class _Size(NamedTuple):
+    """A number of neighbours, and what planes of that many points say of the noise.
+
+    Attributes:
+        num_points: Number of neighbours.
+        factor: Noise by the 35th percentile of the deviations, on a plane with little noise.
+        limit: What that tends to as noise grows, by the radius that so many points of a plane have.
+    """
+
+    num_points: int
+    factor: float
+    limit: float
+
+
+_SMALL_SIZES = (_Size(8, 1.22, 0.3425), _Size(16, 1.1, 0.398))
+_WHOLE_FACTOR = 1.04
+
+
+class Survey(NamedTuple):
+    """What the plane of each neighbourhood leaves unexplained.
+
+    Attributes:
+        offsets: Distance of the fitted plane from the point along the normal, shape ``(N,)``.
+        deviations: Standard deviation of the residuals (3 degrees of freedom less), ``(N,)``.
+        noise: Standard deviation of the noise, positive, shape ``(N,)``; infinite where too few
+            neighbours have a plane.
+        radius: Distance of the farthest neighbour, shape ``(N,)``.
+    """
+
+    offsets: Tensor
+    deviations: Tensor
+    noise: Tensor
+    radius: Tensor
+
+
+def survey_noise(
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = 16384
+) -> Survey:
+    r"""Estimate the noise about each point, at edges and on curved surfaces too.
+
+    The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
+    points lie on one smooth face, and more elsewhere. Small neighbourhoods do so more often, so the
+    estimate is the least of three, for m = 8, 16 and all neighbours, of
+    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``, where ``q`` is the 35th percentile
+    over the neighbours, ``c_m`` the factor that makes it unbiased for a plane, and the root undoes
+    that a plane of few points turns with their noise (``R_m = R (m / K)^(1/2)``: their radius, from
+    that of all; ``a_m``: measured on noisy planes). A place counts once, however many points are
+    there; neighbourhoods almost on one line, as on scan lines, do not count. At corners, where none
+    of the three finds a face, the noise is at most 3 times the 15th percentile of that of the
+    neighbours.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        neighbors: Neighbours of all points.
+        fit: Planes of all neighbours.
+        chunk_size: Points handled at a time.
+
+    Returns:
+        Offsets, deviations, noise and radius. Noise is at least the rounding of the coordinates.
+
+    Example:
+        >>> from torchrg.neighbors import search_knn
+        >>> from torchrg.normals import estimate_normals
+        >>> floor = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
+        >>> floor[:, 2] = 0.01 * torch.randn(500, generator=torch.Generator().manual_seed(1))
+        >>> neighbors = search_knn(floor, 50)
+        >>> fit = estimate_normals(floor, method="paper", neighbors=neighbors)
+        >>> survey = survey_noise(floor, neighbors, fit)
+        >>> bool((survey.noise.median() - 0.01).abs() < 0.001)
+        True
+    """
+    offsets, radius, whole = (torch.empty_like(points[:, 0]) for _ in range(3))
+    small = [torch.empty_like(whole) for _ in _SMALL_SIZES]
+
+    def work(block: slice) -> None:
+        found = _deviations(points, neighbors, fit, block)
+        for values, part in zip((offsets, radius, whole, *small), found, strict=True):
+            values[block] = part
+
+    each_block(work, len(points), chunk_size, points.device)
+    floor = torch.maximum(
+        coordinate_resolution(points), radius * (4 * torch.finfo(points.dtype).eps)
+    )
+    noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors, _QUANTILE)
+    count: Tensor | int = neighbors.indices.shape[1]
+    if neighbors.valid is not None:
+        count = neighbors.valid.sum(dim=1)
+    for size, values in zip(_SMALL_SIZES, small, strict=True):
+        found = size.factor * _neighbor_quantiles(values, neighbors, _QUANTILE)
+        near = radius * (size.num_points / torch.as_tensor(count, dtype=radius.dtype)).sqrt()
+        share = found / torch.where(radius > 0, size.limit * near, 1.0)
+        below = (1 - share * share).clamp_(min=0)
+        scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
+        noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
+    common = _neighbor_quantiles(noise, neighbors, _COMMON_QUANTILE)
+    noise = torch.minimum(noise, _MOST_ABOVE * common)
+    return Survey(offsets, whole, torch.maximum(noise, floor), radius)
+
+
+def _deviations(
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, block: slice
+) -> tuple[Tensor, ...]:
+    """Return offsets, radius and deviations from planes of all and of the nearest neighbours."""
+    patches = gather_patches(points, neighbors.indices[block])
+    mask = None if neighbors.valid is None else neighbors.valid[block]
+    columns = split_columns(patches)
+    counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
+    normals, valid = fit.normals[block], fit.valid[block]
+    count = counted.sum(dim=1)
+    center = covariance(patches, mask)[0]
+    offsets = (normals * center).sum(dim=1)
+    rests = residuals(columns, normals, offsets)
+    spread = (rests * rests * counted).sum(dim=1) / (count - 3).clamp_(min=1)
+    whole = torch.where(valid & (count > 3), spread.sqrt_(), torch.inf)
+    radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
+    patches, counted = _each_place_once(patches, counted)
+    small = [_small_deviations(patches, counted, size.num_points) for size in _SMALL_SIZES]
+    return offsets, radius, whole, *small
+
+
+def _each_place_once(patches: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+    """Move neighbours at the place of the one before to the end, where they do not count."""
+    if patches.shape[1] < 2:
+        return patches, counted
+    moves = torch.zeros_like(counted[:, 1:])
+    for column in patches.unbind(dim=-1):
+        moves += (column[:, 1:] - column[:, :-1]).abs_()
+    rows = (moves.amin(dim=1) == 0).nonzero().squeeze(-1)
+    if len(rows) == 0:
+        return patches, counted
+    again = torch.zeros_like(counted[rows], dtype=torch.bool)
+    again[:, 1:] = moves[rows] == 0
+    order = again.to(torch.uint8).argsort(dim=1, stable=True)
+    once = (counted[rows] * ~again).gather(1, order)
+    moved = patches[rows].gather(1, order[:, :, None].expand(-1, -1, 3))
+    return patches.index_copy(0, rows, moved), counted.index_copy(0, rows, once)
+
+
+def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
+    """Return deviations of the nearest points from their plane; inf where they span none."""
+    if patches.shape[1] < count:
+        return patches.new_full(patches.shape[:1], torch.inf)
+    columns = split_columns(patches[:, :count])
+    normals, offsets, values = fit_planes(columns, counted[:, :count])
+    rests = residuals(columns, normals, offsets)
+    spread = (rests * rests).sum(dim=1) / (count - 3)
+    broad = (values[:, 1] > _NARROW * values[:, 2]) & (counted[:, count - 1] > 0)
+    return torch.where(broad, spread.sqrt_(), torch.inf)
+
+
+def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
+    """Return a quantile of values over the neighbours of each point."""
+    indices, counted = neighbors
+    if counted is not None:
+        near = torch.where(counted, values[indices.long()], torch.inf).sort(dim=1).values
+        ranks = (quantile * counted.sum(dim=1, keepdim=True)).ceil().clamp(min=1)
+        return near.gather(1, ranks.long() - 1).squeeze(1)
+    rank = max(math.ceil(quantile * indices.shape[1]), 1)
+    if values.device.type != "cpu":
+        return values[indices.long()].kthvalue(rank, dim=1).values
+    found, columns, rows = torch.empty_like(values), values.numpy(), indices.numpy()
+
+    def work(block: slice) -> None:
+        near = np.take(columns, rows[block])
+        near.partition(rank - 1, axis=1)
+        found.numpy()[block] = near[:, rank - 1]
+
+    each_block(work, len(values), _BLOCK, values.device)
+    return found

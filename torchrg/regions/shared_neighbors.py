@@ -1,0 +1,164 @@
+"""How many neighbours two points have in common, counted exactly."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._parallel import chunks_of, run_chunks
+from torchrg.structures import Neighbors
+
+_BITS_IN_LINE = 512
+"""Bits of a cache line: bit sets are as wide as one or a few of them."""
+
+_BLOCK_SIZE = 128
+"""Points of a block: smaller ones repeat the lists around them more often, larger ones have wider
+bit sets."""
+
+_PATCH_SIZE = 1024
+"""Points worked on together, several blocks: each step is long enough for threads to go on side by
+side."""
+
+
+class SharedNeighbors:
+    """Neighbour lists of a cloud, prepared for counting what two of them have in common.
+
+    The lists of a block of points are held as bit sets over the points that occur in them, so that
+    an edge costs a few AND and popcount instructions; lists of points outside the block lose only
+    members that no list of the block has, so the counts are exact. Points should be in canonical
+    order: then a block is a patch of surface and its dictionary is small.
+
+    Args:
+        neighbors: Neighbours of all points, each with itself among them.
+
+    Example:
+        >>> lists = torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])
+        >>> SharedNeighbors(Neighbors(lists)).at_least(3, slice(0, 1), torch.ones(1, 3).bool())
+        tensor([[ True,  True, False]])
+    """
+
+    def __init__(self, neighbors: Neighbors) -> None:
+        self._indices = neighbors.indices.cpu().numpy()
+        self._counted = None if neighbors.valid is None else neighbors.valid.cpu().numpy()
+        self._free_numbers: list[NDArray[np.intp]] = []
+
+    def at_least(self, min_shared: int, rows: slice, asked: Tensor) -> Tensor:
+        """Tell which edges join points that share enough neighbours, eq. (10).
+
+        Args:
+            min_shared: Least number of common neighbours.
+            rows: The points that the edges lead from.
+            asked: Which of the edges to their neighbours to test, shape ``(n, K)``, bool.
+
+        Returns:
+            Shape ``(n, K)``, bool; False where not asked.
+        """
+        if min_shared <= 0:
+            return asked.clone()
+        result = asked.cpu().numpy().copy()
+
+        def test(block: slice) -> None:
+            if result[block].any():
+                first = rows.start + block.start
+                counts = self._count(first, first + len(result[block]))
+                result[block] &= counts >= min_shared
+
+        run_chunks(test, chunks_of(len(result), _PATCH_SIZE), torch.device("cpu"))
+        return torch.from_numpy(result).to(asked.device)
+
+    def _count(self, start: int, stop: int) -> NDArray[np.unsignedinteger]:
+        """Return the number of common neighbours along all edges of a patch, shape ``(n, K)``."""
+        own, lists, of_members = self._local_lists(start, stop)
+        # Every block has a column for each member of the patch, and one for what is none.
+        stride = len(of_members) + 1
+        first = np.arange(len(lists)) // _BLOCK_SIZE * stride
+        others = (lists + first[:, None]).ravel()
+        occurs = np.zeros((first[-1] // stride + 1, stride), dtype=bool)
+        occurs.ravel()[others] = True
+        occurs[:, -1] = False
+        rows, sets = _bit_sets(of_members, occurs)
+        # Entries that are no neighbours have place -1 and count nonsense; nobody asks for them.
+        common = sets.take(rows.take(others), axis=0)
+        common &= np.repeat(sets.take(rows.take(own + first), axis=0), lists.shape[1], axis=0)
+        return _sum_of_bits(common, at_most=lists.shape[1]).reshape(lists.shape)
+
+    def _local_lists(
+        self, start: int, stop: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Number the points that occur in the lists of a patch: its members.
+
+        Returns:
+            The numbers of the points of the patch ``(n,)``, and by these numbers their lists
+            ``(n, K)`` and those of all members ``(M, K)``; -1 for what is no member.
+        """
+        # Number of each point, -1 for the others; kept between patches, because filling it takes
+        # longer than a patch.
+        numbers = (
+            self._free_numbers.pop() if self._free_numbers else np.full(len(self._indices), -1)
+        )
+        rows = self._indices[start:stop].astype(np.intp)
+        members = rows.ravel() if self._counted is None else rows[self._counted[start:stop]]
+        places = np.arange(len(members))
+        numbers[members] = places
+        members = members[numbers.take(members) == places]
+        numbers[members] = places[: len(members)]
+        own, lists = numbers[start:stop].copy(), numbers.take(rows)
+        of_members = numbers.take(self._indices.take(members, axis=0))
+        if self._counted is not None:
+            of_members[~self._counted[members]] = -1
+        numbers[members] = -1
+        self._free_numbers.append(numbers)
+        return own, lists, of_members
+
+
+def _bit_sets(
+    lists: NDArray[np.intp], occurs: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.uint64]]:
+    """Hold the lists of the members that occur in a block as bit sets over these, block by block.
+
+    Args:
+        lists: List of each member, -1 for what is none, shape ``(M, K)``.
+        occurs: Members of each block, shape ``(blocks, M + 1)``; none in the last column.
+
+    Returns:
+        Row of each member of each block among the sets, shape ``(blocks * (M + 1),)``, and the
+        sets, shape ``(rows, words)``.
+    """
+    stride = occurs.shape[1]
+    found = np.flatnonzero(occurs)
+    sizes = np.count_nonzero(occurs, axis=1)
+    rows = np.zeros(occurs.size, dtype=np.intp)
+    rows[found] = np.arange(len(found))
+    # What is not in the block falls into the first eight columns, which are cut off.
+    columns = np.full(occurs.size, -8)
+    columns[found] = np.arange(len(found)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    block, member = np.divmod(found, stride)
+    of_found = lists.take(member, axis=0)
+    of_found += (block * stride)[:, None]
+    width = 8 + -(-int(sizes.max()) // _BITS_IN_LINE) * _BITS_IN_LINE
+    bits = np.zeros(len(found) * width, dtype=bool)
+    places = columns.take(of_found, mode="wrap")
+    places += np.arange(8, len(bits), width)[:, None]
+    bits[places.ravel()] = True
+    return rows, np.packbits(bits.reshape(-1, width)[:, 8:], axis=1).view(np.uint64)
+
+
+def _sum_of_bits(words: NDArray[np.uint64], at_most: int) -> NDArray[np.unsignedinteger]:
+    """Return the number of bits in each row of words ``(E, 8 n)``, known to be ``at_most`` so many.
+
+    Example:
+        >>> _sum_of_bits(np.full((1, 8), 5, dtype=np.uint64), at_most=16).tolist()
+        [16]
+    """
+    counts = np.bitwise_count(words)
+    if at_most >= 2**8:
+        total: NDArray[np.unsignedinteger] = counts.sum(axis=1, dtype=np.uint64)
+        return total
+    lanes = counts.view(np.uint64)
+    total = lanes[:, 0].copy()
+    for column in range(1, lanes.shape[1]):
+        total += lanes[:, column]
+    # The product adds all eight bytes up in the highest one.
+    total *= np.uint64(0x0101010101010101)
+    total >>= np.uint64(56)
+    return total

@@ -1,0 +1,19 @@
+"""Pictures of clouds and their segmentation, without a desktop."""
+
+from torchrg.render.cameras import make_camera
+from torchrg.render.colors import color_curvature, color_normals, color_planes, color_sharp
+from torchrg.render.pictures import render_cloud, render_points
+from torchrg.render.png import write_png
+from torchrg.render.tiles import tile_pictures
+
+__all__ = [
+    "color_curvature",
+    "color_normals",
+    "color_planes",
+    "color_sharp",
+    "make_camera",
+    "render_cloud",
+    "render_points",
+    "tile_pictures",
+    "write_png",
+]

@@ -1,0 +1,389 @@
+"""OKLab, a space in which the distance of two colours is about how different they look."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.metrics.contingency import check_labels, contingency_table, number_labels
+from torchrg.metrics.labels import match_regions
+from torchrg.render.grid import CloudGrid, build_grid, shift_codes
+
+_TO_CONES = (
+    (0.4122214708, 0.5363325363, 0.0514459929),
+    (0.2119034982, 0.6806995451, 0.1073969566),
+    (0.0883024619, 0.2817188376, 0.6299787005),
+)
+_TO_LAB = (
+    (0.2104542553, 0.7936177850, -0.0040720468),
+    (1.9779984951, -2.4285922050, 0.4505937099),
+    (0.0259040371, 0.7827717662, -0.8086757660),
+)
+
+
+def rgb_to_oklab(colors: Tensor) -> Tensor:
+    """Convert colours from sRGB to OKLab [1].
+
+    Args:
+        colors: sRGB in [0, 1], shape ``(*, 3)``.
+
+    Returns:
+        Lightness in [0, 1] and the two opponent axes, shape ``(*, 3)``.
+
+    References:
+        [1] B. Ottosson. A perceptual color space for image processing. 2020.
+
+    Example:
+        >>> rgb_to_oklab(torch.tensor([1.0, 1.0, 1.0])).round(decimals=3).abs()
+        tensor([1., 0., 0.])
+    """
+    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    cones = linear @ _matrix(_TO_CONES, colors).T
+    return cones ** (1 / 3) @ _matrix(_TO_LAB, colors).T
+
+
+def oklab_to_rgb(colors: Tensor) -> Tensor:
+    """Convert colours from OKLab to sRGB; values outside [0, 1] are colours no screen shows.
+
+    Args:
+        colors: OKLab, shape ``(*, 3)``.
+
+    Returns:
+        sRGB, shape ``(*, 3)``.
+
+    Example:
+        >>> oklab_to_rgb(torch.tensor([0.5, 0.0, 0.0])).round(decimals=3)
+        tensor([0.3890, 0.3890, 0.3890])
+    """
+    cones = colors @ torch.linalg.inv(_matrix(_TO_LAB, colors)).T
+    linear = cones**3 @ torch.linalg.inv(_matrix(_TO_CONES, colors)).T
+    bright = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, linear * 12.92, bright)
+
+
+def to_bytes(colors: Tensor) -> Tensor:
+    """Return sRGB colours in [0, 1] as uint8, what is outside cut off."""
+    return (colors.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _matrix(rows: tuple[tuple[float, ...], ...], like: Tensor) -> Tensor:
+    return torch.tensor(rows, dtype=like.dtype, device=like.device)
+
+
+UNLABELED_GRAY = 176
+"""Red, green and blue of points that belong to no plane."""
+
+_CALM = ((0.78, 0.88), (0.07, 0.095), 24)  # lightness, chroma, number of hues
+_VIVID = ((0.62, 0.70, 0.78), (0.13, 0.165), 36)
+_LARGE = 0.03  # share of all: planes that get a calm colour
+_ALIKE = 0.0005  # squared OKLab distance of colours that look about the same
+_ELSEWHERE = 0.005  # how much a plane that is not next to another one counts for it
+
+
+def make_palette() -> tuple[Tensor, int]:
+    """Return sRGB colours of even hues, shape ``(C, 3)``, uint8, and how many of them are calm.
+
+    Example:
+        >>> colors, num_calm = make_palette()
+        >>> len(colors) > 150, 0 < num_calm < len(colors)
+        (True, True)
+    """
+    groups = []
+    for lightness, chroma, num_hues in (_CALM, _VIVID):
+        hues = torch.arange(num_hues, dtype=torch.float64) * (2 * math.pi / num_hues)
+        light, strength, hue = torch.meshgrid(
+            torch.tensor(lightness, dtype=torch.float64),
+            torch.tensor(chroma, dtype=torch.float64),
+            hues,
+            indexing="ij",
+        )
+        lab = torch.stack([light, strength * hue.cos(), strength * hue.sin()], dim=-1)
+        colors = oklab_to_rgb(lab.view(-1, 3))
+        groups.append(colors[((colors >= 0) & (colors <= 1)).all(dim=-1)])
+    return to_bytes(torch.cat(groups)), len(groups[0])
+
+
+def choose_colors(
+    sizes: Tensor, pairs: Tensor, weights: Tensor, *, fixed: Tensor | None = None
+) -> Tensor:
+    """Choose a colour for each plane, the largest first, far from those chosen before.
+
+    Each chosen colour repels with the inverse square of its distance in OKLab: that of a neighbour
+    with its weight, any other with a little.
+
+    Args:
+        sizes: Points of each plane, shape ``(M,)``.
+        pairs: Planes that are neighbours, shape ``(E, 2)``.
+        weights: How much they are, shape ``(E,)``.
+        fixed: Rows of the palette that are chosen already, shape ``(M,)``; negative: free.
+
+    Returns:
+        Rows of :func:`make_palette`, shape ``(M,)``, int64.
+
+    Example:
+        >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
+        >>> len(choices.unique())
+        2
+    """
+    palette, num_calm = make_palette()
+    gray = palette.new_full((1, 3), UNLABELED_GRAY)
+    lab = rgb_to_oklab(torch.cat([palette, gray]).double() / 255)
+    distances = (lab[:, None] - lab).square().sum(dim=-1)
+    repulsion = (1 / (distances + _ALIKE)).numpy()[:, :-1]
+    share = (sizes / sizes.sum()).numpy()
+    strength = np.clip(8 * share, _ELSEWHERE, 1)
+    choices = torch.full_like(sizes, -1).numpy() if fixed is None else fixed.numpy().copy()
+    done = choices >= 0
+    field = strength[done] @ repulsion[choices[done]] + 0.05 * repulsion[-1]
+    ends = torch.cat([pairs, pairs.flip(1)])
+    order = ends[:, 0].argsort(stable=True)
+    starts = torch.searchsorted(ends[order, 0], torch.arange(len(sizes) + 1)).tolist()
+    others, pull = ends[order, 1].numpy(), weights.repeat(2)[order].numpy()
+    for plane in sizes.sort(descending=True, stable=True).indices.tolist():
+        if done[plane]:
+            continue
+        near = slice(starts[plane], starts[plane + 1])
+        placed = choices[others[near]]
+        cost = field + (pull[near] * (placed >= 0)) @ repulsion[placed]
+        calm = share[plane] > _LARGE
+        pick = cost[:num_calm].argmin() if calm else num_calm + cost[num_calm:].argmin()
+        choices[plane] = pick
+        field += strength[plane] * repulsion[pick]
+    return torch.from_numpy(choices)
+
+
+_LEVEL_LIGHTNESS, _UPRIGHT_LIGHTNESS, _CHROMA = 0.86, 0.66, 0.13
+_RAMP = (  # OKLab: light gray, yellow, orange, red, violet; darker all the way
+    (0.90, 0.00, 0.00),
+    (0.87, 0.02, 0.10),
+    (0.74, 0.11, 0.12),
+    (0.55, 0.18, 0.06),
+    (0.32, 0.13, -0.06),
+)
+_REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
+
+
+def color_normals(
+    normals: Tensor | NDArray[np.floating], *, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> Tensor:
+    """Colour normals by direction; a normal and its opposite get the same colour.
+
+    Level surfaces are light gray; upright ones are coloured by the direction they face, with
+    perpendicular walls in opposite hues; slanted ones are between.
+
+    Args:
+        normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero where there is none.
+        up: Upward direction.
+
+    Returns:
+        Shape ``(*, 3)``, uint8; gray where there is no normal.
+
+    Raises:
+        ShapeError: If the shape or dtype is not as above.
+        ConfigError: If ``up`` is zero.
+
+    Example:
+        >>> color_normals(torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0, 0]]))[:, 0].tolist()
+        [209, 209, 176]
+    """
+    tensor = as_tensor("color_normals", "normals", normals)
+    check_shapes("color_normals", normals=(tensor, "* 3"))
+    check_floating("color_normals", normals=tensor)
+    if not any(up):
+        raise ConfigError("color_normals: expected up to be a direction, got zeros.")
+    axis = torch.nn.functional.normalize(tensor.new_tensor(up), dim=0)
+    east = torch.zeros_like(axis)
+    east[axis.abs().argmin()] = 1
+    east = torch.nn.functional.normalize(east - (east @ axis) * axis, dim=0)
+    x, y, z = (tensor @ side for side in (east, torch.linalg.cross(axis, east), axis))
+    lightness = _UPRIGHT_LIGHTNESS + (_LEVEL_LIGHTNESS - _UPRIGHT_LIGHTNESS) * z * z
+    lab = torch.stack([lightness, _CHROMA * (x * x - y * y), 2 * _CHROMA * x * y], dim=-1)
+    missing = (tensor == 0).all(dim=-1, keepdim=True)
+    gray = torch.tensor(UNLABELED_GRAY, dtype=torch.uint8, device=tensor.device)
+    return torch.where(missing, gray, to_bytes(oklab_to_rgb(lab)))
+
+
+def color_curvature(
+    curvature: Tensor | NDArray[np.floating], *, max_curvature: float = 0.1
+) -> Tensor:
+    """Colour curvature from light gray over yellow and red to dark violet.
+
+    The scale goes with the root of the curvature, and is the same for every cloud.
+
+    Args:
+        curvature: Surface variation in [0, 1/3], shape ``(*)``.
+        max_curvature: Where the scale ends.
+
+    Returns:
+        Shape ``(*, 3)``, uint8.
+
+    Raises:
+        ShapeError: If the dtype is not as above.
+        ConfigError: If ``max_curvature`` is not positive.
+
+    Example:
+        >>> color_curvature(torch.tensor([0.0, 0.1, 0.3])).tolist()
+        [[222, 222, 222], [90, 0, 78], [90, 0, 78]]
+    """
+    tensor = as_tensor("color_curvature", "curvature", curvature)
+    check_floating("color_curvature", curvature=tensor)
+    if not max_curvature > 0:
+        raise ConfigError(
+            f"color_curvature: expected max_curvature to be positive, got {max_curvature!r}."
+        )
+    place = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
+    before = place.long().clamp(max=len(_RAMP) - 2)
+    ramp = tensor.new_tensor(_RAMP)
+    lab = torch.lerp(ramp[before], ramp[before + 1], (place - before)[..., None])
+    return to_bytes(oklab_to_rgb(lab))
+
+
+def color_sharp(sharp: Tensor | NDArray[Any]) -> Tensor:
+    """Colour sharp feature points red and all others light gray.
+
+    Args:
+        sharp: Shape ``(*)``, bool.
+
+    Returns:
+        Shape ``(*, 3)``, uint8.
+
+    Raises:
+        ShapeError: If ``sharp`` is not bool.
+
+    Example:
+        >>> color_sharp(torch.tensor([False, True])).tolist()
+        [[205, 205, 205], [214, 40, 40]]
+    """
+    tensor = as_tensor("color_sharp", "sharp", sharp)
+    if tensor.dtype != torch.bool:
+        dtype = str(tensor.dtype).removeprefix("torch.")
+        raise ShapeError(f"color_sharp: expected sharp of bool, got {dtype}.")
+    colors = torch.tensor([_REGULAR, _SHARP], dtype=torch.uint8, device=tensor.device)
+    return colors[tensor.long()]
+
+
+_MOST_IN_A_CUBE = 8  # planes of a cube that are paired with each other
+
+
+def touching_planes(grid: CloudGrid, labels: Tensor, *, max_cells: int) -> Tensor:
+    """Return the pairs of planes with points in the same or in neighbouring cubes.
+
+    Args:
+        grid: The cloud.
+        labels: Of all its points, shape ``(N,)``, int64: 0 to M-1, negative for none.
+        max_cells: The cubes are the smallest of which no more are occupied.
+
+    Returns:
+        Pairs of labels, the smaller first, ascending, shape ``(E, 2)``. In a cube of very many
+        planes not all of them are paired.
+
+    Example:
+        >>> from torchrg.render.grid import build_grid
+        >>> line = torch.cartesian_prod(torch.arange(64.0), torch.zeros(1), torch.zeros(1))
+        >>> touching_planes(build_grid(line), torch.arange(64) // 16, max_cells=8).tolist()
+        [[0, 1], [1, 2], [2, 3]]
+    """
+    own_label = labels[grid.rows]
+    labeled = own_label >= 0
+    if not bool(labeled.any()):
+        return labels.new_zeros((0, 2))
+    cell_of, level = grid.cell_of, grid.levels[0]
+    for coarser in grid.levels[1:]:
+        if len(level.codes) <= max_cells:
+            break
+        cell_of, level = level.parents[cell_of], coarser
+    count = int(own_label.amax()) + 1
+    own = torch.unique(cell_of[labeled] * count + own_label[labeled])
+    codes, planes = level.codes[own // count], (own % count).repeat(4)
+    codes = torch.cat([codes, *(shift_codes(codes, axis) for axis in range(3))])
+    both = torch.unique(torch.unique(codes, return_inverse=True)[1] * count + planes)
+    cubes, planes = both // count, both % count
+    found = []
+    for lag in range(1, _MOST_IN_A_CUBE):
+        same = cubes[lag:] == cubes[:-lag]
+        found.append(planes[:-lag][same] * count + planes[lag:][same])
+    pairs = torch.unique(torch.cat(found))
+    return torch.stack([pairs // count, pairs % count], dim=-1)
+
+
+_NEIGHBORHOODS = ((60_000, 1.0), (4_000, 0.2))  # cubes of the cloud, and how much they count
+
+
+def color_planes(
+    labels: Tensor | NDArray[Any],
+    points: Tensor | NDArray[np.floating] | None = None,
+    *,
+    reference: Tensor | NDArray[Any] | None = None,
+) -> Tensor:
+    """Colour the points of each plane.
+
+    Planes get their colours one by one, the largest first: each the colour of a fixed palette that
+    is farthest from those of the planes next to it and, less so, from all others. Large planes get
+    calm colours, small ones vivid colours.
+
+    Convention:
+        The colours do not depend on the order of the points.
+
+    Args:
+        labels: Plane of each point, shape ``(*)``, integers; ``UNLABELED`` for none.
+        points: Points, shape ``(*, 3)``, which tell what lies next to what. Default: nothing does.
+        reference: Other labels of the same points, shape ``(*)``. A plane of ``labels`` and one of
+            ``reference`` that are each other's largest overlap get one colour, that of
+            ``color_planes(reference, points)``. For pictures side by side.
+
+    Returns:
+        Shape ``(*, 3)``, uint8; points of no plane are gray.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+
+    Example:
+        >>> colors = color_planes(torch.tensor([0, 0, 1, -1]))
+        >>> colors[3].tolist(), bool((colors[0] == colors[1]).all())
+        ([176, 176, 176], True)
+    """
+    caller = "color_planes"
+    tensor = as_tensor(caller, "labels", labels)
+    other = None if reference is None else as_tensor(caller, "reference", reference)
+    cloud = None if points is None else as_tensor(caller, "points", points)
+    check_shapes(caller, labels=(tensor, "*"), points=(cloud, "* 3"), reference=(other, "*"))
+    check_floating(caller, points=cloud)
+    flat = check_labels(caller, labels=tensor.flatten())[0]
+    grid = None if cloud is None else build_grid(cloud.reshape(-1, 3))
+    fixed = None
+    if other is not None:
+        same = check_labels(caller, reference=other.flatten())[0]
+        table = contingency_table(flat, same)
+        pairs = match_regions(table)
+        fixed = torch.full_like(table.region_sizes, -1)
+        fixed[table.regions[pairs]] = _choose(same, grid)[1][table.faces[pairs]]
+    rows, choices = _choose(flat, grid, fixed)
+    gray = torch.full((1, 3), UNLABELED_GRAY, dtype=torch.uint8, device=flat.device)
+    colors = torch.cat([make_palette()[0].to(flat.device)[choices], gray])
+    return colors[rows].view(*tensor.shape, 3)
+
+
+def _choose(
+    labels: Tensor, grid: CloudGrid | None, fixed: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return each point's row among the labels that occur, and the palette's row of each label."""
+    rows = number_labels(labels)[1]
+    sizes = torch.bincount(rows[rows >= 0])
+    pairs, weights = [sizes.new_zeros((0, 2))], [torch.zeros(0, dtype=torch.float64)]
+    for max_cells, weight in _NEIGHBORHOODS:
+        if grid is None or not grid.levels:
+            break
+        pairs.append(touching_planes(grid, rows, max_cells=max_cells))
+        weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
+    choices = choose_colors(
+        sizes.cpu(),
+        torch.cat(pairs).cpu(),
+        torch.cat(weights),
+        fixed=None if fixed is None else fixed.cpu(),
+    )
+    return rows, choices.to(labels.device)

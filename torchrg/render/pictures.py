@@ -1,0 +1,303 @@
+"""Pictures of clouds."""
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
+from torchrg.render.grid import CloudGrid, build_grid, local_spacing, surface_cells
+from torchrg.render.raster import (
+    DepthBuffer,
+    close_gaps,
+    depth_and_colors,
+    light_colors,
+    shade_hollows,
+)
+from torchrg.render.views import View, choose_viewpoint
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
+_BLOCK = 131_072  # points in work at a time
+_RADIUS = 1.3  # of a disc, in units of the local spacing: closes surfaces but for a few gaps
+_LARGEST = 4  # times the usual radius, for stray points
+_WIDEST, _ALWAYS = 0.02, 8.0  # largest radius of a disc, in widths of the picture or in pixels
+_GAP = 0.6  # half the width of the gaps that are closed, in disc radii
+_STEEPEST = 0.05  # least cosine of the angle under which a disc is seen
+
+
+def draw_picture(
+    camera: "PinholeCamera",
+    grid: CloudGrid,
+    spacing: Tensor,
+    kept: Tensor,
+    colors: Tensor,
+    normals: Tensor | None,
+    *,
+    supersampling: int,
+) -> Tensor:
+    """Draw the kept points of a cloud as discs, close gaps, shade, and average pixels.
+
+    Args:
+        camera: A batch of one, with the size of the picture.
+        grid: The cloud, of at least one finite point.
+        spacing: Of its finite points, shape ``(n,)``.
+        kept: Which of them to draw, shape ``(n,)``, bool.
+        colors: Of all points, shape ``(N, 3)``, uint8.
+        normals: Of all points, shape ``(N, 3)``. Default: those of small cubes of the cloud.
+        supersampling: Pixels along the side of each pixel of the picture.
+
+    Returns:
+        Shape ``(H, W, 3)``, uint8.
+    """
+    width, height = int(camera.width), int(camera.height)
+    project = projection_of(camera, grid.origin, finer=supersampling)
+    lengths = _RADIUS * spacing.clamp(max=_LARGEST * float(spacing.median()))
+    places = kept.nonzero().squeeze(-1)
+    radius, length = _usual_radius(project, grid.points, lengths, places)
+    widest = supersampling * max(_ALWAYS, _WIDEST * width)
+    buffer = DepthBuffer(
+        width * supersampling, height * supersampling, max_radius=widest, device=places.device
+    )
+    cells = surface_cells(grid) if normals is None else None
+    for block in torch.split(places, _BLOCK):
+        rows = grid.rows[block]
+        if cells is not None:
+            slant = cells.normals[cells.cell_of[block]]
+        elif normals is not None:
+            slant = normals[rows].float()
+        _draw_block(
+            buffer,
+            project,
+            grid.points[block],
+            colors[rows],
+            slant,
+            lengths[block],
+            least=supersampling / 2,
+        )
+    reach = max(1, round(_GAP * min(radius, widest)))
+    depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
+    brightness = shade_hollows(
+        _reduce(depth, supersampling, torch.maximum),
+        focal=project.focal / supersampling,
+        radius=max(1.0, radius / supersampling),
+    )
+    total = _reduce(paint.to(torch.int32), supersampling, torch.add)
+    return (total * (brightness / supersampling**2)[..., None]).round_().to(torch.uint8)
+
+
+def _usual_radius(
+    project: Projection, points: Tensor, lengths: Tensor, places: Tensor
+) -> tuple[float, float]:
+    """Return the median radius of the discs, in pixels and in the unit of the cloud."""
+    sample = places[:: max(1, len(places) // _BLOCK)]
+    depth = project(points[sample])[0][:, 2]
+    sample, depth = sample[depth > 0], depth[depth > 0]
+    if len(sample) == 0:
+        return 1.0, 0.0
+    return float((lengths[sample] / depth).median()) * project.focal, float(
+        lengths[sample].median()
+    )
+
+
+def _draw_block(
+    buffer: DepthBuffer,
+    project: Projection,
+    points: Tensor,
+    colors: Tensor,
+    normals: Tensor,
+    lengths: Tensor,
+    *,
+    least: float,
+) -> None:
+    """Draw points as lit discs of radii ``lengths`` in the unit of the cloud, ``least`` in pixels.
+
+    Points behind the camera do not show.
+    """
+    positions, pixels = project(points)
+    ahead = positions[:, 2] > 0
+    if not bool(ahead.all()):
+        positions, pixels, colors = positions[ahead], pixels[ahead], colors[ahead]
+        normals, lengths = normals[ahead], lengths[ahead]
+    normals = normals @ project.local_to_camera[0, :3, :3].T
+    inverse = 1 / positions[:, 2]
+    along = (normals * positions).sum(dim=-1) * inverse
+    along = torch.where(
+        along.abs() < _STEEPEST, torch.where(along < 0, -_STEEPEST, _STEEPEST), along
+    )
+    buffer.draw_discs(
+        pixels,
+        inverse,
+        light_colors(colors, normals, positions),
+        (lengths * inverse * project.focal).clamp(min=least),
+        # n . X = const gives 1 / z = n . ray / const, whose gradient in pixels is n_xy / focal.
+        slopes=normals[:, :2] * (inverse / (along * project.focal))[:, None],
+        max_change=lengths * inverse * inverse,
+    )
+
+
+def _reduce(image: Tensor, size: int, combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Combine the pixels of each square of ``size`` a side."""
+    parts = [image[row::size, column::size] for row in range(size) for column in range(size)]
+    return functools.reduce(combine, parts)
+
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
+_FAR_APART = 6  # times the usual spacing: stray points, which do not decide what is shown
+
+
+def render_cloud(
+    points: Tensor | NDArray[np.floating],
+    colors: Tensor | NDArray[np.uint8],
+    *,
+    normals: Tensor | NDArray[np.floating] | None = None,
+    view: View = "cutaway",
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    azimuth_deg: float | None = None,
+    elevation_deg: float | None = None,
+    width: int = 1400,
+    height: int | None = None,
+    supersampling: int = 2,
+) -> Tensor:
+    """Draw a cloud so that one sees at once what it is.
+
+    ``"cutaway"`` looks from outside and leaves out the ceiling and the walls that face the viewer;
+    ``"above"`` looks down and leaves out the ceiling; ``"outside"`` leaves out nothing;
+    ``"sensor"`` looks from the origin along z, x to the right and y down, as a depth camera does.
+
+    Convention:
+        Points are drawn as discs as large as their distances, tilted by their normals. The picture
+        does not depend on the order of the points nor, but for rounding, on unit and origin.
+
+    Args:
+        points: Points, shape ``(N, 3)``; those with NaN or Inf are left out.
+        colors: Shape ``(N, 3)``, uint8.
+        normals: For tilt and light, of arbitrary sign, shape ``(N, 3)``; zero where unknown.
+            Default: those of small cubes of the cloud.
+        view: See above.
+        up: Upward direction; not used from the sensor.
+        azimuth_deg: Angle of the viewer about ``up``, from the normal of the largest walls.
+            Default: of eight, the one from which most surface is seen.
+        elevation_deg: Angle of the viewer over the horizon. Default: 35, from above 90.
+        width: In pixels.
+        height: In pixels. Default: what the cloud needs, from a quarter of the width to all of it.
+        supersampling: Each pixel is the mean of the square of this many pixels a side.
+
+    Returns:
+        The picture, shape ``(height, width, 3)``, uint8. White if no point is finite.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+        ConfigError: If a setting is not as above.
+
+    Example:
+        >>> plane = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.zeros(1))
+        >>> picture = render_cloud(plane, torch.zeros(81, 3, dtype=torch.uint8), width=40)
+        >>> picture.shape[1:], picture.amin().item() < 100, picture[0, 0].tolist()
+        (torch.Size([40, 3]), True, [255, 255, 255])
+    """
+    cloud, paint, slant = _check_cloud("render_cloud", points, colors, normals)
+    if view not in get_args(View):
+        names = ", ".join(get_args(View))
+        raise ConfigError(f"render_cloud: expected view to be one of {names}, got {view!r}.")
+    if not any(up):
+        raise ConfigError("render_cloud: expected up to be a direction, got zeros.")
+    _check_at_least_one("render_cloud", width=width, height=height, supersampling=supersampling)
+    grid = build_grid(cloud)
+    if len(grid.rows) == 0:
+        shape = (height or round(0.75 * width), width, 3)
+        return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
+    spacing = local_spacing(grid)
+    near = spacing <= _FAR_APART * spacing.median()
+    kept = torch.ones_like(near)
+    if view == "sensor":
+        camera = sensor_camera(cloud[grid.rows[near]], width=width, height=height)
+    else:
+        upward = functional.normalize(grid.points.new_tensor(up), dim=0)
+        viewpoint = choose_viewpoint(
+            surface_cells(grid), view, upward, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
+        )
+        kept = viewpoint.keeps(grid.points)
+        shown = grid.points[kept & near].double() + grid.origin
+        axes = view_axes(viewpoint.toward, viewpoint.up)
+        camera = fit_camera(shown, axes, width=width, height=height)
+    return draw_picture(camera, grid, spacing, kept, paint, slant, supersampling=supersampling)
+
+
+def render_points(
+    points: Tensor | NDArray[np.floating],
+    colors: Tensor | NDArray[np.uint8],
+    camera: "PinholeCamera",
+    *,
+    normals: Tensor | NDArray[np.floating] | None = None,
+    supersampling: int = 2,
+) -> Tensor:
+    """Draw a cloud as a given camera sees it; see :func:`render_cloud`.
+
+    Args:
+        points: Points, shape ``(N, 3)``; those with NaN or Inf, or behind the camera, do not show.
+        colors: Shape ``(N, 3)``, uint8.
+        camera: A batch of one camera of kornia, with the size of the picture; for example from
+            :func:`torchrg.render.__init__.make_camera`.
+        normals: As for :func:`render_cloud`.
+        supersampling: As for :func:`render_cloud`.
+
+    Returns:
+        The picture, shape ``(height, width, 3)``, uint8.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+        ConfigError: If ``supersampling`` is below 1.
+
+    Example:
+        >>> from torchrg.render import make_camera
+        >>> camera = make_camera(torch.eye(4), 10.0, (2.0, 1.0), 5, 3)
+        >>> red = torch.tensor([[255, 0, 0]], dtype=torch.uint8)
+        >>> picture = render_points(torch.tensor([[0.1, 0.0, 1.0]]), red, camera, supersampling=1)
+        >>> picture[1, 2:4].tolist()
+        [[255, 255, 255], [207, 0, 0]]
+    """
+    cloud, paint, slant = _check_cloud("render_points", points, colors, normals)
+    _check_at_least_one("render_points", supersampling=supersampling)
+    grid = build_grid(cloud)
+    if len(grid.rows) == 0:
+        shape = (int(camera.height), int(camera.width), 3)
+        return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
+    kept = torch.ones_like(grid.rows, dtype=torch.bool)
+    return draw_picture(
+        camera, grid, local_spacing(grid), kept, paint, slant, supersampling=supersampling
+    )
+
+
+def _check_cloud(
+    caller: str,
+    points: Tensor | NDArray[np.floating],
+    colors: Tensor | NDArray[np.uint8],
+    normals: Tensor | NDArray[np.floating] | None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return the arguments as tensors of agreeing shapes and right dtypes."""
+    cloud, paint = as_tensor(caller, "points", points), as_tensor(caller, "colors", colors)
+    slant = None if normals is None else as_tensor(caller, "normals", normals)
+    check_shapes(caller, points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3"))
+    check_floating(caller, points=cloud)
+    check_floating(caller, normals=slant)
+    if paint.dtype != torch.uint8:
+        dtype = str(paint.dtype).removeprefix("torch.")
+        raise ShapeError(f"{caller}: expected colors of uint8, got {dtype}; scale them to 0..255.")
+    return cloud, paint, None if slant is None else slant.detach()
+
+
+def _check_at_least_one(caller: str, **settings: int | None) -> None:
+    for name, value in settings.items():
+        if value is not None and value < 1:
+            raise ConfigError(f"{caller}: expected {name} >= 1, got {value!r}.")

@@ -1,0 +1,321 @@
+"""From patches of any shape to lanes and back: masks, units, exact planes, chunks, threads."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import chunks_of, run_chunks
+from torchrg.errors import ConfigError
+from torchrg.robust.exact import find_flats, flatness_tolerance, refine_flat
+from torchrg.robust.lanes import (
+    covariance_entries,
+    join_columns,
+    median_points,
+    split_columns,
+    sum_points,
+    take_lanes,
+)
+from torchrg.robust.weights import Estimate, subset_size
+
+
+class Frame(NamedTuple):
+    """Where lanes lie in their patches: ``point = (lane / zoom + middle) / unit``.
+
+    The factors are powers of two, which change no digit.
+    """
+
+    middle: Tensor
+    unit: Tensor
+    zoom: Tensor
+
+    def of(self, rows: Tensor) -> "Frame":
+        """The frames of some of the patches."""
+        return Frame(*(field[rows] for field in self))
+
+    def point(self, lanes: Tensor) -> Tensor:
+        """Bring points ``(B, P)`` back to the coordinates of their patches."""
+        return (lanes / self.zoom[:, None] + self.middle) / self.unit[:, None]
+
+    def matrix(self, lanes: Tensor) -> Tensor:
+        """Bring scatter matrices ``(B, P, P)`` back to the unit of their patches."""
+        length = (self.zoom * self.unit)[:, None, None]
+        return lanes / length / length
+
+
+def to_lanes(patches: Tensor) -> tuple[list[Tensor], Frame, Tensor]:
+    """Columns about each patch's median, of size 1/2 to 1, with their frame and tolerance."""
+    unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
+    patches = patches * unit[:, None, None]
+    columns = split_columns(patches)
+    middle = [median_points(column) for column in columns]
+    columns = [column - center for column, center in zip(columns, middle, strict=True)]
+    extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
+    zoom = _power_of_two(extent)
+    tolerance = flatness_tolerance(patches, extent) * zoom
+    columns = [column * zoom for column in columns]
+    return columns, Frame(join_columns(middle), unit, zoom), tolerance
+
+
+def _power_of_two(length: Tensor) -> Tensor:
+    """The power of two that brings a length to between 1/2 and 1; a finite one for zero."""
+    length = length.clamp(min=4 * torch.finfo(length.dtype).tiny)
+    return torch.frexp(length).mantissa / length
+
+
+class RobustFit(NamedTuple):
+    """Robust location and scatter of each patch.
+
+    Attributes:
+        location: Mean of the points in ``support``, shape ``(*, P)``.
+        covariance: Their covariance with its consistency factor, shape ``(*, P, P)``. Of an exact
+            fit: that of the points on the plane, singular, so that its eigenvector of the
+            smallest eigenvalue is the plane's normal.
+        support: Points that are not outliers, shape ``(*, K)``, bool.
+        sq_distances: Squared Mahalanobis distances to the raw fit, shape ``(*, K)``; these decide
+            ``support``. Of an exact fit: 0 on the plane and inf off it. Points that do not count,
+            and all points of a patch that is not valid: inf.
+        raw_location: Location before reweighting, shape ``(*, P)``.
+        raw_covariance: Scatter before reweighting with its consistency factor, ``(*, P, P)``.
+        raw_support: The points that ``raw_location`` and ``raw_covariance`` come from, ``(*, K)``.
+        log_det: What the estimator minimised, shape ``(*)``; see its function. -inf for an exact
+            fit, NaN where not valid.
+        exact_fit: Whether the points in ``support`` lie exactly on one plane (a hyperplane of P
+            coordinates) and are a majority, shape ``(*)``, bool.
+        valid: Whether there is a fit, shape ``(*)``, bool. Where not, everything else is zero.
+    """
+
+    location: Tensor
+    covariance: Tensor
+    support: Tensor
+    sq_distances: Tensor
+    raw_location: Tensor
+    raw_covariance: Tensor
+    raw_support: Tensor
+    log_det: Tensor
+    exact_fit: Tensor
+    valid: Tensor
+
+
+def no_fit(batch: torch.Size, num_points: int, num_coordinates: int, like: Tensor) -> RobustFit:
+    """Fits that are not valid, of the dtype and on the device of ``like``."""
+    vector = like.new_zeros(*batch, num_coordinates)
+    matrix = like.new_zeros(*batch, num_coordinates, num_coordinates)
+    points = like.new_zeros(*batch, num_points, dtype=torch.bool)
+    flag = like.new_zeros(batch, dtype=torch.bool)
+    return RobustFit(
+        location=vector,
+        covariance=matrix,
+        support=points,
+        sq_distances=like.new_full((*batch, num_points), torch.inf),
+        raw_location=vector.clone(),
+        raw_covariance=matrix.clone(),
+        raw_support=points.clone(),
+        log_det=like.new_full(batch, torch.nan),
+        exact_fit=flag,
+        valid=flag.clone(),
+    )
+
+
+Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
+"""Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
+
+CHUNK_SIZE = 4096
+"""Patches worked on together; what they need has to fit the processor's cache."""
+
+_MIN_SHARE = 64
+
+
+def fit_patchwise(
+    caller: str,
+    patches: Tensor,
+    mask: Tensor | None,
+    support_fraction: float,
+    quantile: float,
+    chunk_size: int,
+    estimator: Estimator,
+    majority: Callable[[int], int] | None = None,
+) -> RobustFit:
+    """Apply an estimator to every patch, and answer the degenerate ones.
+
+    Patches are grouped by their number of points that count, so that every group is dense. The
+    points on one plane are an exact fit where they are ``majority(n)`` of n, by default h.
+    """
+    patches = as_tensor(caller, "patches", patches)
+    check_floating(caller, patches=patches)
+    check_shapes(caller, patches=(patches, "* K P"), mask=(mask, "* K"))
+    if not 0.5 <= support_fraction <= 1:
+        raise ConfigError(
+            f"{caller}: expected support_fraction from 0.5 to 1, got {support_fraction!r}."
+        )
+    if not 0 < quantile < 1:
+        raise ConfigError(f"{caller}: expected quantile above 0 and below 1, got {quantile!r}.")
+    if chunk_size < 1:
+        raise ConfigError(f"{caller}: expected chunk_size of at least 1, got {chunk_size!r}.")
+    batch, (num_points, size) = patches.shape[:-2], patches.shape[-2:]
+    dense = patches.detach().reshape(batch.numel(), num_points, size)
+    counted = torch.isfinite(dense).all(dim=-1)
+    if mask is not None:
+        counted &= mask.reshape(-1, num_points)
+
+    def fit_dense(chunk: Tensor) -> RobustFit:
+        return _fit_chunk(chunk, support_fraction, estimator, majority)
+
+    fit = _fit_groups(dense, counted, chunk_size, fit_dense)
+    return RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in fit))
+
+
+def _fit_groups(
+    patches: Tensor, counted: Tensor, chunk_size: int, fit: Callable[[Tensor], RobustFit]
+) -> RobustFit:
+    """Fit patches ``(B, K, P)`` group by group of equally many points that count ``(B, K)``."""
+    num_patches, num_points, size = patches.shape
+    out = no_fit(torch.Size([num_patches]), num_points, size, patches)
+    counts = counted.sum(dim=1)
+    for count in sorted(set(counts.tolist())):
+        if count == 0:
+            continue
+        rows = torch.nonzero(counts == count).squeeze(1)
+        share = min(chunk_size, max(_MIN_SHARE, -(-len(rows) // torch.get_num_threads())))
+
+        def work(
+            chunk: slice, rows: Tensor = rows, whole: bool = count == num_points, count: int = count
+        ) -> None:
+            chosen = rows[chunk]
+            block = patches[chosen]
+            if whole:
+                _store(out, chosen, fit(block))
+                return
+            # The points that count move to the front, in their order.
+            order = torch.argsort((~counted[chosen]).to(torch.uint8), dim=1, stable=True)
+            order = order[:, :count]
+            block = block.gather(1, order[..., None].expand(-1, -1, size))
+            _store(out, chosen, _spread(fit(block), order, num_points))
+
+        run_chunks(work, chunks_of(len(rows), share), patches.device)
+    return out
+
+
+def _store(out: RobustFit, rows: Tensor, fit: RobustFit) -> None:
+    for target, source in zip(out, fit, strict=True):
+        target[rows] = source
+
+
+def _spread(fit: RobustFit, order: Tensor, num_points: int) -> RobustFit:
+    """Put the points of a fit back to their places ``order (B, n)`` among K."""
+    shape = (len(order), num_points)
+    flags = fit.support.new_zeros(shape)
+    far = fit.sq_distances.new_full(shape, torch.inf)
+    return fit._replace(
+        support=flags.scatter(1, order, fit.support),
+        raw_support=flags.scatter(1, order, fit.raw_support),
+        sq_distances=far.scatter(1, order, fit.sq_distances),
+    )
+
+
+def _fit_chunk(
+    patches: Tensor,
+    support_fraction: float,
+    estimator: Estimator,
+    majority: Callable[[int], int] | None,
+) -> RobustFit:
+    """Fit finite patches ``(B, n, P)``."""
+    num_patches, num_points, size = patches.shape
+    subset = subset_size(num_points, size, support_fraction)
+    enough = subset if majority is None else majority(num_points)
+    columns, frame, tolerance = to_lanes(patches)
+    flats = find_flats(columns, tolerance, enough)
+    out = no_fit(torch.Size([num_patches]), num_points, size, patches)
+
+    def lanes_of(rows: Tensor) -> list[Tensor]:
+        return columns if len(rows) == num_patches else take_lanes(columns, rows)
+
+    regular = torch.nonzero(flats.dimension == size).squeeze(1)
+    if len(regular):
+        estimate = estimator(lanes_of(regular), tolerance[regular] ** 2, subset)
+        _store(out, regular, _general_fit(estimate, frame.of(regular)))
+        # A plane that no simplex lay on may have been found by concentration.
+        thin = torch.nonzero(estimate.singular).squeeze(1)
+        if len(thin):
+            rows, chosen = regular[thin], estimate.raw_support[:, thin]
+            members = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
+            found = members.sum(dim=0) >= enough
+            rows, members = rows[found], members[:, found]
+            _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
+    exact = torch.nonzero(flats.dimension == size - 1).squeeze(1)
+    if len(exact):
+        members = flats.members[:, exact]
+        _store(out, exact, _exact_fit(lanes_of(exact), members, frame.of(exact)))
+    lower = torch.nonzero(flats.dimension < size - 1).squeeze(1)
+    if len(lower):
+        rest = ~flats.members[:, lower].t()
+        fit = _fit_groups(
+            patches[lower],
+            rest,
+            CHUNK_SIZE,
+            lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
+        )
+        _store(out, lower, fit)
+        lower = lower[~fit.valid]
+        lanes, every = lanes_of(lower), flats.members[:, lower] | True
+        plane = refine_flat(lanes, every, tolerance[lower], size - 1).all(dim=0)
+        line = refine_flat(lanes, every, tolerance[lower], size - 2).all(dim=0)
+        rows = lower[plane & ~line]
+        members = flats.members[:, rows] | True
+        _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
+    return out
+
+
+def _general_fit(estimate: Estimate, frame: Frame) -> RobustFit:
+    """The fit of lanes in general position, back in the patches' own coordinates."""
+    size = estimate.location.shape[1]
+    units = 2 * size * _log(frame.zoom.double() * frame.unit.double())
+    valid = torch.ones_like(estimate.singular)
+    return RobustFit(
+        location=frame.point(estimate.location),
+        covariance=frame.matrix(estimate.covariance),
+        support=estimate.support.t(),
+        sq_distances=estimate.sq_distances.t(),
+        raw_location=frame.point(estimate.raw_location),
+        raw_covariance=frame.matrix(estimate.raw_covariance),
+        raw_support=estimate.raw_support.t(),
+        log_det=(_log(estimate.objective) - units).to(estimate.location.dtype),
+        exact_fit=~valid,
+        valid=valid,
+    )
+
+
+def _exact_fit(columns: list[Tensor], members: Tensor, frame: Frame) -> RobustFit:
+    """The fit of lanes whose ``members (K, M)`` lie on a plane; these are the inliers."""
+    dtype = columns[0].dtype
+    weights = members.double()
+    count = sum_points(weights)
+    wide = [column.double() for column in columns]
+    means = [sum_points(weights * column) / count for column in wide]
+    covariance = covariance_entries(wide, means, weights, (count - 1).clamp(min=1)).to(dtype)
+    location = frame.point(join_columns(means).to(dtype))
+    covariance = frame.matrix(covariance)
+    support = members.t()
+    valid = torch.ones(len(support), dtype=torch.bool, device=support.device)
+    return RobustFit(
+        location=location,
+        covariance=covariance,
+        support=support,
+        sq_distances=torch.where(support, 0.0, torch.inf).to(dtype),
+        raw_location=location,
+        raw_covariance=covariance,
+        raw_support=support,
+        log_det=torch.full((len(support),), -torch.inf, dtype=dtype, device=support.device),
+        exact_fit=valid,
+        valid=valid,
+    )
+
+
+def _log(values: Tensor) -> Tensor:
+    """Natural logarithm, the same for a value wherever it stands; torch's on a CPU is not."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.log(values.numpy()))
+    return values.log()
