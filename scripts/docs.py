@@ -60,10 +60,8 @@ def _reaches(start: object, dotted: str) -> bool:
     for name in filter(None, dotted.split(".")):
         if hasattr(start, name):
             start = getattr(start, name)
-        elif name in getattr(start, "__annotations__", {}):
-            return True
         else:
-            return False
+            return name in getattr(start, "__annotations__", {})
     return True
 
 
