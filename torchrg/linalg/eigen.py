@@ -1,4 +1,8 @@
-"""Eigenvectors of many symmetric 3x3 matrices."""
+"""Eigenvectors of many symmetric 3x3 matrices, and how little counts as nothing.
+
+Every tolerance that follows from the precision of a dtype is a function here; other modules name
+multiples of them.
+"""
 
 from typing import NamedTuple
 
@@ -15,6 +19,19 @@ _SETTLED = 1e-9
 _NEARLY_EQUAL = 1e-9
 """Share of the squared largest eigenvalue below which the adjugate has no direction."""
 
+_ROUNDED_STEPS = 8
+"""Rounding errors that a distance to a plane adds up, in units of the patch's own extent."""
+
+
+def machine_epsilon(dtype: torch.dtype) -> float:
+    """Return the distance from 1 to the next number of a dtype: twice its relative rounding."""
+    return torch.finfo(dtype).eps
+
+
+def smallest_normal(dtype: torch.dtype) -> float:
+    """Return the smallest positive number of a dtype that has all its digits."""
+    return torch.finfo(dtype).tiny
+
 
 def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
     """Return the singular value, relative to the largest, at which a direction counts as flat.
@@ -30,7 +47,36 @@ def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
         >>> rank_tolerance(50, torch.float64) < 1e-13
         True
     """
-    return max(num_values, 3) * torch.finfo(dtype).eps
+    return max(num_values, 3) * machine_epsilon(dtype)
+
+
+def coordinate_resolution(points: Tensor) -> Tensor:
+    """Return the rounding of differences of coordinates ``(*, P)`` at each point, shape ``(*)``.
+
+    Example:
+        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
+        tensor([True])
+    """
+    return points.abs().amax(dim=-1) * (4 * machine_epsilon(points.dtype))
+
+
+def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
+    """Return how far from its plane rounding alone can move a point.
+
+    Args:
+        patches: The points as they were given, shape ``(B, K, P)``: their coordinates were
+            rounded where they are, however far from the origin.
+        extent: Largest coordinate of each patch about its own middle, shape ``(B,)``.
+
+    Returns:
+        A length in the unit of the points, shape ``(B,)``.
+
+    Example:
+        >>> flatness_tolerance(torch.ones(1, 5, 3), torch.ones(1)) < 2e-6
+        tensor([True])
+    """
+    coordinates = 2 * patches.abs().amax(dim=(1, 2))
+    return machine_epsilon(patches.dtype) * (coordinates + _ROUNDED_STEPS * extent)
 
 
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,12 +208,9 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """Return what so many steps of Newton's method lead to, and the last step.
+    """Return what steps of Newton's method lead to, and the last step.
 
-    Args:
-        root: Where to begin, shape ``(n,)``.
-        coefficients: Trace, sum of the principal minors and determinant, shape ``(3, n)``.
-        num_steps: At least 1.
+    The coefficients are trace, sum of the principal minors and determinant, shape ``(3, n)``.
     """
     trace, minors, determinant = coefficients
     twice, step = 2 * trace, root
@@ -184,9 +227,7 @@ def _kernel(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit vectors that singular semi-definite matrices take to zero.
 
-    Args:
-        diagonal: Entries (0, 0), (1, 1), (2, 2).
-        beside: Entries (1, 2), (0, 2), (0, 1): those that miss coordinate 0, 1, 2.
+    Of the entries beside the diagonal the first misses coordinate 0, then 1, then 2.
     """
     x, y, z = diagonal
     yz, xz, xy = beside

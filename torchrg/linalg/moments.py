@@ -1,6 +1,14 @@
-"""Means and covariances: of small neighbourhoods, of weighted columns, of regions."""
+"""Means and covariances: of patches, of weighted neighbourhoods, of regions.
 
-from collections.abc import Sequence
+Points lie along the last axis in patches, along the first in the lanes of
+:mod:`torchrg.robust.lanes`, one region after the other in :class:`Segments`, and each layout adds
+them up in its own way, so that a sum does not depend on what stands beside it. All covariances are
+:func:`second_moments` about a mean, given that way of adding. Apart stand only what is no matrix:
+the robust fits factor the scatter by Gram-Schmidt as they need determinants of thin ones, depth
+images have running sums over windows, and the grid of pictures adds whole numbers, which are exact.
+"""
+
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -51,30 +59,50 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
     if mask is not None:
         centered = [torch.where(mask, column, 0.0) for column in centered]
     total = count if isinstance(count, int) else count.squeeze(-1)
-    size = len(columns)
-    entries = {
-        (i, j): (centered[i] * centered[j]).sum(dim=-1) / total
-        for i in range(size)
-        for j in range(i + 1)
-    }
-    rows = [
-        torch.stack([entries[max(i, j), min(i, j)] for j in range(size)], dim=-1)
-        for i in range(size)
-    ]
+    matrix = second_moments(centered, None, _add_rows, total)
     center = torch.cat([start + mean for start, mean in zip(first, means, strict=True)], dim=-1)
     if mask is not None:
         center = torch.where(mask.any(dim=-1, keepdim=True), center, 0.0)
-    return center, torch.stack(rows, dim=-2)
+    return center, matrix
 
 
-def coordinate_resolution(points: Tensor) -> Tensor:
-    """Return the rounding of coordinate differences at each point, shape ``(N,)``.
+def second_moments(
+    columns: Sequence[Tensor],
+    weights: Tensor | None,
+    add: Callable[[Tensor], Tensor],
+    total: Tensor | float = 1.0,
+) -> Tensor:
+    """Return the second moments of weighted points about zero, shape ``(*, P, P)``.
+
+    Args:
+        columns: P coordinates of the points, about their mean for a covariance.
+        weights: Weights of the points, of the shape of a column. Default: 1 each.
+        add: Takes a column to its sums, shape ``(*)``.
+        total: What the sums are divided by: the sum of the weights for a covariance.
+
+    Returns:
+        The matrices.
 
     Example:
-        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
-        tensor([True])
+        >>> square = torch.tensor([[-1.0, -1, 1, 1]]), torch.tensor([[-2.0, 2, -2, 2]])
+        >>> second_moments(square, None, lambda column: column.sum(dim=1), 4)
+        tensor([[[1., 0.],
+                 [0., 4.]]])
     """
-    return points.abs().amax(dim=-1) * (4 * torch.finfo(points.dtype).eps)
+    size = len(columns)
+    weighted = columns if weights is None else [weights * column for column in columns]
+    entries = {
+        (i, j): add(weighted[i] * columns[j]) / total for i in range(size) for j in range(i, size)
+    }
+    rows = [
+        torch.stack([entries[min(i, j), max(i, j)] for j in range(size)], dim=-1)
+        for i in range(size)
+    ]
+    return torch.stack(rows, dim=-2)
+
+
+def _add_rows(values: Tensor) -> Tensor:
+    return values.sum(dim=-1)
 
 
 Columns = tuple[Tensor, Tensor, Tensor]
@@ -162,12 +190,8 @@ def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
     total = weights.sum(dim=1)
     share = weights / torch.where(total > 0, total, 1.0)[:, None]
     means = [(share * column).sum(dim=1) for column in columns]
-    x, y, z = (column - mean[:, None] for column, mean in zip(columns, means, strict=True))
-    sx, sy, sz = share * x, share * y, share * z
-    xx, xy, xz = (sx * x).sum(dim=1), (sx * y).sum(dim=1), (sx * z).sum(dim=1)
-    yy, yz, zz = (sy * y).sum(dim=1), (sy * z).sum(dim=1), (sz * z).sum(dim=1)
-    rows = [torch.stack(row, dim=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
-    return torch.stack(means, dim=-1), torch.stack(rows, dim=-2)
+    centered = [column - mean[:, None] for column, mean in zip(columns, means, strict=True)]
+    return torch.stack(means, dim=-1), second_moments(centered, share, _add_rows)
 
 
 class Segments:

@@ -11,8 +11,8 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg._parallel import fair_chunks, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
+from torchrg.linalg import coordinate_resolution
 from torchrg.linalg.eigen import principal_frame
-from torchrg.linalg.moments import coordinate_resolution
 from torchrg.neighbors import gather_patches
 from torchrg.normals.consensus.noise import survey_noise
 from torchrg.normals.patches import about_query, at_all_points, join_fits, replace_rows

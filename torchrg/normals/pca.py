@@ -1,15 +1,15 @@
 """Least-squares planes: the classic estimator, and the last step of every robust one."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
-from torchrg.linalg import covariance, eigh3, rank_tolerance
+from torchrg.linalg import coordinate_resolution, covariance, eigh3, rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
-from torchrg.linalg.moments import coordinate_resolution
 from torchrg.structures import NormalFit
+
+_NARROW = 0.03
+"""Share of its length below which the width of a patch drowns in the rounding of a covariance."""
 
 
 def fit_normals_pca(
@@ -114,56 +114,31 @@ def _spans_plane(
     """Return whether the second direction of each patch is more than rounding.
 
     A covariance holds squares, so its own rounding hides widths below the root of its precision;
-    the few patches that narrow are looked at again. Which these are depends on the data: as an
-    operator of its own, neither compilers nor vmap see that.
+    the few patches that narrow are looked at again. Compilers and vmap know of no rows that are
+    few: there all are.
     """
-    spans: Tensor = torch.ops.torchrg.spans_plane(patches, mask, values, resolution)
-    return spans
-
-
-# ``torch.library.custom_op`` would do all of this, and load the compiler at the first call.
-torch.library.define(
-    "torchrg::spans_plane",
-    "(Tensor patches, Tensor? mask, Tensor values, Tensor? resolution) -> Tensor",
-)
-
-
-@torch.library.impl("torchrg::spans_plane", "CompositeExplicitAutograd")
-def _look_again_at_narrow(
-    patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None
-) -> Tensor:
     if resolution is None:
         resolution = patch_resolution(patches, mask)
     lengths, widths = (values[..., axis].clamp(min=0).sqrt() for axis in (2, 1))
-    narrow = widths < 0.03 * lengths
-    if bool(narrow.any()):
+    flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
+    narrow = widths < _NARROW * lengths
+    any_narrow = _any(narrow)
+    if any_narrow is None:
+        widths = torch.where(narrow, _width(patches, mask), widths)
+    elif any_narrow:
         widths = widths.double()
         widths[narrow] = _width(patches[narrow], None if mask is None else mask[narrow])
-    flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     return widths > flat
 
 
-@torch.library.register_fake("torchrg::spans_plane")  # type: ignore[untyped-decorator]
-def _(patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None) -> Tensor:
-    return patches.new_empty(patches.shape[:-2], dtype=torch.bool)
-
-
-@torch.library.register_vmap("torchrg::spans_plane")  # type: ignore[untyped-decorator]
-def _(
-    info: Any,  # noqa: ANN401
-    in_dims: tuple[int | None, ...],
-    *arguments: Tensor | None,
-) -> tuple[Tensor, int]:
-    batched = [
-        argument
-        if argument is None
-        else argument.expand(info.batch_size, *argument.shape)
-        if dim is None
-        else argument.movedim(dim, 0)
-        for argument, dim in zip(arguments, in_dims, strict=True)
-    ]
-    spans: Tensor = torch.ops.torchrg.spans_plane(*batched)
-    return spans, 0
+def _any(condition: Tensor) -> bool | None:
+    """Return whether a condition holds anywhere; None under vmap and compilers: no values yet."""
+    if torch.compiler.is_compiling():
+        return None
+    try:
+        return bool(condition.any())
+    except RuntimeError:  # vmap's answer to the question; it cannot be told beforehand
+        return None
 
 
 def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
