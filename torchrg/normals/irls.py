@@ -15,7 +15,7 @@ from torchrg.linalg import coordinate_resolution
 from torchrg.linalg.eigen import principal_frame
 from torchrg.neighbors import gather_patches
 from torchrg.normals.consensus.noise import survey_noise
-from torchrg.normals.patches import about_query, at_all_points, join_fits, replace_rows
+from torchrg.normals.patches import about_first, at_all_points, join_fits, replace_rows
 from torchrg.normals.pca import check_patches, fit_normals_pca
 from torchrg.structures import Neighbors, NormalFit
 
@@ -290,7 +290,7 @@ def _fit_rows(
     others = mask & ~query
     plane = fit_normals_pca(patches, mask, resolution=resolution)
     start = fit_normals_pca(patches, others, resolution=resolution)
-    _, offsets = about_query(patches, mask)
+    _, offsets = about_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
     noise = torch.maximum(noise, _LEAST_NOISE * radius)
     flat = start.valid & (start.residual_rms <= noise)
