@@ -17,6 +17,10 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg.eigen import smallest_eigenvector3
 
 
+def _add_rows(values: Tensor) -> Tensor:
+    return values.sum(dim=-1)
+
+
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     r"""Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
 
@@ -59,7 +63,7 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
     if mask is not None:
         centered = [torch.where(mask, column, 0.0) for column in centered]
     total = count if isinstance(count, int) else count.squeeze(-1)
-    matrix = second_moments(centered, None, _add_rows, total)
+    matrix = second_moments(centered, total=total)
     center = torch.cat([start + mean for start, mean in zip(first, means, strict=True)], dim=-1)
     if mask is not None:
         center = torch.where(mask.any(dim=-1, keepdim=True), center, 0.0)
@@ -68,8 +72,8 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 
 def second_moments(
     columns: Sequence[Tensor],
-    weights: Tensor | None,
-    add: Callable[[Tensor], Tensor],
+    weights: Tensor | None = None,
+    add: Callable[[Tensor], Tensor] = _add_rows,
     total: Tensor | float = 1.0,
 ) -> Tensor:
     """Return the second moments of weighted points about zero, shape ``(*, P, P)``.
@@ -77,15 +81,15 @@ def second_moments(
     Args:
         columns: P coordinates of the points, about their mean for a covariance.
         weights: Weights of the points, of the shape of a column. Default: 1 each.
-        add: Takes a column to its sums, shape ``(*)``.
-        total: What the sums are divided by: the sum of the weights for a covariance.
+        add: Takes a column to its sums, shape ``(*)``. Default: sums along the last axis.
+        total: What the sums are divided by; for a covariance the sum of the weights.
 
     Returns:
         The matrices.
 
     Example:
         >>> square = torch.tensor([[-1.0, -1, 1, 1]]), torch.tensor([[-2.0, 2, -2, 2]])
-        >>> second_moments(square, None, lambda column: column.sum(dim=1), 4)
+        >>> second_moments(square, total=4)
         tensor([[[1., 0.],
                  [0., 4.]]])
     """
@@ -99,10 +103,6 @@ def second_moments(
         for i in range(size)
     ]
     return torch.stack(rows, dim=-2)
-
-
-def _add_rows(values: Tensor) -> Tensor:
-    return values.sum(dim=-1)
 
 
 Columns = tuple[Tensor, Tensor, Tensor]
@@ -191,7 +191,7 @@ def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
     share = weights / torch.where(total > 0, total, 1.0)[:, None]
     means = [(share * column).sum(dim=1) for column in columns]
     centered = [column - mean[:, None] for column, mean in zip(columns, means, strict=True)]
-    return torch.stack(means, dim=-1), second_moments(centered, share, _add_rows)
+    return torch.stack(means, dim=-1), second_moments(centered, share)
 
 
 class Segments:

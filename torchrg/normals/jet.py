@@ -321,14 +321,14 @@ def _principal_curvatures(shape: Tensor, tangents: Tensor) -> tuple[Tensor, Tens
     values = torch.stack([middle + radius, middle - radius], dim=-1)
     with torch.no_grad():
         # Of the two rows of (S - k1), the longer one is orthogonal to the first direction.
-        along = torch.where(half >= 0, half + radius, ab)
-        across = torch.where(half >= 0, ab, radius - half)
-        size = root(along * along + across * across)
-        round_ = size == 0
-        along = torch.where(round_, 1.0, along / torch.where(round_, 1.0, size))
-        across = torch.where(round_, 0.0, across / torch.where(round_, 1.0, size))
-        first = torch.stack([along, across], dim=-1)
-        second = torch.stack([-across, along], dim=-1)
+        a = torch.where(half >= 0, half + radius, ab)
+        b = torch.where(half >= 0, ab, radius - half)
+        size = root(a * a + b * b)
+        umbilic = size == 0
+        a = torch.where(umbilic, 1.0, a / torch.where(umbilic, 1.0, size))
+        b = torch.where(umbilic, 0.0, b / torch.where(umbilic, 1.0, size))
+        first = torch.stack([a, b], dim=-1)
+        second = torch.stack([-b, a], dim=-1)
         directions = torch.stack([first, second], dim=-2) @ tangents
     return values, directions
 

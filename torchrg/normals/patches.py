@@ -23,6 +23,7 @@ def fit_points(
     *,
     rows: Tensor | None = None,
     chunk_size: int = 16384,
+    **of_points: Tensor,
 ) -> NormalFit:
     """Fit the neighbourhoods of some points of a cloud, with bounded memory.
 
@@ -32,6 +33,7 @@ def fit_points(
         fit: Estimator of a block of patches.
         rows: Points to fit, shape ``(n,)``. Default: all.
         chunk_size: Patches in memory at a time; changes no result.
+        **of_points: Further keywords of ``fit`` that have a value for each point, shape ``(N,)``.
 
     Returns:
         Normals, curvature, validity and residual of those points.
@@ -48,7 +50,8 @@ def fit_points(
         block = chunk if rows is None else rows[chunk]
         mask = None if neighbors.valid is None else neighbors.valid[block]
         patches = gather_patches(points, neighbors.indices[block])
-        return fit(patches, mask, resolution=coordinate_resolution(points[block]))
+        own = {name: values[block] for name, values in of_points.items()}
+        return fit(patches, mask, resolution=coordinate_resolution(points[block]), **own)
 
     chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
     return join_fits(map_chunks(fit_chunk, chunks, points.device))
