@@ -17,8 +17,6 @@ from torchrg.normals.patches import about_first, fit_points, replace_rows
 from torchrg.normals.pca import check_patches, fit_normals_pca
 from torchrg.structures import Neighbors, NormalFit
 
-# The numbers below are those of the authors' program.
-
 _HEAVY = 0.25
 """Points of a weight above this make up the plane."""
 
@@ -38,7 +36,8 @@ _LEAST_SHARE = 0.1
 """Share of the points below which a solution gives way to the other."""
 
 _LEAST_NOISE = 1e-4
-"""Share of the distance to the farthest point: exact planes have no noise, and steps must end."""
+"""Share of the distance to the farthest point: exact planes have no noise, and steps must end. (The
+numbers above are those of the authors' program.)"""
 
 
 class _Offsets(NamedTuple):
