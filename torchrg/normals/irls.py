@@ -175,23 +175,8 @@ def estimate_irls(
 ) -> NormalFit:
     """Estimate normals by iteratively weighted PCA, with the noise found about each point.
 
-    See :func:`torchrg.normals.fit_normals_irls`. Its authors ask the user for the noise; here it
-    is estimated from the planes of PCA about each point.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        config: Settings, none of which matters here.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The fit.
-
-    Example:
-        >>> import torch
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
-        >>> estimate_irls(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
-        tensor(True)
+    The authors ask the user for the noise; here it is estimated from the planes of PCA about each
+    point. No setting matters.
     """
     known = points.detach()
     planes = fit_points(known, neighbors, fit_normals_pca, chunk_size=chunk_size)

@@ -126,7 +126,7 @@ def fit_jet(
         tensor(0.5...)
     """
     check_patches("fit_jet", patches, mask, resolution)
-    plane, frame = fit_plane(patches, mask, resolution=resolution)
+    plane, frame = fit_plane(patches, mask, resolution)
     place, offsets = about_first(patches, mask)
     axes = _tangent_axes(frame)
     u, v, w = (offsets @ axes).unbind(dim=-1)

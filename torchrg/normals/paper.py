@@ -105,24 +105,7 @@ def _percentile_exceeds(chords: Tensor, counted: Tensor | None, angle_deg: float
 def estimate_paper(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
-    """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at those.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        config: Sharp rule and limit, support fraction and inlier quantile of the MCD.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The fit, with ``sharp``.
-
-    Example:
-        >>> import torch
-        >>> points = torch.cat([torch.eye(3), torch.zeros(1, 3)])
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 3], [1, 0, 3], [2, 0, 3], [3, 0, 1]]))
-        >>> estimate_paper(points, neighbors, NormalsConfig(k=3), 16).valid.all()
-        tensor(True)
-    """
+    """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at those."""
     fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
     sharp = find_sharp_points(
         fit.normals,

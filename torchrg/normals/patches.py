@@ -1,6 +1,6 @@
 """From fits of patches to estimators of clouds, a block at a time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -54,19 +54,8 @@ def fit_points(
         return fit(patches, mask, resolution=coordinate_resolution(points[block]), **own)
 
     chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
-    return join_fits(map_chunks(fit_chunk, chunks, points.device))
-
-
-def join_fits(parts: Sequence[NormalFit]) -> NormalFit:
-    """Return the fits of consecutive points as one, without ``sharp``.
-
-    Example:
-        >>> flat = NormalFit(torch.zeros(2, 3), *torch.zeros(3, 2))
-        >>> join_fits([flat, flat]).curvature
-        tensor([0., 0., 0., 0.])
-    """
-    columns = list(zip(*parts, strict=True))
-    return NormalFit(*(torch.cat(column) for column in columns[:4]))
+    parts = list(zip(*map_chunks(fit_chunk, chunks, points.device), strict=True))
+    return NormalFit(*(torch.cat(part) for part in parts[:4]))
 
 
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
@@ -76,19 +65,8 @@ Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
     """Return the estimator that fits every neighbourhood alike.
 
-    Args:
-        fit: Fit of patches, as :func:`torchrg.normals.fit_normals_pca`.
-        **settings: Its keywords, and the fields of :class:`torchrg.config.NormalsConfig` for them.
-
-    Returns:
-        The estimator.
-
-    Example:
-        >>> from torchrg.normals.pca import fit_normals_pca
-        >>> estimate = at_all_points(fit_normals_pca)
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
-        >>> estimate(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
-        tensor(True)
+    The settings are keywords of the fit, and the fields of :class:`torchrg.config.NormalsConfig`
+    for them.
     """
 
     def estimate(
@@ -103,18 +81,7 @@ def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
 def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the first point of each patch that counts, and all points relative to it.
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold NaN. Default: all.
-
-    Returns:
-        Those points, shape ``(*, 3)``, zero where none counts, and differences to them, shape
-        ``(*, K, 3)``, zero for points that do not count.
-
-    Example:
-        >>> patches, mask = torch.tensor([[5.0, 5, 5], [1, 2, 3]]), torch.tensor([False, True])
-        >>> about_first(patches, mask)[0]
-        tensor([1., 2., 3.])
+    Zero where no point counts, and for points that do not; these may hold NaN.
     """
     if mask is None:
         return patches[..., 0, :], patches - patches[..., :1, :]
@@ -125,15 +92,7 @@ def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
 
 
 def replace_rows(fit: NormalFit, rows: Tensor, refined: NormalFit) -> NormalFit:
-    """Return a fit in which some points have another one.
-
-    Example:
-        >>> import torch
-        >>> flat = NormalFit(torch.zeros(3, 3), *torch.zeros(3, 3))
-        >>> one = NormalFit(torch.ones(1, 3), *torch.ones(3, 1))
-        >>> replace_rows(flat, torch.tensor([1]), one).curvature
-        tensor([0., 1., 0.])
-    """
+    """Return a fit in which some points have another one; ``sharp`` stays."""
     merged = [old.index_copy(0, rows, new) for old, new in zip(fit[:4], refined[:4], strict=True)]
     normals, curvature, valid, residual_rms = merged
     return NormalFit(normals, curvature, valid, residual_rms, fit.sharp)

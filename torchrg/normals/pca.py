@@ -51,28 +51,13 @@ def fit_normals_pca(
         tensor([0., 0., 1.])
     """
     check_patches("fit_normals_pca", patches, mask, resolution)
-    fit, _ = fit_plane(patches, mask, resolution=resolution)
-    return fit
+    return fit_plane(patches, mask, resolution)[0]
 
 
 def fit_plane(
-    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
+    patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> tuple[NormalFit, PrincipalFrame]:
-    """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        Fit and frame.
-
-    Example:
-        >>> _, frame = fit_plane(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [2, 1, 0]]))
-        >>> frame.vectors[:, 2].abs()
-        tensor([1., 0., 0.])
-    """
+    """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
     _, matrix = covariance(patches, mask)
     frame = principal_frame(matrix)
     with torch.no_grad():
@@ -92,17 +77,7 @@ def fit_plane(
 def check_patches(
     caller: str, patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> None:
-    """Check the arguments of an estimator of patches.
-
-    Raises:
-        ShapeError: If a shape or dtype is wrong.
-
-    Example:
-        >>> check_patches("f", torch.zeros(8, 2), None, None)
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected patches of shape (*, K, 3), got (8, 2).
-    """
+    """Check the arguments of an estimator of patches; raise ShapeError if one is wrong."""
     check_shapes(caller, patches=(patches, "* K 3"), mask=(mask, "* K"))
     check_shapes(caller, patches=(patches[..., 0, 0], "*"), resolution=(resolution, "*"))
     check_floating(caller, patches=patches, resolution=resolution)
@@ -114,8 +89,7 @@ def _spans_plane(
     """Return whether the second direction of each patch is more than rounding.
 
     A covariance holds squares, so its own rounding hides widths below the root of its precision;
-    the few patches that narrow are looked at again. Compilers and vmap know of no rows that are
-    few: there all are.
+    the few patches that narrow are looked at again: all of them where nobody can tell which.
     """
     if resolution is None:
         resolution = patch_resolution(patches, mask)
@@ -132,12 +106,12 @@ def _spans_plane(
 
 
 def _any(condition: Tensor) -> bool | None:
-    """Return whether a condition holds anywhere; None under vmap and compilers: no values yet."""
+    """Return whether a condition holds anywhere; None in a compiler and under vmap: no values."""
     if torch.compiler.is_compiling():
         return None
     try:
         return bool(condition.any())
-    except RuntimeError:  # vmap's answer to the question; it cannot be told beforehand
+    except RuntimeError:  # vmap's answer; it has no public way to ask beforehand
         return None
 
 
@@ -153,18 +127,6 @@ def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def patch_resolution(patches: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the rounding of coordinate differences in each patch.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold NaN.
-
-    Returns:
-        Shape ``(*)``, in the unit of the cloud.
-
-    Example:
-        >>> patch_resolution(torch.full((8, 3), 1000.0)) > 1e-4
-        tensor(True)
-    """
+    """Return the rounding of coordinate differences in each patch, shape ``(*)``."""
     counted = patches if mask is None else torch.where(mask[..., None], patches, 0.0)
     return coordinate_resolution(counted.detach().flatten(-2))
