@@ -1,6 +1,6 @@
 """Iteratively weighted PCA: an M-estimator of planes by graduated non-convexity."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -195,17 +195,18 @@ def _fit_rows(
     _, offsets = about_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
     noise = torch.maximum(noise, _LEAST_NOISE * radius)
-    flat = start.valid & (start.residual_rms <= noise)
-    plane = NormalFit(*(_select(flat, *pair) for pair in zip(start[:4], plane[:4], strict=True)))
+    is_flat = start.residual_rms <= noise
+    flat = (start.valid & is_flat).nonzero().squeeze(-1)
+    plane = replace_rows(plane, flat, start.each(lambda part: part[flat]))
 
-    rows = (start.valid & ~flat).nonzero().squeeze(-1)
+    rows = (start.valid & ~is_flat).nonzero().squeeze(-1)
     x, y, z = offsets[rows].unbind(dim=-1)
     points = _Offsets(x, y, z, others[rows].to(patches.dtype))
     normals, heavy = _fit_edges(points, start.normals[rows], noise[rows, None], decay)
     resolution = None if resolution is None else resolution[rows]
     inliers = fit_normals_pca(patches[rows], heavy | itself[rows], resolution=resolution)
     known = zip(inliers[1:4], plane[1:4], strict=True)
-    rest = (_select(inliers.valid, new, old[rows]) for new, old in known)
+    rest = (torch.where(inliers.valid, new, old[rows]) for new, old in known)
     return replace_rows(plane, rows, NormalFit(normals, *rest))
 
 
@@ -283,11 +284,6 @@ def _cosine(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(dim=-1).abs()
 
 
-def _select(condition: Tensor, yes: Tensor, no: Tensor) -> Tensor:
-    """Return rows of one tensor where a condition holds, of another elsewhere."""
-    return torch.where(condition.reshape(-1, *[1] * (yes.ndim - 1)), yes, no)
-
-
 def _fit_graduated(
     points: _Offsets, plane: _Plane, limit: Tensor, decay: float, *, shift: bool
 ) -> _Plane:
@@ -297,9 +293,11 @@ def _fit_graduated(
     direction in which the weighted points are flattest about the center. With ``shift`` the center
     first moves along the normal to the weighted mean of the heavy points, their weights being those
     of the step before. ``mu`` ends at the first value at or below the limit, with ``shift`` at the
-    last one at or above. Patches leave the batch when they are done.
+    last one at or above. Patches leave the batch when they are done. If gradients are wanted, each
+    step keeps its input only and is run again for them.
     """
-    step = _shift_and_refit if shift else _refit
+    differentiable = torch.is_grad_enabled() and plane.normal.requires_grad
+    step = partial(checkpoint, _step, use_reentrant=False) if differentiable else _step
     num_steps = _count_steps(plane.mu.detach(), limit, decay, stay_above=shift)
     order = num_steps.argsort(descending=True, stable=True)
     remaining = num_steps[order].tolist()
@@ -309,7 +307,7 @@ def _fit_graduated(
         while remaining[active - 1] <= done:
             active -= 1
         part = slice(0, active)
-        moved = _run(step, points.take(part), plane.take(part), decay)
+        moved = step(points.take(part), plane.take(part), decay, shift)
         rest = plane.take(slice(active, None))
         plane = _Plane(*map(torch.cat, zip(moved, rest, strict=True)))
     return plane.take(order.argsort())
@@ -321,41 +319,21 @@ def _weigh(distances: Tensor, mu: Tensor, counted: Tensor) -> Tensor:
     return weights * weights * counted
 
 
-def _refit(points: _Offsets, plane: _Plane, decay: float) -> _Plane:
-    """Return the next plane through the same center."""
-    return _flattest(points.about(plane.center), plane, decay)
-
-
-def _shift_and_refit(points: _Offsets, plane: _Plane, decay: float) -> _Plane:
-    """Return the next plane, through the mean height of the heavy points."""
-    points = points.about(plane.center)
-    weights = _weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
-    heavy = weights * (weights > _HEAVY)
-    total = heavy.sum(dim=-1, keepdim=True)
-    heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
-    shift = plane.normal * (heights / torch.where(total > 0, total, 1.0))
-    return _flattest(points.about(shift), plane._replace(center=plane.center + shift), decay)
-
-
-def _flattest(points: _Offsets, plane: _Plane, decay: float) -> _Plane:
+def _step(points: _Offsets, plane: _Plane, decay: float, shift: bool) -> _Plane:
     """Return the next plane, with the normal along which the weighted points are flattest."""
+    center = plane.center
+    if shift:
+        points = points.about(center)
+        weights = _weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
+        heavy = weights * (weights > _HEAVY)
+        total = heavy.sum(dim=-1, keepdim=True)
+        heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
+        move = plane.normal * (heights / torch.where(total > 0, total, 1.0))
+        points, center = points.about(move), center + move
     mu = plane.mu / decay
     weights = _weigh(points.distances(plane.normal), mu, points.counted)
     matrix = second_moments(points[:3], weights)
-    return _Plane(principal_frame(matrix).normals, plane.center, mu, plane.normal, mu)
-
-
-def _run(
-    step: Callable[[_Offsets, _Plane, float], _Plane],
-    points: _Offsets,
-    plane: _Plane,
-    decay: float,
-) -> _Plane:
-    """Run a step; if gradients are wanted, keep its input only and run it again for them."""
-    if not (torch.is_grad_enabled() and plane.normal.requires_grad):
-        return step(points, plane, decay)
-    result: _Plane = checkpoint(step, points, plane, decay, use_reentrant=False)
-    return result
+    return _Plane(principal_frame(matrix).normals, center, mu, plane.normal, mu)
 
 
 def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -> Tensor:

@@ -37,17 +37,6 @@ def fit_normals_jet(
     variation of PCA, so that regions grow in the same order; ``residual_rms`` belongs to the
     quadratic surface.
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the point itself first.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-
     Example:
         >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
         >>> bowl = torch.stack([x, y, (x**2 + y**2) / 9], dim=-1).reshape(25, 3)
