@@ -120,11 +120,8 @@ def fit_jet(
     axes = _tangent_axes(frame)
     u, v, w = (offsets @ axes).unbind(dim=-1)
     rounding = patch_resolution(patches, mask) if resolution is None else resolution
-    sides = [_mean_size(u), _mean_size(v)]
-    terms, residual = _fit_height(u, v, w, sides, mask, rounding)
-    height, slope_u, slope_v, *bend = terms
-    normal, shape, tangents = _shape_operator(slope_u, slope_v, *bend)
-    curvatures, directions = _principal_curvatures(shape, tangents)
+    (height, *derivatives), residual = _fit_height(u, v, w, mask, rounding)
+    normal, curvatures, directions = _principal_curvatures(*derivatives)
     count = residual.shape[-1] if mask is None else mask.sum(dim=-1).clamp(min=1)
     valid = plane.valid
     return JetFit(
@@ -145,27 +142,11 @@ def fit_paraboloids(
 
     The normal at the point is that of the height field at ``u = v = 0``: the 2-jet of
     :func:`fit_jet` in another frame, by normal equations. Terms that the neighbours cannot tell
-    from the ones before, as on two scan lines, are left out.
+    from the ones before, as on two scan lines, are left out. The heights are along ``normals``
+    ``(n, 3)``, within some 60 degrees of the surface normal; ``counted`` are weights 0 or 1.
 
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        normals: Directions of the heights, shape ``(n, 3)``, within some 60 degrees of the surface
-            normal.
-        counted: Weights 0 or 1, shape ``(n, K)``.
-
-    Returns:
-        Unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``, and
-        standard deviations of the residuals ``(n,)``: root of their sum of squares by the number of
-        points less six.
-
-    Example:
-        >>> from torchrg.linalg.moments import split_columns
-        >>> grid = torch.cartesian_prod(torch.arange(-2.0, 3), torch.arange(-2.0, 3))
-        >>> bowl = torch.cat([grid, grid.square().sum(dim=1, keepdim=True)], dim=1)[None]
-        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
-        >>> normals, _, deviations = fit_paraboloids(split_columns(bowl), up, torch.ones(1, 25))
-        >>> bool((normals - up).abs().max() < 1e-6), bool(deviations < 1e-5)
-        (True, True)
+    Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``,
+    and standard deviations of the residuals ``(n,)``, six degrees of freedom less.
     """
     radius = sq_lengths(columns).mul_(counted).amax(dim=1).sqrt_()
     scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None] * counted
@@ -198,23 +179,17 @@ def _tangent_axes(frame: PrincipalFrame) -> Tensor:
     return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=-1)
 
 
-def _mean_size(values: Tensor) -> Tensor:
-    """Return the mean absolute value of each row, 1 for a row of zeros, shape ``(*, 1)``."""
-    size = values.detach().abs().mean(dim=-1, keepdim=True)
-    return torch.where(size > 0, size, 1.0)
-
-
 def _fit_height(
     u: Tensor,
     v: Tensor,
     w: Tensor,
-    sides: list[Tensor],
     mask: Tensor | None,
     rounding: Tensor,
 ) -> tuple[list[Tensor], Tensor]:
     """Return height, slopes and second derivatives, shape ``(*)`` each, and the residuals."""
     count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)
     ones = torch.ones_like(u) if mask is None else mask.to(u.dtype)
+    sides = [_mean_size(u), _mean_size(v)]
     # Rounding of a coordinate, relative to the size of each column, hides dependent columns.
     rough = [rounding[..., None] / side for side in sides]
     exact = rank_tolerance(u.shape[-1], u.dtype)
@@ -233,6 +208,12 @@ def _fit_height(
     units = (torch.ones_like(p), p, q, p * p / 2, p * q, q * q / 2)
     derivatives = [(c / unit).squeeze(-1) for c, unit in zip(coefficients, units, strict=True)]
     return derivatives, residual
+
+
+def _mean_size(values: Tensor) -> Tensor:
+    """Return the mean absolute value of each row, 1 for a row of zeros, shape ``(*, 1)``."""
+    size = values.detach().abs().mean(dim=-1, keepdim=True)
+    return torch.where(size > 0, size, 1.0)
 
 
 def _quadratic_terms(ones: Tensor, u: Tensor, v: Tensor) -> list[Tensor]:
@@ -276,14 +257,14 @@ def least_squares(
     return coefficients, target
 
 
-def _shape_operator(
+def _principal_curvatures(
     slope_u: Tensor, slope_v: Tensor, uu: Tensor, uv: Tensor, vv: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the normal of a height field and how it turns along two tangents.
+    """Return unit normals of height fields, principal curvatures and their directions.
 
-    From the first and second derivatives: the unit normal with positive height, shape ``(*, 3)``;
-    entries aa, ab, bb of the shape operator in an orthonormal basis of tangents a and b, shape
-    ``(*, 3)``; that basis, shape ``(*, 2, 3)``.
+    From first and second derivatives: normals of positive height ``(*, 3)``, curvatures ``(*, 2)``,
+    larger first, and directions ``(*, 2, 3)``, these without gradient. They are the eigenvalues of
+    the shape operator, of entries aa, ab, bb in an orthonormal basis of tangents.
     """
     one = torch.ones_like(slope_u)
     gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()
@@ -292,19 +273,9 @@ def _shape_operator(
     first = torch.stack([one, torch.zeros_like(one), slope_u], dim=-1) / length[..., None]
     second = torch.linalg.cross(normal, first)
     au, bu, bv = first[..., 0], second[..., 0], second[..., 1]
-    aa = au * au * uu
-    ab = au * (bu * uu + bv * uv)
-    bb = bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv
-    shape = torch.stack([aa, ab, bb], dim=-1) / gradient[..., None]
-    return normal, shape, torch.stack([first, second], dim=-2)
-
-
-def _principal_curvatures(shape: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the eigenvalues of shape operators, larger first, and their directions.
-
-    Curvatures ``(*, 2)`` and unit directions ``(*, 2, 3)``, these without gradient.
-    """
-    aa, ab, bb = shape.unbind(dim=-1)
+    aa = au * au * uu / gradient
+    ab = au * (bu * uu + bv * uv) / gradient
+    bb = (bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv) / gradient
     middle, half = (aa + bb) / 2, (aa - bb) / 2
     radius = root(half * half + ab * ab)
     values = torch.stack([middle + radius, middle - radius], dim=-1)
@@ -316,10 +287,9 @@ def _principal_curvatures(shape: Tensor, tangents: Tensor) -> tuple[Tensor, Tens
         umbilic = size == 0
         a = torch.where(umbilic, 1.0, a / torch.where(umbilic, 1.0, size))
         b = torch.where(umbilic, 0.0, b / torch.where(umbilic, 1.0, size))
-        first = torch.stack([a, b], dim=-1)
-        second = torch.stack([-b, a], dim=-1)
-        directions = torch.stack([first, second], dim=-2) @ tangents
-    return values, directions
+        turn = torch.stack([torch.stack([a, b], dim=-1), torch.stack([-b, a], dim=-1)], dim=-2)
+        directions = turn @ torch.stack([first, second], dim=-2)
+    return normal, values, directions
 
 
 def _tangents(normals: Tensor) -> tuple[Tensor, Tensor]:
