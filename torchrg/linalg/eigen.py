@@ -12,7 +12,11 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes
 
 _JACOBI_SWEEPS = 5
+"""Rotations of all three pairs: 3x3 matrices are diagonal to rounding, in float64 too."""
+
 _FIRST_STEPS, _MORE_STEPS = 4, 6
+"""Steps of Newton's method: enough for a simple root, and for one that is nearly double."""
+
 _SETTLED = 1e-9
 """Share of the trace by which the last step may move a root that is as good as found."""
 
@@ -127,14 +131,7 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Do as :func:`eigh3`, one matrix at a time: the faster way for less than a thousand of them.
 
-    Args:
-        matrices: Symmetric matrices, shape ``(*, 3, 3)``.
-
-    Returns:
-        As :func:`eigh3`; NaN for a matrix that is not finite.
-
-    Raises:
-        ShapeError: If the shape or dtype is not as above.
+    A matrix that is not finite gives NaN.
 
     Example:
         >>> values, vectors = eigh3_of_few(torch.diag(torch.tensor([3.0, 1.0, 2.0])))
@@ -302,12 +299,6 @@ def principal_frame(matrices: Tensor) -> PrincipalFrame:
     and everything in gradient: ``dn = sum_j v_j (v_j . dA n) / (l0 - l_j)``. Where two eigenvalues
     are equal, the turn between their vectors is left out.
 
-    Args:
-        matrices: Symmetric matrices, shape ``(*, 3, 3)``.
-
-    Returns:
-        The frame.
-
     Example:
         >>> matrix = torch.diag(torch.tensor([3.0, 1.0, 2.0])).requires_grad_()
         >>> principal_frame(matrix).smallest.backward()
@@ -337,13 +328,6 @@ def _perturbed(matrices: Tensor, values: Tensor, vectors: Tensor) -> tuple[Tenso
 
 
 def root(squares: Tensor) -> Tensor:
-    """Return square roots whose gradient at zero is zero.
-
-    Example:
-        >>> zero = torch.zeros(1, requires_grad=True)
-        >>> root(zero).sum().backward()
-        >>> zero.grad
-        tensor([0.])
-    """
+    """Return square roots whose gradient at zero is zero."""
     positive = squares > 0
     return torch.where(positive, squares, 1.0).sqrt() * positive

@@ -45,25 +45,22 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
     check_shapes("covariance", patches=(patches, "* K P"), mask=(mask, "* K"))
     check_floating("covariance", patches=patches)
     columns = patches.unbind(dim=-1)
-    if mask is None:
-        first = [column[..., :1] for column in columns]
-        shifted = [column - start for column, start in zip(columns, first, strict=True)]
-        count: Tensor | int = patches.shape[-2]
-    else:
+    first = [column[..., :1] for column in columns]
+    count: Tensor | int = patches.shape[-2]
+    if mask is not None:
         # Any counted point serves as the local origin: the one with the largest mask value.
         anchor = mask.to(torch.uint8).argmax(dim=-1, keepdim=True)
         first = [column.gather(-1, anchor) for column in columns]
-        shifted = [
-            torch.where(mask, column - start, 0.0)
-            for column, start in zip(columns, first, strict=True)
-        ]
         count = mask.sum(dim=-1, keepdim=True).clamp(min=1)
+
+    def moved(values: Sequence[Tensor], origin: Sequence[Tensor]) -> list[Tensor]:
+        differences = [column - start for column, start in zip(values, origin, strict=True)]
+        return differences if mask is None else [torch.where(mask, d, 0.0) for d in differences]
+
+    shifted = moved(columns, first)
     means = [column.sum(dim=-1, keepdim=True) / count for column in shifted]
-    centered = [column - mean for column, mean in zip(shifted, means, strict=True)]
-    if mask is not None:
-        centered = [torch.where(mask, column, 0.0) for column in centered]
     total = count if isinstance(count, int) else count.squeeze(-1)
-    matrix = second_moments(centered, total=total)
+    matrix = second_moments(moved(shifted, means), total=total)
     center = torch.cat([start + mean for start, mean in zip(first, means, strict=True)], dim=-1)
     if mask is not None:
         center = torch.where(mask.any(dim=-1, keepdim=True), center, 0.0)

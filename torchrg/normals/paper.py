@@ -57,13 +57,14 @@ def find_sharp_points(
     if rule not in ("qn", "percentile"):
         raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
     columns = normals.T.contiguous()
-    everywhere = valid is None or bool(valid.all())
+    if valid is not None and bool(valid.all()):
+        valid = None
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
 
     def classify(block: slice) -> None:
         indices = neighbors.indices[block]
         counted = None if neighbors.valid is None else neighbors.valid[block]
-        if valid is not None and not everywhere:
+        if valid is not None:
             has_normal = valid.index_select(0, indices.reshape(-1)).view(indices.shape)
             counted = has_normal if counted is None else counted & has_normal
         near = [c.index_select(0, indices.reshape(-1)).view(indices.shape) for c in columns]
