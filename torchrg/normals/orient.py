@@ -355,10 +355,8 @@ def _near_obstacles(points: Tensor, normals: Tensor, neighbors: Neighbors) -> tu
 
 def _cell_width(points: Tensor, neighbors: Neighbors) -> float:
     """Return the width of the grid's cells; wider than asked for if there would be too many."""
-    if len(points) == 0:
-        return 0.0
     rank = (neighbors.indices.shape[1] - 1) // 2
-    if rank == 0:
+    if len(points) == 0 or rank == 0:
         return 0.0
     offsets = points[neighbors.indices[:, rank].long()] - points
     # A disk of that radius holds ``rank`` points, one for each square of the spacing.

@@ -1,4 +1,4 @@
-"""From fits of patches to estimators of clouds, a block at a time."""
+"""From fits of patches to estimators of clouds, a chunk at a time."""
 
 from collections.abc import Callable
 from functools import partial
@@ -30,28 +30,21 @@ def fit_points(
     Args:
         points: Points, shape ``(N, 3)``.
         neighbors: Neighbours of all points.
-        fit: Estimator of a block of patches.
+        fit: Estimator of patches.
         rows: Points to fit, shape ``(n,)``. Default: all.
         chunk_size: Patches in memory at a time; changes no result.
         **of_points: Further keywords of ``fit`` that have a value for each point, shape ``(N,)``.
 
     Returns:
-        Normals, curvature, validity and residual of those points.
-
-    Example:
-        >>> from torchrg.normals.pca import fit_normals_pca
-        >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
-        >>> fit_points(points, neighbors, fit_normals_pca).normals.abs()[0]
-        tensor([0., 0., 1.])
+        The fit of those points, without ``sharp``.
     """
 
     def fit_chunk(chunk: slice) -> NormalFit:
-        block = chunk if rows is None else rows[chunk]
-        mask = None if neighbors.valid is None else neighbors.valid[block]
-        patches = gather_patches(points, neighbors.indices[block])
-        own = {name: values[block] for name, values in of_points.items()}
-        return fit(patches, mask, resolution=coordinate_resolution(points[block]), **own)
+        chosen = chunk if rows is None else rows[chunk]
+        mask = None if neighbors.valid is None else neighbors.valid[chosen]
+        patches = gather_patches(points, neighbors.indices[chosen])
+        own = {name: values[chosen] for name, values in of_points.items()}
+        return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **own)
 
     chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
     parts = list(zip(*map_chunks(fit_chunk, chunks, points.device), strict=True))
