@@ -1,17 +1,26 @@
 """Covariances, 3x3 eigenvectors and angles against NumPy and torch.linalg."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from torchrg.linalg import (
     covariance,
+    deg_to_sq_chord,
     eigh3,
+    flatness_tolerance,
+    second_moments,
     smallest_eigenvector3,
     sq_chord_to_deg,
+    sq_chords,
     unsigned_angle_deg,
 )
 
+PACKAGE = Path(__file__).parents[1] / "torchrg"
+# The row of linalg itself, and the largest number that a file can hold.
+MAY_ASK_FOR_PRECISION = {"neighbors/cells.py", "datasets/rooms.py"}
 EIGEN_TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-14}
 
 
@@ -118,6 +127,19 @@ def test_masked_points_do_not_count_whatever_they_hold(rng):
     assert not matrix[4].any()
 
 
+def test_weighted_moments_are_those_of_numpy_in_every_layout(rng):
+    points = torch.randn(3, 20, 4, generator=rng, dtype=torch.float64)
+    weights = torch.rand(3, 20, generator=rng, dtype=torch.float64)
+    expected = torch.einsum("nk,nkp,nkq->npq", weights, points, points)
+    rows = second_moments(points.unbind(dim=-1), weights)
+    columns = points.permute(2, 1, 0).unbind(dim=0)
+    lanes = second_moments(columns, weights.T, lambda column: column.sum(dim=0))
+    scaled = second_moments(points.unbind(dim=-1), weights, total=weights.sum(dim=1))
+    assert torch.allclose(rows, expected)
+    assert torch.allclose(lanes, expected)
+    assert torch.allclose(scaled, expected / weights.sum(dim=1)[:, None, None])
+
+
 def test_angles_are_those_of_the_arc_cosine():
     angles = torch.linspace(0, 180, 1801, dtype=torch.float64)
     a = torch.tensor([1.0, 0, 0], dtype=torch.float64).expand(len(angles), 3)
@@ -132,3 +154,27 @@ def test_small_angles_keep_their_digits_in_float32():
     for degrees in (1e-4, 1e-3, 1e-2):
         sq_chord = torch.tensor((2 * np.sin(np.radians(degrees) / 2)) ** 2, dtype=torch.float32)
         assert sq_chord_to_deg(sq_chord).item() == pytest.approx(degrees, rel=1e-6)
+
+
+def test_chords_are_those_of_the_angles(rng):
+    a, b = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=rng).double(), dim=-1)
+    chords = sq_chords(a[:, :, None].unbind(dim=1), b[:, :, None].unbind(dim=1)).squeeze(1)
+    assert torch.allclose(sq_chord_to_deg(chords), unsigned_angle_deg(a, b), atol=1e-6)
+    limits = torch.tensor([deg_to_sq_chord(float(angle)) for angle in unsigned_angle_deg(a, b)])
+    assert torch.allclose(chords, limits.double(), atol=1e-7)
+
+
+def test_tolerance_of_a_plane_grows_with_the_distance_from_the_origin(dtype):
+    near = flatness_tolerance(torch.ones(1, 5, 3, dtype=dtype), torch.ones(1, dtype=dtype))
+    far = flatness_tolerance(torch.full((1, 5, 3), 1e4, dtype=dtype), torch.ones(1, dtype=dtype))
+    assert 9 < near / torch.finfo(dtype).eps < 11
+    assert 1e3 < far / near < 1e4
+
+
+def test_tolerances_stand_here_alone():
+    asking = {
+        str(path.relative_to(PACKAGE))
+        for path in PACKAGE.rglob("*.py")
+        if "finfo" in path.read_text() and path.parent.name != "linalg"
+    }
+    assert asking <= MAY_ASK_FOR_PRECISION

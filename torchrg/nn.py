@@ -1,6 +1,6 @@
 """Module forms of the batched functions; they hold settings and nothing else."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,25 @@ from torchrg.robust.mcd import Starts
 from torchrg.robust.mm import Target
 
 
-class Covariance(nn.Module):
+class _Function(nn.Module):
+    """A function whose settings are attributes, and shown."""
+
+    def __init__(self, **settings: object) -> None:
+        super().__init__()
+        self._names = tuple(settings)
+        for name, value in settings.items():
+            setattr(self, name, value)
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings by name."""
+        return {name: getattr(self, name) for name in self._names}
+
+    def extra_repr(self) -> str:
+        """Return the settings as text."""
+        return ", ".join(f"{name}={value!r}" for name, value in self.settings().items())
+
+
+class Covariance(_Function):
     """Mean and covariance of patches; see :func:`torchrg.linalg.covariance`.
 
     Example:
@@ -25,7 +43,7 @@ class Covariance(nn.Module):
         return covariance(patches, mask)
 
 
-class Eigh(nn.Module):
+class Eigh(_Function):
     """Eigenvalues, ascending, and eigenvectors of symmetric matrices.
 
     Args:
@@ -38,10 +56,9 @@ class Eigh(nn.Module):
     """
 
     def __init__(self, method: Literal["jacobi", "linalg"] = "jacobi") -> None:
-        super().__init__()
         if method not in ("jacobi", "linalg"):
             raise ConfigError(f"Eigh: expected method to be jacobi or linalg, got {method!r}.")
-        self.method = method
+        super().__init__(method=method)
 
     def forward(self, matrices: Tensor) -> tuple[Tensor, Tensor]:
         """Return eigenvalues and eigenvectors."""
@@ -50,12 +67,8 @@ class Eigh(nn.Module):
         values, vectors = torch.linalg.eigh(matrices)
         return values, vectors
 
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return f"method={self.method!r}"
 
-
-class Qn(nn.Module):
+class Qn(_Function):
     """Robust scale of rows; see :func:`torchrg.robust.qn`.
 
     Args:
@@ -68,20 +81,14 @@ class Qn(nn.Module):
     """
 
     def __init__(self, dim: int = -1, *, finite_sample: bool = False) -> None:
-        super().__init__()
-        self.dim = dim
-        self.finite_sample = finite_sample
+        super().__init__(dim=dim, finite_sample=finite_sample)
 
     def forward(self, values: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the scale."""
-        return qn(values, dim=self.dim, finite_sample=self.finite_sample, mask=mask)
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return f"dim={self.dim}, finite_sample={self.finite_sample}"
+        return qn(values, mask=mask, **self.settings())
 
 
-class DetMCD(nn.Module):
+class DetMCD(_Function):
     """Deterministic MCD of patches; see :func:`torchrg.robust.fit_detmcd`.
 
     Args:
@@ -103,32 +110,19 @@ class DetMCD(nn.Module):
         starts: Starts = "paper",
         small_sample: bool = False,
     ) -> None:
-        super().__init__()
-        self.support_fraction = support_fraction
-        self.quantile = quantile
-        self.starts: Starts = starts
-        self.small_sample = small_sample
+        super().__init__(
+            support_fraction=support_fraction,
+            quantile=quantile,
+            starts=starts,
+            small_sample=small_sample,
+        )
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
-        return fit_detmcd(
-            patches,
-            mask,
-            support_fraction=self.support_fraction,
-            quantile=self.quantile,
-            starts=self.starts,
-            small_sample=self.small_sample,
-        )
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return (
-            f"support_fraction={self.support_fraction}, quantile={self.quantile}, "
-            f"starts={self.starts!r}, small_sample={self.small_sample}"
-        )
+        return fit_detmcd(patches, mask, **self.settings())
 
 
-class FastMCD(nn.Module):
+class FastMCD(_Function):
     """MCD of patches with random starts; see :func:`torchrg.robust.fit_fastmcd`.
 
     Args:
@@ -150,11 +144,12 @@ class FastMCD(nn.Module):
         num_starts: int = 500,
         small_sample: bool = False,
     ) -> None:
-        super().__init__()
-        self.support_fraction = support_fraction
-        self.quantile = quantile
-        self.num_starts = num_starts
-        self.small_sample = small_sample
+        super().__init__(
+            support_fraction=support_fraction,
+            quantile=quantile,
+            num_starts=num_starts,
+            small_sample=small_sample,
+        )
 
     def forward(
         self,
@@ -163,25 +158,10 @@ class FastMCD(nn.Module):
         generator: torch.Generator | None = None,
     ) -> RobustFit:
         """Return the fits; the generator draws the starts."""
-        return fit_fastmcd(
-            patches,
-            mask,
-            support_fraction=self.support_fraction,
-            quantile=self.quantile,
-            num_starts=self.num_starts,
-            small_sample=self.small_sample,
-            generator=generator,
-        )
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return (
-            f"support_fraction={self.support_fraction}, quantile={self.quantile}, "
-            f"num_starts={self.num_starts}, small_sample={self.small_sample}"
-        )
+        return fit_fastmcd(patches, mask, generator=generator, **self.settings())
 
 
-class DetMM(nn.Module):
+class DetMM(_Function):
     """Deterministic MM-estimator of patches; see :func:`torchrg.robust.fit_detmm`.
 
     Args:
@@ -201,21 +181,8 @@ class DetMM(nn.Module):
         starts: Starts = "robustbase",
         tuned_for: Target = "shape",
     ) -> None:
-        super().__init__()
-        self.quantile = quantile
-        self.starts: Starts = starts
-        self.tuned_for: Target = tuned_for
+        super().__init__(quantile=quantile, starts=starts, tuned_for=tuned_for)
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
-        return fit_detmm(
-            patches,
-            mask,
-            quantile=self.quantile,
-            starts=self.starts,
-            tuned_for=self.tuned_for,
-        )
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return f"quantile={self.quantile}, starts={self.starts!r}, tuned_for={self.tuned_for!r}"
+        return fit_detmm(patches, mask, **self.settings())

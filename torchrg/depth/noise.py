@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrg.depth.windows import WindowPlanes
+from torchrg.linalg import machine_epsilon
 
 _FLAT_QUANTILE = 0.35
 _NUM_BINS = 12
@@ -46,7 +47,7 @@ def noise_by_radius(
         >>> noise
         {}
     """
-    rounding = max(_ROUNDING * torch.finfo(dtype).eps, _LEAST_ROUNDING) * inverse
+    rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING) * inverse
     square = inverse * inverse
     if given is not None:
         constant, growth = given

@@ -1,23 +1,47 @@
-"""Linear algebra of many tiny matrices, and the only numerical tolerances of the library.
+"""Linear algebra of many tiny matrices, and the tolerances that follow from a precision.
 
 Everything that can decide a label is built from ``+ - * /`` and ``sqrt`` alone: these are exact to
 the last bit wherever an element stands in a tensor, so results do not depend on chunk size or on
 the number of threads. Vectorised ``acos`` or ``cos`` do not promise that.
 """
 
-from torchrg.linalg.angles import above, at_most, signs, sq_chord_to_deg, unsigned_angle_deg
-from torchrg.linalg.eigen import eigh3, eigh3_of_few, rank_tolerance, smallest_eigenvector3
-from torchrg.linalg.moments import covariance
+from torchrg.linalg.angles import (
+    above,
+    at_most,
+    deg_to_sq_chord,
+    signs,
+    sq_chord_to_deg,
+    sq_chords,
+    unsigned_angle_deg,
+)
+from torchrg.linalg.eigen import (
+    coordinate_resolution,
+    eigh3,
+    eigh3_of_few,
+    flatness_tolerance,
+    machine_epsilon,
+    rank_tolerance,
+    smallest_eigenvector3,
+    smallest_normal,
+)
+from torchrg.linalg.moments import covariance, second_moments
 
 __all__ = [
     "above",
     "at_most",
+    "coordinate_resolution",
     "covariance",
+    "deg_to_sq_chord",
     "eigh3",
     "eigh3_of_few",
+    "flatness_tolerance",
+    "machine_epsilon",
     "rank_tolerance",
+    "second_moments",
     "signs",
     "smallest_eigenvector3",
+    "smallest_normal",
     "sq_chord_to_deg",
+    "sq_chords",
     "unsigned_angle_deg",
 ]

@@ -1,4 +1,8 @@
-"""Eigenvectors of many symmetric 3x3 matrices."""
+"""Eigenvectors of many symmetric 3x3 matrices, and how little counts as nothing.
+
+Every tolerance that follows from the precision of a dtype is a function here; other modules name
+multiples of them.
+"""
 
 from typing import NamedTuple
 
@@ -8,12 +12,29 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes
 
 _JACOBI_SWEEPS = 5
+"""Rotations of all three pairs: 3x3 matrices are diagonal to rounding, in float64 too."""
+
 _FIRST_STEPS, _MORE_STEPS = 4, 6
+"""Steps of Newton's method: enough for a simple root, and for one that is nearly double."""
+
 _SETTLED = 1e-9
 """Share of the trace by which the last step may move a root that is as good as found."""
 
 _NEARLY_EQUAL = 1e-9
 """Share of the squared largest eigenvalue below which the adjugate has no direction."""
+
+_ROUNDED_STEPS = 8
+"""Rounding errors that a distance to a plane adds up, in units of the patch's own extent."""
+
+
+def machine_epsilon(dtype: torch.dtype) -> float:
+    """Return the distance from 1 to the next number of a dtype: twice its relative rounding."""
+    return torch.finfo(dtype).eps
+
+
+def smallest_normal(dtype: torch.dtype) -> float:
+    """Return the smallest positive number of a dtype that has all its digits."""
+    return torch.finfo(dtype).tiny
 
 
 def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
@@ -30,7 +51,36 @@ def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
         >>> rank_tolerance(50, torch.float64) < 1e-13
         True
     """
-    return max(num_values, 3) * torch.finfo(dtype).eps
+    return max(num_values, 3) * machine_epsilon(dtype)
+
+
+def coordinate_resolution(points: Tensor) -> Tensor:
+    """Return the rounding of differences of coordinates ``(*, P)`` at each point, shape ``(*)``.
+
+    Example:
+        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
+        tensor([True])
+    """
+    return points.abs().amax(dim=-1) * (4 * machine_epsilon(points.dtype))
+
+
+def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
+    """Return how far from its plane rounding alone can move a point.
+
+    Args:
+        patches: The points as they were given, shape ``(B, K, P)``: their coordinates were
+            rounded where they are, however far from the origin.
+        extent: Largest coordinate of each patch about its own middle, shape ``(B,)``.
+
+    Returns:
+        A length in the unit of the points, shape ``(B,)``.
+
+    Example:
+        >>> flatness_tolerance(torch.ones(1, 5, 3), torch.ones(1)) < 2e-6
+        tensor([True])
+    """
+    coordinates = 2 * patches.abs().amax(dim=(1, 2))
+    return machine_epsilon(patches.dtype) * (coordinates + _ROUNDED_STEPS * extent)
 
 
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,14 +131,7 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Do as :func:`eigh3`, one matrix at a time: the faster way for less than a thousand of them.
 
-    Args:
-        matrices: Symmetric matrices, shape ``(*, 3, 3)``.
-
-    Returns:
-        As :func:`eigh3`; NaN for a matrix that is not finite.
-
-    Raises:
-        ShapeError: If the shape or dtype is not as above.
+    A matrix that is not finite gives NaN.
 
     Example:
         >>> values, vectors = eigh3_of_few(torch.diag(torch.tensor([3.0, 1.0, 2.0])))
@@ -162,12 +205,9 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """Return what so many steps of Newton's method lead to, and the last step.
+    """Return what steps of Newton's method lead to, and the last step.
 
-    Args:
-        root: Where to begin, shape ``(n,)``.
-        coefficients: Trace, sum of the principal minors and determinant, shape ``(3, n)``.
-        num_steps: At least 1.
+    The coefficients are trace, sum of the principal minors and determinant, shape ``(3, n)``.
     """
     trace, minors, determinant = coefficients
     twice, step = 2 * trace, root
@@ -184,9 +224,7 @@ def _kernel(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit vectors that singular semi-definite matrices take to zero.
 
-    Args:
-        diagonal: Entries (0, 0), (1, 1), (2, 2).
-        beside: Entries (1, 2), (0, 2), (0, 1): those that miss coordinate 0, 1, 2.
+    Of the entries beside the diagonal the first misses coordinate 0, then 1, then 2.
     """
     x, y, z = diagonal
     yz, xz, xy = beside
@@ -261,12 +299,6 @@ def principal_frame(matrices: Tensor) -> PrincipalFrame:
     and everything in gradient: ``dn = sum_j v_j (v_j . dA n) / (l0 - l_j)``. Where two eigenvalues
     are equal, the turn between their vectors is left out.
 
-    Args:
-        matrices: Symmetric matrices, shape ``(*, 3, 3)``.
-
-    Returns:
-        The frame.
-
     Example:
         >>> matrix = torch.diag(torch.tensor([3.0, 1.0, 2.0])).requires_grad_()
         >>> principal_frame(matrix).smallest.backward()
@@ -296,13 +328,6 @@ def _perturbed(matrices: Tensor, values: Tensor, vectors: Tensor) -> tuple[Tenso
 
 
 def root(squares: Tensor) -> Tensor:
-    """Return square roots whose gradient at zero is zero.
-
-    Example:
-        >>> zero = torch.zeros(1, requires_grad=True)
-        >>> root(zero).sum().backward()
-        >>> zero.grad
-        tensor([0.])
-    """
+    """Return square roots whose gradient at zero is zero."""
     positive = squares > 0
     return torch.where(positive, squares, 1.0).sqrt() * positive

@@ -1,12 +1,24 @@
-"""Means and covariances: of small neighbourhoods, of weighted columns, of regions."""
+"""Means and covariances: of patches, of weighted neighbourhoods, of regions.
 
-from collections.abc import Sequence
+Points lie along the last axis in patches, along the first in the lanes of
+:mod:`torchrg.robust.lanes`, one region after the other in :class:`Segments`, and each layout adds
+them up in its own way, so that a sum does not depend on what stands beside it. All covariances are
+:func:`second_moments` about a mean, given that way of adding. Apart stand only what is no matrix:
+the robust fits factor the scatter by Gram-Schmidt as they need determinants of thin ones, depth
+images have running sums over windows, and the grid of pictures adds whole numbers, which are exact.
+"""
+
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg.eigen import smallest_eigenvector3
+
+
+def _add_rows(values: Tensor) -> Tensor:
+    return values.sum(dim=-1)
 
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -33,48 +45,136 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
     check_shapes("covariance", patches=(patches, "* K P"), mask=(mask, "* K"))
     check_floating("covariance", patches=patches)
     columns = patches.unbind(dim=-1)
-    if mask is None:
-        first = [column[..., :1] for column in columns]
-        shifted = [column - start for column, start in zip(columns, first, strict=True)]
-        count: Tensor | int = patches.shape[-2]
-    else:
+    first = [column[..., :1] for column in columns]
+    count: Tensor | int = patches.shape[-2]
+    if mask is not None:
         # Any counted point serves as the local origin: the one with the largest mask value.
         anchor = mask.to(torch.uint8).argmax(dim=-1, keepdim=True)
         first = [column.gather(-1, anchor) for column in columns]
-        shifted = [
-            torch.where(mask, column - start, 0.0)
-            for column, start in zip(columns, first, strict=True)
-        ]
         count = mask.sum(dim=-1, keepdim=True).clamp(min=1)
+
+    def moved(values: Sequence[Tensor], origin: Sequence[Tensor]) -> list[Tensor]:
+        differences = [column - start for column, start in zip(values, origin, strict=True)]
+        return differences if mask is None else [torch.where(mask, d, 0.0) for d in differences]
+
+    shifted = moved(columns, first)
     means = [column.sum(dim=-1, keepdim=True) / count for column in shifted]
-    centered = [column - mean for column, mean in zip(shifted, means, strict=True)]
-    if mask is not None:
-        centered = [torch.where(mask, column, 0.0) for column in centered]
     total = count if isinstance(count, int) else count.squeeze(-1)
-    size = len(columns)
-    entries = {
-        (i, j): (centered[i] * centered[j]).sum(dim=-1) / total
-        for i in range(size)
-        for j in range(i + 1)
-    }
-    rows = [
-        torch.stack([entries[max(i, j), min(i, j)] for j in range(size)], dim=-1)
-        for i in range(size)
-    ]
+    matrix = second_moments(moved(shifted, means), total=total)
     center = torch.cat([start + mean for start, mean in zip(first, means, strict=True)], dim=-1)
     if mask is not None:
         center = torch.where(mask.any(dim=-1, keepdim=True), center, 0.0)
-    return center, torch.stack(rows, dim=-2)
+    return center, matrix
 
 
-def coordinate_resolution(points: Tensor) -> Tensor:
-    """Return the rounding of coordinate differences at each point, shape ``(N,)``.
+def second_moments(
+    columns: Sequence[Tensor],
+    weights: Tensor | None = None,
+    add: Callable[[Tensor], Tensor] = _add_rows,
+    total: Tensor | float = 1.0,
+) -> Tensor:
+    """Return the second moments of weighted points about zero, shape ``(*, P, P)``.
+
+    Args:
+        columns: P coordinates of the points, about their mean for a covariance.
+        weights: Weights of the points, of the shape of a column. Default: 1 each.
+        add: Takes a column to its sums, shape ``(*)``. Default: sums along the last axis.
+        total: What the sums are divided by; for a covariance the sum of the weights.
+
+    Returns:
+        The matrices.
 
     Example:
-        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
-        tensor([True])
+        >>> square = torch.tensor([[-1.0, -1, 1, 1]]), torch.tensor([[-2.0, 2, -2, 2]])
+        >>> second_moments(square, total=4)
+        tensor([[[1., 0.],
+                 [0., 4.]]])
     """
-    return points.abs().amax(dim=-1) * (4 * torch.finfo(points.dtype).eps)
+    size = len(columns)
+    weighted = columns if weights is None else [weights * column for column in columns]
+    entries = {
+        (i, j): add(weighted[i] * columns[j]) / total for i in range(size) for j in range(i, size)
+    }
+    rows = [
+        torch.stack([entries[min(i, j), max(i, j)] for j in range(size)], dim=-1)
+        for i in range(size)
+    ]
+    return torch.stack(rows, dim=-2)
+
+
+class Segments:
+    """The points of each region side by side, in the order of their rows.
+
+    Sums run over one region after the other, never by atomic additions, so they do not depend on
+    threads or device scheduling.
+
+    Args:
+        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
+
+    Example:
+        >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
+        >>> segments.counts.tolist(), segments.rows.tolist()
+        ([1, 2], [1, 0, 3])
+        >>> segments.mean(segments.take(torch.tensor([1.0, 2.0, 9.0, 3.0]))).tolist()
+        [2.0, 2.0]
+    """
+
+    def __init__(self, labels: Tensor) -> None:
+        ascending, rows = labels.sort(stable=True)
+        num_unlabeled = int(torch.searchsorted(ascending, 0))
+        self.rows = rows[num_unlabeled:]
+        self.labels = ascending[num_unlabeled:].long()
+        self.counts = torch.bincount(self.labels)
+
+    def take(self, values: Tensor) -> Tensor:
+        """Return the values of the points that have a region, region by region."""
+        return values.index_select(0, self.rows)
+
+    def first(self, values: Tensor) -> Tensor:
+        """Return the value of the first point of each region."""
+        return values[self.rows[self.counts.cumsum(0) - self.counts]]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Return for each point, in the order of :meth:`take`, the value of its region."""
+        return values.index_select(0, self.labels)
+
+    def take_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
+        return [self.take(column).double() for column in vectors.unbind(dim=1)]
+
+    def spread_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Return the three columns of :meth:`spread` of vectors ``(M, 3)``."""
+        return [self.spread(column) for column in vectors.unbind(dim=1)]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Return the sum of each region's values, given in the order of :meth:`take`."""
+        return self._reduce(values, "sum")
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the mean of each region's values."""
+        return self.sum(values) / self.counts
+
+    def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest value of each region."""
+        return self._reduce(values, "min"), self._reduce(values, "max")
+
+    def first_of_each(self, chosen: Tensor) -> Tensor:
+        """Return the place of the first chosen value of each region that has one."""
+        places = chosen.nonzero().squeeze(1)
+        owner = self.labels[places]
+        is_first = torch.ones_like(owner, dtype=torch.bool)
+        is_first[1:] = owner[1:] != owner[:-1]
+        return places[is_first]
+
+    def median(self, values: Tensor) -> Tensor:
+        """Return the median of each region's values, the lower one of an even number."""
+        parts = torch.split(values, self.counts.tolist())
+        return torch.stack([part.median() for part in parts]) if parts else values
+
+    def _reduce(self, values: Tensor, how: str) -> Tensor:
+        if len(self.counts) == 0:
+            return values[:0]
+        return torch.segment_reduce(values.contiguous(), how, lengths=self.counts)
 
 
 Columns = tuple[Tensor, Tensor, Tensor]
@@ -162,84 +262,5 @@ def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
     total = weights.sum(dim=1)
     share = weights / torch.where(total > 0, total, 1.0)[:, None]
     means = [(share * column).sum(dim=1) for column in columns]
-    x, y, z = (column - mean[:, None] for column, mean in zip(columns, means, strict=True))
-    sx, sy, sz = share * x, share * y, share * z
-    xx, xy, xz = (sx * x).sum(dim=1), (sx * y).sum(dim=1), (sx * z).sum(dim=1)
-    yy, yz, zz = (sy * y).sum(dim=1), (sy * z).sum(dim=1), (sz * z).sum(dim=1)
-    rows = [torch.stack(row, dim=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
-    return torch.stack(means, dim=-1), torch.stack(rows, dim=-2)
-
-
-class Segments:
-    """The points of each region side by side, in the order of their rows.
-
-    Sums run over one region after the other, never by atomic additions, so they do not depend on
-    threads or device scheduling.
-
-    Args:
-        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
-
-    Example:
-        >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
-        >>> segments.counts.tolist(), segments.rows.tolist()
-        ([1, 2], [1, 0, 3])
-        >>> segments.mean(segments.take(torch.tensor([1.0, 2.0, 9.0, 3.0]))).tolist()
-        [2.0, 2.0]
-    """
-
-    def __init__(self, labels: Tensor) -> None:
-        ascending, rows = labels.sort(stable=True)
-        num_unlabeled = int(torch.searchsorted(ascending, 0))
-        self.rows = rows[num_unlabeled:]
-        self.labels = ascending[num_unlabeled:].long()
-        self.counts = torch.bincount(self.labels)
-
-    def take(self, values: Tensor) -> Tensor:
-        """Return the values of the points that have a region, region by region."""
-        return values.index_select(0, self.rows)
-
-    def first(self, values: Tensor) -> Tensor:
-        """Return the value of the first point of each region."""
-        return values[self.rows[self.counts.cumsum(0) - self.counts]]
-
-    def spread(self, values: Tensor) -> Tensor:
-        """Return for each point, in the order of :meth:`take`, the value of its region."""
-        return values.index_select(0, self.labels)
-
-    def take_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
-        return [self.take(column).double() for column in vectors.unbind(dim=1)]
-
-    def spread_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Return the three columns of :meth:`spread` of vectors ``(M, 3)``."""
-        return [self.spread(column) for column in vectors.unbind(dim=1)]
-
-    def sum(self, values: Tensor) -> Tensor:
-        """Return the sum of each region's values, given in the order of :meth:`take`."""
-        return self._reduce(values, "sum")
-
-    def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of each region's values."""
-        return self.sum(values) / self.counts
-
-    def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the smallest and the largest value of each region."""
-        return self._reduce(values, "min"), self._reduce(values, "max")
-
-    def first_of_each(self, chosen: Tensor) -> Tensor:
-        """Return the place of the first chosen value of each region that has one."""
-        places = chosen.nonzero().squeeze(1)
-        owner = self.labels[places]
-        is_first = torch.ones_like(owner, dtype=torch.bool)
-        is_first[1:] = owner[1:] != owner[:-1]
-        return places[is_first]
-
-    def median(self, values: Tensor) -> Tensor:
-        """Return the median of each region's values, the lower one of an even number."""
-        parts = torch.split(values, self.counts.tolist())
-        return torch.stack([part.median() for part in parts]) if parts else values
-
-    def _reduce(self, values: Tensor, how: str) -> Tensor:
-        if len(self.counts) == 0:
-            return values[:0]
-        return torch.segment_reduce(values.contiguous(), how, lengths=self.counts)
+    centered = [column - mean[:, None] for column, mean in zip(columns, means, strict=True)]
+    return torch.stack(means, dim=-1), second_moments(centered, share)

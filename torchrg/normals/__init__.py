@@ -42,19 +42,15 @@ __all__ = [
     "orient_normals",
 ]
 
+_MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
+
 ESTIMATORS: dict[str, Estimator] = {
     "pca": at_all_points(fit_normals_pca),
     "jet": at_all_points(fit_normals_jet),
     "irls": estimate_irls,
-    "fastmcd": at_all_points(
-        fit_normals_fastmcd, support_fraction="support_fraction", quantile="inlier_quantile"
-    ),
-    "mve": at_all_points(
-        fit_normals_mve, support_fraction="support_fraction", quantile="inlier_quantile"
-    ),
-    "detmcd": at_all_points(
-        fit_normals_detmcd, support_fraction="support_fraction", quantile="inlier_quantile"
-    ),
+    "fastmcd": at_all_points(fit_normals_fastmcd, **_MCD),
+    "mve": at_all_points(fit_normals_mve, **_MCD),
+    "detmcd": at_all_points(fit_normals_detmcd, **_MCD),
     "detmm": at_all_points(fit_normals_detmm, quantile="inlier_quantile"),
     "paper": estimate_paper,
     "consensus": estimate_consensus,

@@ -1,6 +1,6 @@
-"""Iteratively weighted PCA: an M-estimator of planes whose scale shrinks."""
+"""Iteratively weighted PCA: an M-estimator of planes by graduated non-convexity."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -8,41 +8,56 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchrg._checks import check_floating, check_shapes
-from torchrg._parallel import fair_chunks, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
+from torchrg.linalg import second_moments
 from torchrg.linalg.eigen import principal_frame
-from torchrg.linalg.moments import coordinate_resolution
-from torchrg.neighbors import gather_patches
 from torchrg.normals.consensus.noise import survey_noise
-from torchrg.normals.patches import about_query, at_all_points, join_fits, replace_rows
+from torchrg.normals.patches import about_first, fit_points, replace_rows
 from torchrg.normals.pca import check_patches, fit_normals_pca
 from torchrg.structures import Neighbors, NormalFit
 
-HEAVY = 0.25
+_HEAVY = 0.25
 """Points of a weight above this make up the plane."""
 
 _LEAST_STEPS = 5
+"""However near the start is to the limit."""
+
+_CLOSE_TO_PCA = 0.996
+"""Cosine, of 5 degrees: a normal that turned less from that of PCA has no edge beside it."""
+
+_SAME_SOLUTION = 0.95
+"""Cosine, of 18 degrees, above which two solutions are one."""
+
+_SECOND_START = 0.35
+"""Quantile of the squared distances at which the second solution starts."""
+
+_LEAST_SHARE = 0.1
+"""Share of the points below which a solution gives way to the other."""
+
+_LEAST_NOISE = 1e-4
+"""Share of the distance to the farthest point: exact planes have no noise, and steps must end. (The
+numbers above are those of the authors' program.)"""
 
 
-class Surroundings(NamedTuple):
-    """Points about a query point each: coordinates and whether they count, shape ``(n, K)``."""
+class _Offsets(NamedTuple):
+    """Neighbours about each point: coordinates, and 1 for those that count, shape ``(n, K)``."""
 
     x: Tensor
     y: Tensor
     z: Tensor
     counted: Tensor
 
-    def take(self, rows: Tensor | slice) -> "Surroundings":
+    def take(self, rows: Tensor | slice) -> "_Offsets":
         """Return some of the rows."""
-        return Surroundings(*(part[rows] for part in self))
+        return _Offsets(*(part[rows] for part in self))
 
-    def about(self, centers: Tensor) -> "Surroundings":
+    def about(self, centers: Tensor) -> "_Offsets":
         """Return the points relative to other centers, shape ``(n, 3)``."""
         x, y, z = (
             part - center for part, center in zip(self[:3], centers.T[..., None], strict=True)
         )
-        return Surroundings(x, y, z, self.counted)
+        return _Offsets(x, y, z, self.counted)
 
     def distances(self, normals: Tensor) -> Tensor:
         """Return signed distances to planes through the centers, shape ``(n, K)``."""
@@ -51,12 +66,12 @@ class Surroundings(NamedTuple):
         return total
 
 
-class Plane(NamedTuple):
-    """Planes near query points, and the scale of the weights.
+class _Plane(NamedTuple):
+    """Planes near points, and the scale of the weights.
 
     Attributes:
         normal: Unit normals, shape ``(n, 3)``.
-        center: Points of the planes, relative to the query points, shape ``(n, 3)``.
+        center: Points of the planes, relative to the points themselves, shape ``(n, 3)``.
         mu: Squared distance at which the weight is a quarter, shape ``(n, 1)``.
         weighed_normal: Normals that the last weights were taken with, shape ``(n, 3)``.
         weighed_mu: ``mu`` that the last weights were taken with, shape ``(n, 1)``.
@@ -68,146 +83,18 @@ class Plane(NamedTuple):
     weighed_normal: Tensor
     weighed_mu: Tensor
 
-    def take(self, rows: Tensor | slice) -> "Plane":
+    def take(self, rows: Tensor | slice) -> "_Plane":
         """Return some of the rows."""
-        return Plane(*(part[rows] for part in self))
+        return _Plane(*(part[rows] for part in self))
 
 
-def start_plane(normal: Tensor, mu: Tensor) -> Plane:
-    """Return planes through the query points.
+class _Solution(NamedTuple):
+    """A plane for each edge, the distance of the point itself to it, and the plane's points."""
 
-    Example:
-        >>> start_plane(torch.eye(3)[:1], torch.ones(1, 1)).center
-        tensor([[0., 0., 0.]])
-    """
-    return Plane(normal, torch.zeros_like(normal), mu, normal, mu)
-
-
-def anneal(
-    points: Surroundings, plane: Plane, limit: Tensor, decay: float, *, shift: bool
-) -> Plane:
-    r"""Reweight and refit planes while ``mu`` shrinks to a limit.
-
-    Each step divides ``mu`` by ``decay``, weighs every point by ``(mu / (mu + r^2))^2`` of its
-    distance ``r``, and takes the direction in which the weighted points are flattest about the
-    center. With ``shift`` the center first moves along the normal to the weighted mean of the heavy
-    points, their weights being those of the step before.
-
-    Args:
-        points: Points about each query point.
-        plane: Where to start.
-        limit: Where ``mu`` ends, shape ``(n, 1)``: the first value at or below it, with ``shift``
-            the last one at or above. At least five steps are made.
-        decay: Above 1.
-        shift: Whether the center moves.
-
-    Returns:
-        The planes after their last step. Patches leave the batch when they are done.
-
-    Example:
-        >>> xy = torch.tensor([[[1.0, -1, 0, 0]], [[0, 0, 1, -1]]])
-        >>> cross = Surroundings(*xy, torch.zeros(1, 4), torch.ones(1, 4))
-        >>> start = start_plane(torch.tensor([[0.0, 0.6, 0.8]]), torch.ones(1, 1))
-        >>> anneal(cross, start, torch.full((1, 1), 0.1), 1.5, shift=False).normal.abs()
-        tensor([[0., 0., 1.]])
-    """
-    step = _shift_and_refit if shift else _refit
-    num_steps = _count_steps(plane.mu.detach(), limit, decay, stay_above=shift)
-    order = num_steps.argsort(descending=True, stable=True)
-    remaining = num_steps[order].tolist()
-    points, plane = points.take(order), plane.take(order)
-    active = len(remaining)
-    for done in range(remaining[0] if remaining else 0):
-        while remaining[active - 1] <= done:
-            active -= 1
-        part = slice(0, active)
-        moved = _run(step, points.take(part), plane.take(part), decay)
-        rest = plane.take(slice(active, None))
-        plane = Plane(*map(torch.cat, zip(moved, rest, strict=True)))
-    return plane.take(order.argsort())
-
-
-def weigh(distances: Tensor, mu: Tensor, counted: Tensor) -> Tensor:
-    """Return Geman-McClure weights.
-
-    Args:
-        distances: Distances to planes, shape ``(n, K)``.
-        mu: Squared distance at which the weight is a quarter, shape ``(n, 1)``.
-        counted: 0 for points that do not count, else 1, shape ``(n, K)``.
-
-    Returns:
-        Weights in [0, 1], shape ``(n, K)``.
-
-    Example:
-        >>> weigh(torch.tensor([[0.0, 2.0]]), torch.full((1, 1), 4.0), torch.ones(1, 2))
-        tensor([[1.0000, 0.2500]])
-    """
-    weights = mu / (mu + distances * distances)
-    return weights * weights * counted
-
-
-def _refit(points: Surroundings, plane: Plane, decay: float) -> Plane:
-    """Return the next plane through the same center."""
-    return _flattest(points.about(plane.center), plane, decay)
-
-
-def _shift_and_refit(points: Surroundings, plane: Plane, decay: float) -> Plane:
-    """Return the next plane, through the mean height of the heavy points."""
-    points = points.about(plane.center)
-    weights = weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
-    heavy = weights * (weights > HEAVY)
-    total = heavy.sum(dim=-1, keepdim=True)
-    heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
-    shift = plane.normal * (heights / torch.where(total > 0, total, 1.0))
-    return _flattest(points.about(shift), plane._replace(center=plane.center + shift), decay)
-
-
-def _flattest(points: Surroundings, plane: Plane, decay: float) -> Plane:
-    """Return the next plane, with the normal along which the weighted points are flattest."""
-    mu = plane.mu / decay
-    weights = weigh(points.distances(plane.normal), mu, points.counted)
-    x, y, z, _ = points
-    wx, wy = weights * x, weights * y
-    xx, xy, xz = ((wx * part).sum(dim=-1) for part in (x, y, z))
-    yy, yz, zz = (wy * y).sum(dim=-1), (wy * z).sum(dim=-1), (weights * z * z).sum(dim=-1)
-    rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    return Plane(principal_frame(matrix).normals, plane.center, mu, plane.normal, mu)
-
-
-def _run(
-    step: Callable[[Surroundings, Plane, float], Plane],
-    points: Surroundings,
-    plane: Plane,
-    decay: float,
-) -> Plane:
-    """Run a step; if gradients are wanted, keep its input only and run it again for them."""
-    if not (torch.is_grad_enabled() and plane.normal.requires_grad):
-        return step(points, plane, decay)
-    result: Plane = checkpoint(step, points, plane, decay, use_reentrant=False)
-    return result
-
-
-def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -> Tensor:
-    """Return the number of divisions that bring ``mu`` to the limit, shape ``(n,)``.
-
-    Counted by dividing, not by a logarithm, whose last bit depends on where an element stands.
-    """
-    num_steps = torch.zeros(len(mu), dtype=torch.int64, device=mu.device)
-    while True:
-        following = mu / decay
-        goes_on = following >= limit if stay_above else mu > limit
-        if not bool(goes_on.any()):
-            return num_steps.clamp(min=_LEAST_STEPS)
-        num_steps += goes_on.squeeze(-1)
-        mu = torch.where(goes_on, following, mu)
-
-
-_CLOSE_TO_PCA = 0.996
-_SAME_SOLUTION = 0.95
-_SECOND_START = 0.35
-_LEAST_SHARE = 0.1
-_LEAST_NOISE = 1e-4
+    normal: Tensor
+    through: Tensor
+    error: Tensor
+    heavy: Tensor
 
 
 def fit_normals_irls(
@@ -221,24 +108,24 @@ def fit_normals_irls(
     r"""Fit a plane to each patch by iteratively weighted PCA [1], eqs. (3) and (5).
 
     1. Where the plane of PCA fits within the noise, it is the answer.
-    2. Elsewhere the normal is the smallest eigenvector of the covariance about the query point
+    2. Elsewhere the normal is the smallest eigenvector of the covariance about the point itself
        with weights ``(mu / (mu + r^2))^2`` (Geman-McClure) of the distances ``r`` to the plane
        through it; ``mu`` shrinks by ``mu_decay`` from the largest ``r^2`` of PCA to
-       ``(noise / 2)^2``.
+       ``(noise / 2)^2`` (graduated non-convexity [2]).
     3. The same once more from a quarter of that, now with the plane shifted along its normal to
-       the weighted mean of the points of weight above 1/4, so that noise of the query itself
+       the weighted mean of the points of weight above 1/4, so that noise of the point itself
        matters less.
     4. If that turned the normal by more than 5 degrees, there is an edge: a second solution starts
-       across the first, and the one closer to the query with more than a tenth of the points wins.
+       across the first, and the one closer to the point with more than a tenth of the others wins.
 
     Convention:
-        The query point is the first point of the patch that counts; it takes no part in the fit.
+        The point itself is the first of the patch that counts; it takes no part in the fit.
         The authors' ``mu_decay`` is 1.01. (The paper prints eq. (5) without the square of ``r``;
         the authors square it.) Their surface may be curved by a known radius; here it is flat.
         Gradients are those of the steps as taken, and are recomputed step by step to save memory.
 
     Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the query point first.
+        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the point itself first.
         mask: Which points count, shape ``(*, K)``, bool; the others may hold anything, NaN
             included. Default: all.
         noise: Standard deviation of the noise, shape ``(*)``, in the unit of the cloud. At least
@@ -247,8 +134,8 @@ def fit_normals_irls(
         resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
 
     Returns:
-        The fit. Curvature and residual are those of PCA on the query and the points of weight
-        above 1/4, or on all points where these span no plane; so is ``valid``.
+        The fit. Curvature and residual are those of PCA on it and the points of weight above
+        1/4, or on all points where these span no plane; so is ``valid``.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
@@ -257,6 +144,7 @@ def fit_normals_irls(
         [1] J. Sanchez, F. Denis, D. Coeurjolly, F. Dupont, L. Trassoudaine, P. Checchin. Robust
         normal vector estimation in 3D point clouds through iterative principal component analysis.
         ISPRS Journal of Photogrammetry and Remote Sensing 163, 2020.
+        [2] A. Blake, A. Zisserman. Visual Reconstruction. MIT Press, 1987.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(5.0), torch.arange(5.0), torch.zeros(1))
@@ -282,47 +170,53 @@ def fit_normals_irls(
     return fit.each(lambda part: part.reshape(leading + part.shape[1:]))
 
 
+def estimate_irls(
+    points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
+) -> NormalFit:
+    """Estimate normals by iteratively weighted PCA, with the noise found about each point.
+
+    The authors ask the user for the noise; here it is estimated from the planes of PCA about each
+    point. No setting matters.
+    """
+    known = points.detach()
+    planes = fit_points(known, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    noise = survey_noise(known, neighbors, planes, chunk_size=chunk_size).noise
+    return fit_points(points, neighbors, fit_normals_irls, chunk_size=chunk_size, noise=noise)
+
+
 def _fit_rows(
     patches: Tensor, mask: Tensor, noise: Tensor, decay: float, resolution: Tensor | None
 ) -> NormalFit:
     """Fit patches with one leading axis."""
-    query = mask & (mask.cumsum(dim=-1) == 1)
-    others = mask & ~query
+    itself = mask & (mask.cumsum(dim=-1) == 1)
+    others = mask & ~itself
     plane = fit_normals_pca(patches, mask, resolution=resolution)
     start = fit_normals_pca(patches, others, resolution=resolution)
-    _, offsets = about_query(patches, mask)
+    _, offsets = about_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
     noise = torch.maximum(noise, _LEAST_NOISE * radius)
-    flat = start.valid & (start.residual_rms <= noise)
-    plane = NormalFit(*(_select(flat, *pair) for pair in zip(start[:4], plane[:4], strict=True)))
+    is_flat = start.residual_rms <= noise
+    flat = (start.valid & is_flat).nonzero().squeeze(-1)
+    plane = replace_rows(plane, flat, start.each(lambda part: part[flat]))
 
-    rows = (start.valid & ~flat).nonzero().squeeze(-1)
+    rows = (start.valid & ~is_flat).nonzero().squeeze(-1)
     x, y, z = offsets[rows].unbind(dim=-1)
-    points = Surroundings(x, y, z, others[rows].to(patches.dtype))
+    points = _Offsets(x, y, z, others[rows].to(patches.dtype))
     normals, heavy = _fit_edges(points, start.normals[rows], noise[rows, None], decay)
     resolution = None if resolution is None else resolution[rows]
-    inliers = fit_normals_pca(patches[rows], heavy | query[rows], resolution=resolution)
+    inliers = fit_normals_pca(patches[rows], heavy | itself[rows], resolution=resolution)
     known = zip(inliers[1:4], plane[1:4], strict=True)
-    rest = (_select(inliers.valid, new, old[rows]) for new, old in known)
+    rest = (torch.where(inliers.valid, new, old[rows]) for new, old in known)
     return replace_rows(plane, rows, NormalFit(normals, *rest))
 
 
-class _Solution(NamedTuple):
-    """A plane for each edge, the distance of the query point to it, and its points."""
-
-    normal: Tensor
-    through: Tensor
-    error: Tensor
-    heavy: Tensor
-
-
 def _fit_edges(
-    points: Surroundings, start: Tensor, noise: Tensor, decay: float
+    points: _Offsets, start: Tensor, noise: Tensor, decay: float
 ) -> tuple[Tensor, Tensor]:
     """Return normals and heavy points of the better of two solutions."""
     limit = noise * noise / 4
     largest = _sq_distances(points, start).amax(dim=-1, keepdim=True)
-    first = _anneal_twice(points, start, largest, largest / 4, limit, decay)
+    first = _fit_twice(points, start, largest, largest / 4, limit, decay)
     normals, heavy = first.normal, first.heavy
 
     rows = (_cosine(start, normals) < _CLOSE_TO_PCA).nonzero().squeeze(-1)
@@ -330,7 +224,7 @@ def _fit_edges(
     axis = torch.linalg.cross(torch.linalg.cross(start[rows], ours), ours)
     across = axis / (axis * axis).sum(dim=-1, keepdim=True).sqrt()
     mu = _low_quantile(_sq_distances(part, across), part.counted)
-    second = _anneal_twice(part, across, mu, mu / 2, limit, decay)
+    second = _fit_twice(part, across, mu, mu / 2, limit, decay)
     known = _Solution(*(field[rows] for field in first))
     better = (_cosine(known.through, second.through) < _SAME_SOLUTION) & ~_first_wins(
         known, second, part
@@ -342,31 +236,27 @@ def _fit_edges(
     )
 
 
-def _anneal_twice(
-    points: Surroundings,
-    start: Tensor,
-    mu: Tensor,
-    restart: Tensor,
-    limit: Tensor,
-    decay: float,
+def _fit_twice(
+    points: _Offsets, start: Tensor, mu: Tensor, restart: Tensor, limit: Tensor, decay: float
 ) -> _Solution:
-    """Return planes fitted through the query points, then near them."""
-    through = anneal(points, start_plane(start, mu), limit, decay, shift=False)
+    """Return planes fitted through the points themselves, then near them."""
+    plane = _Plane(start, torch.zeros_like(start), mu, start, mu)
+    through = _fit_graduated(points, plane, limit, decay, shift=False)
     restarted = through._replace(
         mu=torch.maximum(restart, limit),
         weighed_normal=through.normal,
         weighed_mu=through.mu,
     )
-    near = anneal(points, restarted, limit, decay, shift=True)
+    near = _fit_graduated(points, restarted, limit, decay, shift=True)
     points = points.about(near.center)
-    weights = weigh(points.distances(near.weighed_normal), near.weighed_mu, points.counted)
+    weights = _weigh(points.distances(near.weighed_normal), near.weighed_mu, points.counted)
     height = (near.center * near.normal).sum(dim=-1)
     above = (points.distances(near.normal) * points.counted).sum(dim=-1) > 0
     error = torch.where(above, -height, height)
-    return _Solution(near.normal, through.normal, error, weights > HEAVY)
+    return _Solution(near.normal, through.normal, error, weights > _HEAVY)
 
 
-def _first_wins(first: _Solution, second: _Solution, points: Surroundings) -> Tensor:
+def _first_wins(first: _Solution, second: _Solution, points: _Offsets) -> Tensor:
     """Return whether the first of two solutions is to be taken, shape ``(n,)``."""
     nearer = first.error < second.error
     many_first, many_second = (
@@ -376,8 +266,8 @@ def _first_wins(first: _Solution, second: _Solution, points: Surroundings) -> Te
     return torch.where(many_second, nearer & many_first, nearer | many_first)
 
 
-def _sq_distances(points: Surroundings, normal: Tensor) -> Tensor:
-    """Return squared distances to planes through the query points, 0 if not counted."""
+def _sq_distances(points: _Offsets, normal: Tensor) -> Tensor:
+    """Return squared distances to planes through the points themselves, 0 if not counted."""
     distances = points.distances(normal)
     return distances * distances * points.counted
 
@@ -394,45 +284,68 @@ def _cosine(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(dim=-1).abs()
 
 
-def _select(condition: Tensor, yes: Tensor, no: Tensor) -> Tensor:
-    """Return rows of one tensor where a condition holds, of another elsewhere."""
-    return torch.where(condition.reshape(-1, *[1] * (yes.ndim - 1)), yes, no)
+def _fit_graduated(
+    points: _Offsets, plane: _Plane, limit: Tensor, decay: float, *, shift: bool
+) -> _Plane:
+    """Reweight and refit planes while ``mu`` shrinks to a limit: graduated non-convexity.
 
-
-def estimate_irls(
-    points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
-) -> NormalFit:
-    """Estimate normals by iteratively weighted PCA, with the noise found about each point.
-
-    See :func:`torchrg.normals.fit_normals_irls`. Its authors ask the user for the noise; here it
-    is estimated from the planes of PCA about each point.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        config: Settings, none of which matters here.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The fit.
-
-    Example:
-        >>> import torch
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
-        >>> estimate_irls(torch.eye(3), neighbors, NormalsConfig(k=3), 16).valid.all()
-        tensor(True)
+    Each step divides ``mu`` by ``decay``, weighs every point by its distance, and takes the
+    direction in which the weighted points are flattest about the center. With ``shift`` the center
+    first moves along the normal to the weighted mean of the heavy points, their weights being those
+    of the step before. ``mu`` ends at the first value at or below the limit, with ``shift`` at the
+    last one at or above. Patches leave the batch when they are done. If gradients are wanted, each
+    step keeps its input only and is run again for them.
     """
-    known = points.detach()
-    planes = at_all_points(fit_normals_pca)(known, neighbors, config, chunk_size)
-    noise = survey_noise(known, neighbors, planes, chunk_size=chunk_size).noise
+    differentiable = torch.is_grad_enabled() and plane.normal.requires_grad
+    step = partial(checkpoint, _step, use_reentrant=False) if differentiable else _step
+    num_steps = _count_steps(plane.mu.detach(), limit, decay, stay_above=shift)
+    order = num_steps.argsort(descending=True, stable=True)
+    remaining = num_steps[order].tolist()
+    points, plane = points.take(order), plane.take(order)
+    active = len(remaining)
+    for done in range(remaining[0] if remaining else 0):
+        while remaining[active - 1] <= done:
+            active -= 1
+        part = slice(0, active)
+        moved = step(points.take(part), plane.take(part), decay, shift)
+        rest = plane.take(slice(active, None))
+        plane = _Plane(*map(torch.cat, zip(moved, rest, strict=True)))
+    return plane.take(order.argsort())
 
-    def fit_chunk(chunk: slice) -> NormalFit:
-        return fit_normals_irls(
-            gather_patches(points, neighbors.indices[chunk]),
-            None if neighbors.valid is None else neighbors.valid[chunk],
-            noise=noise[chunk],
-            resolution=coordinate_resolution(points[chunk]),
-        )
 
-    chunks = fair_chunks(len(points), chunk_size)
-    return join_fits(map_chunks(fit_chunk, chunks, points.device))
+def _weigh(distances: Tensor, mu: Tensor, counted: Tensor) -> Tensor:
+    """Return Geman-McClure weights ``(mu / (mu + r^2))^2``, 0 for what does not count."""
+    weights = mu / (mu + distances * distances)
+    return weights * weights * counted
+
+
+def _step(points: _Offsets, plane: _Plane, decay: float, shift: bool) -> _Plane:
+    """Return the next plane, with the normal along which the weighted points are flattest."""
+    center = plane.center
+    if shift:
+        points = points.about(center)
+        weights = _weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
+        heavy = weights * (weights > _HEAVY)
+        total = heavy.sum(dim=-1, keepdim=True)
+        heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
+        move = plane.normal * (heights / torch.where(total > 0, total, 1.0))
+        points, center = points.about(move), center + move
+    mu = plane.mu / decay
+    weights = _weigh(points.distances(plane.normal), mu, points.counted)
+    matrix = second_moments(points[:3], weights)
+    return _Plane(principal_frame(matrix).normals, center, mu, plane.normal, mu)
+
+
+def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -> Tensor:
+    """Return the number of divisions that bring ``mu`` to the limit, shape ``(n,)``.
+
+    Counted by dividing, not by a logarithm, whose last bit depends on where an element stands.
+    """
+    num_steps = torch.zeros(len(mu), dtype=torch.int64, device=mu.device)
+    while True:
+        following = mu / decay
+        goes_on = following >= limit if stay_above else mu > limit
+        if not bool(goes_on.any()):
+            return num_steps.clamp(min=_LEAST_STEPS)
+        num_steps += goes_on.squeeze(-1)
+        mu = torch.where(goes_on, following, mu)

@@ -1,4 +1,10 @@
-"""Quadratic height fields: normals and curvatures of curved surfaces."""
+"""Quadratic height fields: normals and curvatures of curved surfaces.
+
+Two solvers, as they are for two ends. Jets are for all points of a cloud, in float64 as exact as
+CGAL's, with gradients: they are fitted by orthogonalisation. The paraboloids of the consensus need
+three digits and no gradient: normal equations square the condition, which costs nothing there, and
+take half the time.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
@@ -10,33 +16,220 @@ from torch import Tensor
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root
 from torchrg.linalg.moments import Columns, along, sq_lengths
-from torchrg.normals.patches import about_query
+from torchrg.normals.patches import about_first
 from torchrg.normals.pca import check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
+
+_NUM_TERMS = 6
+"""Of a quadratic in two coordinates; fewer points do not determine it."""
+
+_FLAT_PIVOT = 1e-5
+"""Share of its squared length that a term of a paraboloid keeps beside those before it, at least:
+normal equations in float32 have the root of it, three parts in a thousand, right to a percent."""
+
+
+def fit_normals_jet(
+    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
+) -> NormalFit:
+    """Fit a quadratic surface to each patch and return its normal at the point itself.
+
+    See :func:`fit_jet`, which gives the principal curvatures too. ``curvature`` is the surface
+    variation of PCA, so that regions grow in the same order; ``residual_rms`` belongs to the
+    quadratic surface.
+
+    Example:
+        >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
+        >>> bowl = torch.stack([x, y, (x**2 + y**2) / 9], dim=-1).reshape(25, 3)
+        >>> fit_normals_jet(bowl.roll(13, dims=0)).normals.abs().round(decimals=4)
+        tensor([0., 0., 1.])
+    """
+    fit = fit_jet(patches, mask, resolution=resolution)
+    return NormalFit(fit.normals, fit.curvature, fit.valid, fit.residual_rms)
+
+
+class JetFit(NamedTuple):
+    """A quadratic surface through each neighbourhood; see :func:`fit_jet`.
+
+    Attributes:
+        normals: Unit normals of the surface at the point itself, shape ``(*, 3)``; zero where not
+            ``valid``. The sign is arbitrary.
+        foot: Point of the surface above or below it, shape ``(*, 3)``.
+        principal_curvatures: The larger and the smaller one, shape ``(*, 2)``, in 1 / unit of the
+            cloud; positive where the surface bends towards ``normals``.
+        principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
+            two orthogonal ones where the two curvatures are equal.
+        curvature: Surface variation, as of :func:`fit_normals_pca`, shape ``(*)``.
+        valid: Whether there is a plane, shape ``(*)``, bool; all else is zero where not.
+        residual_rms: Root mean square distance of the points to the surface along the normal of
+            their plane, shape ``(*)``.
+    """
+
+    normals: Tensor
+    foot: Tensor
+    principal_curvatures: Tensor
+    principal_directions: Tensor
+    curvature: Tensor
+    valid: Tensor
+    residual_rms: Tensor
+
+
+def fit_jet(
+    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
+) -> JetFit:
+    r"""Fit a quadratic height field to each patch: a jet of degree 2 [1].
+
+    In the frame of the patch's PCA about the point itself, the first of the patch that counts, the
+    height ``w`` is fitted by least squares as ``a0 + a1 u + a2 v + a3 u^2/2 + a4 u v + a5 v^2/2``.
+    The normal at the point is ``(-a1, -a2, 1)`` turned back, and the principal curvatures are the
+    eigenvalues of the shape operator there. This is what CGAL's ``jet_estimate_normals`` does in
+    degree 2.
+
+    Convention:
+        Gradients flow through everything but the principal directions, and are finite where two
+        eigenvalues are equal.
+
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the point itself first.
+        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything, NaN
+            included. Default: all.
+        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in the unit
+            of the cloud. Default: rounding of the patch's own coordinates.
+
+    Returns:
+        The fit. Terms that the points do not determine are left out, the last ones first: two
+        straight scan lines have no ``v^2``; fewer than six points have no quadratic terms, which
+        leaves the plane of PCA. ``valid`` is that of :func:`fit_normals_pca`.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+
+    References:
+        [1] F. Cazals, M. Pouget. Estimating differential quantities using polynomial fitting of
+        osculating jets. Computer Aided Geometric Design 22(2), 2005.
+
+    Example:
+        >>> angle = torch.linspace(-0.3, 0.3, 7)
+        >>> angle, along = torch.meshgrid(angle.roll(4), torch.arange(3.0) / 10, indexing="ij")
+        >>> pipe = torch.stack([2 * angle.sin(), along, 2 * angle.cos()], dim=-1).reshape(21, 3)
+        >>> fit_jet(pipe).principal_curvatures.abs().amax()
+        tensor(0.5...)
+    """
+    check_patches("fit_jet", patches, mask, resolution)
+    plane, frame = fit_plane(patches, mask, resolution)
+    place, offsets = about_first(patches, mask)
+    axes = _tangent_axes(frame)
+    u, v, w = (offsets @ axes).unbind(dim=-1)
+    rounding = patch_resolution(patches, mask) if resolution is None else resolution
+    (height, *derivatives), residual = _fit_height(u, v, w, mask, rounding)
+    normal, curvatures, directions = _principal_curvatures(*derivatives)
+    count = residual.shape[-1] if mask is None else mask.sum(dim=-1).clamp(min=1)
+    valid = plane.valid
+    return JetFit(
+        torch.where(valid[..., None], (axes @ normal[..., None]).squeeze(-1), 0.0),
+        torch.where(valid[..., None], place + height[..., None] * axes[..., 2], 0.0),
+        torch.where(valid[..., None], curvatures, 0.0),
+        torch.where(valid[..., None, None], directions @ axes.mT, 0.0),
+        plane.curvature,
+        valid,
+        torch.where(valid, root((residual * residual).sum(dim=-1) / count), 0.0),
+    )
+
+
+def fit_paraboloids(
+    columns: Columns, normals: Tensor, counted: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Fit ``h(u, v) = a + b u + c v + d u^2 + e u v + f v^2`` over a plane through each point.
+
+    The normal at the point is that of the height field at ``u = v = 0``: the 2-jet of
+    :func:`fit_jet` in another frame, by normal equations. Terms that the neighbours cannot tell
+    from the ones before, as on two scan lines, are left out. The heights are along ``normals``
+    ``(n, 3)``, within some 60 degrees of the surface normal; ``counted`` are weights 0 or 1.
+
+    Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``,
+    and standard deviations of the residuals ``(n,)``, six degrees of freedom less.
+    """
+    radius = sq_lengths(columns).mul_(counted).amax(dim=1).sqrt_()
+    scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None] * counted
+    first, second = _tangents(normals)
+    u, v, height = (along(columns, axis) * scale for axis in (first, second, normals))
+    terms = _quadratic_terms(counted, u, v)
+    matrix = {
+        (j, i): (terms[i] * terms[j]).sum(dim=1)
+        for i, j in combinations_with_replacement(range(_NUM_TERMS), 2)
+    }
+    solution = _solve(matrix, [(term * height).sum(dim=1) for term in terms])
+    for coefficient, term in zip(solution, terms, strict=True):
+        height.sub_(term * coefficient[:, None])
+    freedom = (counted.sum(dim=1) - _NUM_TERMS).clamp_(min=1)
+    deviations = (height.square_().sum(dim=1) / freedom).sqrt_() * radius
+    a, b, c = solution[:3]
+    length = (1 + b * b + c * c).sqrt_()
+    tilted = normals - b[:, None] * first - c[:, None] * second
+    return tilted / length[:, None], a * radius / length, deviations
+
+
+def _tangent_axes(frame: PrincipalFrame) -> Tensor:
+    """Return the longest, the middle and the normal direction as columns.
+
+    The fit is the same for any two tangents, so only the normal needs gradients; the tangents just
+    have to stay orthogonal to it.
+    """
+    normal, longest = frame.normals, frame.vectors[..., 2]
+    tangent = longest - (longest * normal).sum(dim=-1, keepdim=True) * normal
+    return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=-1)
+
+
+def _fit_height(
+    u: Tensor,
+    v: Tensor,
+    w: Tensor,
+    mask: Tensor | None,
+    rounding: Tensor,
+) -> tuple[list[Tensor], Tensor]:
+    """Return height, slopes and second derivatives, shape ``(*)`` each, and the residuals."""
+    count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)
+    ones = torch.ones_like(u) if mask is None else mask.to(u.dtype)
+    sides = [_mean_size(u), _mean_size(v)]
+    # Rounding of a coordinate, relative to the size of each column, hides dependent columns.
+    rough = [rounding[..., None] / side for side in sides]
+    exact = rank_tolerance(u.shape[-1], u.dtype)
+    quadratic = torch.where(torch.as_tensor(count, device=u.device) < _NUM_TERMS, torch.inf, exact)
+    shares = (
+        exact,
+        exact + rough[0],
+        exact + rough[1],
+        quadratic + 2 * rough[0],
+        quadratic + rough[0] + rough[1],
+        quadratic + 2 * rough[1],
+    )
+    terms = _quadratic_terms(ones, u / sides[0], v / sides[1])
+    coefficients, residual = least_squares(list(zip(terms, shares, strict=True)), w)
+    p, q = sides
+    units = (torch.ones_like(p), p, q, p * p / 2, p * q, q * q / 2)
+    derivatives = [(c / unit).squeeze(-1) for c, unit in zip(coefficients, units, strict=True)]
+    return derivatives, residual
+
+
+def _mean_size(values: Tensor) -> Tensor:
+    """Return the mean absolute value of each row, 1 for a row of zeros, shape ``(*, 1)``."""
+    size = values.detach().abs().mean(dim=-1, keepdim=True)
+    return torch.where(size > 0, size, 1.0)
+
+
+def _quadratic_terms(ones: Tensor, u: Tensor, v: Tensor) -> list[Tensor]:
+    """Return the terms of a quadratic height field, all zero where a point does not count."""
+    return [ones, u, v, u * u, u * v, v * v]
 
 
 def least_squares(
     columns: Sequence[tuple[Tensor, Tensor | float]], target: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Fit a target by columns, and leave out columns that depend on the ones before.
+    """Fit a target ``(*, K)`` by columns, and leave out columns that depend on the ones before.
 
     Modified Gram-Schmidt with the target as the last column: as accurate as Householder's QR, and
-    made of sums of products only, so it runs batched on any device and gradients flow.
-
-    Args:
-        columns: Columns, shape ``(*, K)``, each with the share of its length, a number or shape
-            ``(*, 1)``, that must be left after the columns before it are taken out.
-        target: Shape ``(*, K)``.
-
-    Returns:
-        The coefficient of each column, shape ``(*, 1)``, 0 where it is left out, and the residual,
-        shape ``(*, K)``.
-
-    Example:
-        >>> one, x = torch.ones(3), torch.tensor([0.0, 1.0, 2.0])
-        >>> (a, b), _ = least_squares([(one, 1e-6), (x, 1e-6)], 2 * x + 1)
-        >>> a.round(decimals=4), b.round(decimals=4)
-        (tensor([1.]), tensor([2.]))
+    made of sums of products only, so it runs batched on any device and gradients flow. Each column
+    comes with the share of its length that must be left after those before it are taken out.
+    Returns the coefficient of each, shape ``(*, 1)``, 0 where it is left out, and the residual.
     """
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
@@ -64,26 +257,14 @@ def least_squares(
     return coefficients, target
 
 
-def shape_operator(
+def _principal_curvatures(
     slope_u: Tensor, slope_v: Tensor, uu: Tensor, uv: Tensor, vv: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the normal of a height field and how it turns along two tangents.
+    """Return unit normals of height fields, principal curvatures and their directions.
 
-    Args:
-        slope_u: First derivative along u, shape ``(*)``.
-        slope_v: First derivative along v.
-        uu: Second derivative along u.
-        uv: Mixed derivative.
-        vv: Second derivative along v.
-
-    Returns:
-        Unit normal with positive height, shape ``(*, 3)``; entries aa, ab, bb of the shape operator
-        in an orthonormal basis of tangents a and b, shape ``(*, 3)``; that basis, ``(*, 2, 3)``.
-
-    Example:
-        >>> zero, one = torch.zeros(()), torch.ones(())
-        >>> shape_operator(zero, zero, 2 * one, zero, one)[1]
-        tensor([2., 0., 1.])
+    From first and second derivatives: normals of positive height ``(*, 3)``, curvatures ``(*, 2)``,
+    larger first, and directions ``(*, 2, 3)``, these without gradient. They are the eigenvalues of
+    the shape operator, of entries aa, ab, bb in an orthonormal basis of tangents.
     """
     one = torch.ones_like(slope_u)
     gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()
@@ -92,271 +273,23 @@ def shape_operator(
     first = torch.stack([one, torch.zeros_like(one), slope_u], dim=-1) / length[..., None]
     second = torch.linalg.cross(normal, first)
     au, bu, bv = first[..., 0], second[..., 0], second[..., 1]
-    aa = au * au * uu
-    ab = au * (bu * uu + bv * uv)
-    bb = bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv
-    shape = torch.stack([aa, ab, bb], dim=-1) / gradient[..., None]
-    return normal, shape, torch.stack([first, second], dim=-2)
-
-
-def principal_curvatures(shape: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the eigenvalues of shape operators, larger first, and their directions.
-
-    Args:
-        shape: Entries aa, ab, bb, shape ``(*, 3)``.
-        tangents: The tangents a and b, shape ``(*, 2, 3)``.
-
-    Returns:
-        Curvatures, shape ``(*, 2)``, and unit directions, shape ``(*, 2, 3)``, without gradient.
-
-    Example:
-        >>> principal_curvatures(torch.tensor([1.0, 1.0, 1.0]), torch.eye(3)[:2])[0]
-        tensor([2., 0.])
-    """
-    aa, ab, bb = shape.unbind(dim=-1)
+    aa = au * au * uu / gradient
+    ab = au * (bu * uu + bv * uv) / gradient
+    bb = (bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv) / gradient
     middle, half = (aa + bb) / 2, (aa - bb) / 2
     radius = root(half * half + ab * ab)
     values = torch.stack([middle + radius, middle - radius], dim=-1)
     with torch.no_grad():
         # Of the two rows of (S - k1), the longer one is orthogonal to the first direction.
-        along = torch.where(half >= 0, half + radius, ab)
-        across = torch.where(half >= 0, ab, radius - half)
-        size = root(along * along + across * across)
-        round_ = size == 0
-        along = torch.where(round_, 1.0, along / torch.where(round_, 1.0, size))
-        across = torch.where(round_, 0.0, across / torch.where(round_, 1.0, size))
-        first = torch.stack([along, across], dim=-1)
-        second = torch.stack([-across, along], dim=-1)
-        directions = torch.stack([first, second], dim=-2) @ tangents
-    return values, directions
-
-
-_NUM_TERMS = 6
-
-
-class JetFit(NamedTuple):
-    """A quadratic surface through each neighbourhood; see :func:`fit_jet`.
-
-    Attributes:
-        normals: Unit normals of the surface at the query point, shape ``(*, 3)``; zero where not
-            ``valid``. The sign is arbitrary.
-        foot: Point of the surface above or below the query point, shape ``(*, 3)``.
-        principal_curvatures: The larger and the smaller one, shape ``(*, 2)``, in 1 / unit of the
-            cloud; positive where the surface bends towards ``normals``.
-        principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
-            two orthogonal ones where the two curvatures are equal.
-        curvature: Surface variation, as of :func:`fit_normals_pca`, shape ``(*)``.
-        valid: Whether there is a plane, shape ``(*)``, bool; all else is zero where not.
-        residual_rms: Root mean square distance of the points to the surface along the normal of
-            their plane, shape ``(*)``.
-    """
-
-    normals: Tensor
-    foot: Tensor
-    principal_curvatures: Tensor
-    principal_directions: Tensor
-    curvature: Tensor
-    valid: Tensor
-    residual_rms: Tensor
-
-
-def fit_normals_jet(
-    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
-) -> NormalFit:
-    """Fit a quadratic surface to each patch and return its normal at the query point.
-
-    See :func:`fit_jet`, which gives the principal curvatures too. ``curvature`` is the surface
-    variation of PCA, so that regions grow in the same order; ``residual_rms`` belongs to the
-    quadratic surface.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the query point first.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-
-    Example:
-        >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
-        >>> bowl = torch.stack([x, y, (x**2 + y**2) / 9], dim=-1).reshape(25, 3)
-        >>> fit_normals_jet(bowl.roll(13, dims=0)).normals.abs().round(decimals=4)
-        tensor([0., 0., 1.])
-    """
-    fit = fit_jet(patches, mask, resolution=resolution)
-    return NormalFit(fit.normals, fit.curvature, fit.valid, fit.residual_rms)
-
-
-def fit_jet(
-    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
-) -> JetFit:
-    r"""Fit a quadratic height field to each patch: a jet of degree 2 [1].
-
-    In the frame of the patch's PCA with the query point as origin, the height ``w`` is fitted by
-    least squares as ``a0 + a1 u + a2 v + a3 u^2/2 + a4 u v + a5 v^2/2``; the normal at the query
-    is ``(-a1, -a2, 1)`` turned back, and the principal curvatures are the eigenvalues of the shape
-    operator there. This is what CGAL's ``jet_estimate_normals`` does in degree 2.
-
-    Convention:
-        The query point is the first point of the patch that counts. Gradients flow through
-        everything but the principal directions, and are finite where two eigenvalues are equal.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the query point first.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything, NaN
-            included. Default: all.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in the unit
-            of the cloud. Default: rounding of the patch's own coordinates.
-
-    Returns:
-        The fit. Terms that the points do not determine are left out, the last ones first: two
-        straight scan lines have no ``v^2``; fewer than six points have no quadratic terms, which
-        leaves the plane of PCA. ``valid`` is that of :func:`fit_normals_pca`.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-
-    References:
-        [1] F. Cazals, M. Pouget. Estimating differential quantities using polynomial fitting of
-        osculating jets. Computer Aided Geometric Design 22(2), 2005.
-
-    Example:
-        >>> angle = torch.linspace(-0.3, 0.3, 7)
-        >>> angle, along = torch.meshgrid(angle.roll(4), torch.arange(3.0) / 10, indexing="ij")
-        >>> pipe = torch.stack([2 * angle.sin(), along, 2 * angle.cos()], dim=-1).reshape(21, 3)
-        >>> fit_jet(pipe).principal_curvatures.abs().amax()
-        tensor(0.5...)
-    """
-    check_patches("fit_jet", patches, mask, resolution)
-    plane, frame = fit_plane(patches, mask, resolution=resolution)
-    query, offsets = about_query(patches, mask)
-    axes = _tangent_axes(frame)
-    u, v, w = (offsets @ axes).unbind(dim=-1)
-    rounding = patch_resolution(patches, mask) if resolution is None else resolution
-    sides = [_mean_size(u), _mean_size(v)]
-    terms, residual = _fit_height(u, v, w, sides, mask, rounding)
-    height, slope_u, slope_v, *bend = terms
-    normal, shape, tangents = shape_operator(slope_u, slope_v, *bend)
-    curvatures, directions = principal_curvatures(shape, tangents)
-    count = residual.shape[-1] if mask is None else mask.sum(dim=-1).clamp(min=1)
-    valid = plane.valid
-    return JetFit(
-        torch.where(valid[..., None], (axes @ normal[..., None]).squeeze(-1), 0.0),
-        torch.where(valid[..., None], query + height[..., None] * axes[..., 2], 0.0),
-        torch.where(valid[..., None], curvatures, 0.0),
-        torch.where(valid[..., None, None], directions @ axes.mT, 0.0),
-        plane.curvature,
-        valid,
-        torch.where(valid, root((residual * residual).sum(dim=-1) / count), 0.0),
-    )
-
-
-def _tangent_axes(frame: PrincipalFrame) -> Tensor:
-    """Return the longest, the middle and the normal direction as columns.
-
-    The fit is the same for any two tangents, so only the normal needs gradients; the tangents just
-    have to stay orthogonal to it.
-    """
-    normal, longest = frame.normals, frame.vectors[..., 2]
-    tangent = longest - (longest * normal).sum(dim=-1, keepdim=True) * normal
-    return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=-1)
-
-
-def _mean_size(values: Tensor) -> Tensor:
-    """Return the mean absolute value of each row, 1 for a row of zeros, shape ``(*, 1)``."""
-    size = values.detach().abs().mean(dim=-1, keepdim=True)
-    return torch.where(size > 0, size, 1.0)
-
-
-def _fit_height(
-    u: Tensor,
-    v: Tensor,
-    w: Tensor,
-    sides: list[Tensor],
-    mask: Tensor | None,
-    rounding: Tensor,
-) -> tuple[list[Tensor], Tensor]:
-    """Return the six coefficients of the height field, shape ``(*)`` each, and the residuals."""
-    count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)
-    ones = torch.ones_like(u) if mask is None else mask.to(u.dtype)
-    a, b = u / sides[0], v / sides[1]
-    # Rounding of a coordinate, relative to the size of each column, hides dependent columns.
-    rough = [rounding[..., None] / side for side in sides]
-    exact = rank_tolerance(u.shape[-1], u.dtype)
-    quadratic = torch.where(torch.as_tensor(count, device=u.device) < _NUM_TERMS, torch.inf, exact)
-    columns: list[tuple[Tensor, Tensor | float]] = [
-        (ones, exact),
-        (a, exact + rough[0]),
-        (b, exact + rough[1]),
-        (a * a / 2, quadratic + 2 * rough[0]),
-        (a * b, quadratic + rough[0] + rough[1]),
-        (b * b / 2, quadratic + 2 * rough[1]),
-    ]
-    coefficients, residual = least_squares(columns, w)
-    p, q = sides
-    units = (torch.ones_like(p), p, q, p * p, p * q, q * q)
-    terms = [(c / unit).squeeze(-1) for c, unit in zip(coefficients, units, strict=True)]
-    return terms, residual
-
-
-_NUM_COEFFICIENTS = 6
-_FLAT_PIVOT = 1e-5
-
-
-def fit_paraboloids(
-    columns: Columns, normals: Tensor, counted: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Fit ``h(u, v) = a + b u + c v + d u^2 + e u v + f v^2`` over a plane through each point.
-
-    The normal at the point is that of the height field at ``u = v = 0``: a 2-jet [1], by normal
-    equations. Terms that the neighbours cannot tell from the ones before, as on two scan lines,
-    are left out.
-
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        normals: Directions of the heights, shape ``(n, 3)``, within some 60 degrees of the surface
-            normal.
-        counted: Weights 0 or 1, shape ``(n, K)``.
-
-    Returns:
-        Unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``, and
-        standard deviations of the residuals ``(n,)``: root of their sum of squares by the number of
-        points less six.
-
-    References:
-        [1] F. Cazals, M. Pouget. Estimating differential quantities using polynomial fitting of
-        osculating jets. Computer Aided Geometric Design 22, 2005.
-
-    Example:
-        >>> from torchrg.linalg.moments import split_columns
-        >>> grid = torch.cartesian_prod(torch.arange(-2.0, 3), torch.arange(-2.0, 3))
-        >>> bowl = torch.cat([grid, grid.square().sum(dim=1, keepdim=True)], dim=1)[None]
-        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
-        >>> normals, _, deviations = fit_paraboloids(split_columns(bowl), up, torch.ones(1, 25))
-        >>> bool((normals - up).abs().max() < 1e-6), bool(deviations < 1e-5)
-        (True, True)
-    """
-    radius = sq_lengths(columns).mul_(counted).amax(dim=1).sqrt_()
-    scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None]
-    first, second = _tangents(normals)
-    u, v, height = (along(columns, axis) * scale for axis in (first, second, normals))
-    terms = [counted, u * counted, v * counted, u * u * counted, u * v * counted, v * v * counted]
-    matrix = {
-        (j, i): (terms[i] * terms[j]).sum(dim=1)
-        for i, j in combinations_with_replacement(range(_NUM_COEFFICIENTS), 2)
-    }
-    a, b, c, *bend = _solve(matrix, [(term * height).sum(dim=1) for term in terms])
-    rest = height * counted
-    for coefficient, term in zip((a, b, c, *bend), terms, strict=True):
-        rest = rest.sub_(term * coefficient[:, None])
-    freedom = (counted.sum(dim=1) - _NUM_COEFFICIENTS).clamp_(min=1)
-    deviations = (rest.square_().sum(dim=1) / freedom).sqrt_() * radius
-    length = (1 + b * b + c * c).sqrt_()
-    tilted = normals - b[:, None] * first - c[:, None] * second
-    return tilted / length[:, None], a * radius / length, deviations
+        a = torch.where(half >= 0, half + radius, ab)
+        b = torch.where(half >= 0, ab, radius - half)
+        size = root(a * a + b * b)
+        umbilic = size == 0
+        a = torch.where(umbilic, 1.0, a / torch.where(umbilic, 1.0, size))
+        b = torch.where(umbilic, 0.0, b / torch.where(umbilic, 1.0, size))
+        turn = torch.stack([torch.stack([a, b], dim=-1), torch.stack([-b, a], dim=-1)], dim=-2)
+        directions = turn @ torch.stack([first, second], dim=-2)
+    return normal, values, directions
 
 
 def _tangents(normals: Tensor) -> tuple[Tensor, Tensor]:

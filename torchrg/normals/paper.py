@@ -1,6 +1,5 @@
 """The paper's two stages: PCA everywhere, a robust fit where the normals disagree."""
 
-import math
 from functools import partial
 from typing import Literal
 
@@ -10,7 +9,7 @@ from torch import Tensor
 from torchrg._parallel import fair_chunks, run_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
-from torchrg.linalg import at_most, signs, sq_chord_to_deg
+from torchrg.linalg import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
 from torchrg.normals.patches import fit_points, replace_rows
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.normals.robust import fit_normals_detmcd
@@ -58,93 +57,57 @@ def find_sharp_points(
     if rule not in ("qn", "percentile"):
         raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
     columns = normals.T.contiguous()
-    everywhere = valid is None or bool(valid.all())
+    if valid is not None and bool(valid.all()):
+        valid = None
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
 
     def classify(block: slice) -> None:
         indices = neighbors.indices[block]
         counted = None if neighbors.valid is None else neighbors.valid[block]
-        if valid is not None and not everywhere:
+        if valid is not None:
             has_normal = valid.index_select(0, indices.reshape(-1)).view(indices.shape)
             counted = has_normal if counted is None else counted & has_normal
-        sq_chords = _sq_chords(columns, indices)
+        near = [c.index_select(0, indices.reshape(-1)).view(indices.shape) for c in columns]
+        chords = sq_chords([component[:, :1] for component in near], near)
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
-        sharp[block] = exceeds(sq_chords, counted, angle_deg)
+        sharp[block] = exceeds(chords, counted, angle_deg)
 
     run_chunks(classify, fair_chunks(len(sharp), chunk_size), normals.device)
     return sharp if valid is None else sharp | ~valid
 
 
-def _sq_chords(columns: Tensor, indices: Tensor) -> Tensor:
-    """Return squared chords between the normals of points and of their neighbours, without sign."""
-    flat = indices.reshape(-1)
-    gathered = [column.index_select(0, flat).view(indices.shape) for column in columns]
-    own = [component[:, :1] for component in gathered]
-    dot = own[0] * gathered[0]
-    for a, b in zip(own[1:], gathered[1:], strict=True):
-        dot += a * b
-    sign = signs(dot)
-    result = torch.zeros_like(dot)
-    for a, b in zip(own, gathered, strict=True):
-        difference = b * sign - a
-        result += difference.mul_(difference)
-    return result
-
-
-def _sq_chord_of(angle_deg: float) -> float:
-    """Return the squared chord of an angle."""
-    return (2 * math.sin(math.radians(angle_deg) / 2)) ** 2
-
-
-def _qn_exceeds(sq_chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
+def _qn_exceeds(chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
     """Return whether Qn of the angles exceeds the limit.
 
     If the majority of the angles lies within one difference of zero, all their pairs do, and they
     are enough: most points of a room are settled by counting, and only the rest needs angles.
     """
-    near = at_most(sq_chords, _sq_chord_of(angle_deg / QN_FACTOR))
+    near = at_most(chords, deg_to_sq_chord(angle_deg / QN_FACTOR))
     if counted is None:
-        majority: Tensor | int = sq_chords.shape[-1] // 2 + 1
+        majority: Tensor | int = chords.shape[-1] // 2 + 1
     else:
         near *= counted
         majority = counted.sum(dim=-1) // 2 + 1
     exceeds = near.sum(dim=-1) < majority
     rows = exceeds.nonzero().squeeze(-1)
     mask = None if counted is None else counted[rows]
-    exceeds[rows] = qn_exceeds(sq_chord_to_deg(sq_chords[rows]), angle_deg, mask=mask)
+    exceeds[rows] = qn_exceeds(sq_chord_to_deg(chords[rows]), angle_deg, mask=mask)
     return exceeds
 
 
-def _percentile_exceeds(sq_chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
+def _percentile_exceeds(chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
     """Return whether fewer than a quarter of the angles are within the limit."""
-    within = sq_chords <= _sq_chord_of(angle_deg)
+    within = chords <= deg_to_sq_chord(angle_deg)
     if counted is None:
-        return within.sum(dim=-1) * 4 < sq_chords.shape[-1]
+        return within.sum(dim=-1) * 4 < chords.shape[-1]
     return (within & counted).sum(dim=-1) * 4 < counted.sum(dim=-1)
 
 
 def estimate_paper(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
-    """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at those.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        config: Sharp rule and limit, support fraction and inlier quantile of the MCD.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The fit, with ``sharp``.
-
-    Example:
-        >>> import torch
-        >>> points = torch.cat([torch.eye(3), torch.zeros(1, 3)])
-        >>> neighbors = Neighbors(torch.tensor([[0, 1, 3], [1, 0, 3], [2, 0, 3], [3, 0, 1]]))
-        >>> estimate_paper(points, neighbors, NormalsConfig(k=3), 16).valid.all()
-        tensor(True)
-    """
-    fit = fit_points(points, neighbors, _fit_pca, chunk_size=chunk_size)
+    """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at those."""
+    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
     sharp = find_sharp_points(
         fit.normals,
         neighbors,
@@ -154,22 +117,10 @@ def estimate_paper(
         chunk_size=chunk_size,
     )
     rows = sharp.nonzero().squeeze(-1)
-    robust = partial(_fit_detmcd, config=config)
-    refined = fit_points(points, neighbors, robust, rows=rows, chunk_size=chunk_size)
-    return replace_rows(fit, rows, refined)._replace(sharp=sharp)
-
-
-def _fit_pca(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
-    return fit_normals_pca(patches, mask, resolution=resolution)
-
-
-def _fit_detmcd(
-    patches: Tensor, mask: Tensor | None, resolution: Tensor, *, config: NormalsConfig
-) -> NormalFit:
-    return fit_normals_detmcd(
-        patches,
-        mask,
+    robust = partial(
+        fit_normals_detmcd,
         support_fraction=config.support_fraction,
         quantile=config.inlier_quantile,
-        resolution=resolution,
     )
+    refined = fit_points(points, neighbors, robust, rows=rows, chunk_size=chunk_size)
+    return replace_rows(fit, rows, refined)._replace(sharp=sharp)

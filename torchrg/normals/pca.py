@@ -1,15 +1,15 @@
 """Least-squares planes: the classic estimator, and the last step of every robust one."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
-from torchrg.linalg import covariance, eigh3, rank_tolerance
+from torchrg.linalg import coordinate_resolution, covariance, eigh3, rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
-from torchrg.linalg.moments import coordinate_resolution
 from torchrg.structures import NormalFit
+
+_NARROW = 0.03
+"""Share of its length below which the width of a patch drowns in the rounding of a covariance."""
 
 
 def fit_normals_pca(
@@ -51,28 +51,13 @@ def fit_normals_pca(
         tensor([0., 0., 1.])
     """
     check_patches("fit_normals_pca", patches, mask, resolution)
-    fit, _ = fit_plane(patches, mask, resolution=resolution)
-    return fit
+    return fit_plane(patches, mask, resolution)[0]
 
 
 def fit_plane(
-    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
+    patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> tuple[NormalFit, PrincipalFrame]:
-    """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        Fit and frame.
-
-    Example:
-        >>> _, frame = fit_plane(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [2, 1, 0]]))
-        >>> frame.vectors[:, 2].abs()
-        tensor([1., 0., 0.])
-    """
+    """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
     _, matrix = covariance(patches, mask)
     frame = principal_frame(matrix)
     with torch.no_grad():
@@ -92,17 +77,7 @@ def fit_plane(
 def check_patches(
     caller: str, patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> None:
-    """Check the arguments of an estimator of patches.
-
-    Raises:
-        ShapeError: If a shape or dtype is wrong.
-
-    Example:
-        >>> check_patches("f", torch.zeros(8, 2), None, None)
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected patches of shape (*, K, 3), got (8, 2).
-    """
+    """Check the arguments of an estimator of patches; raise ShapeError if one is wrong."""
     check_shapes(caller, patches=(patches, "* K 3"), mask=(mask, "* K"))
     check_shapes(caller, patches=(patches[..., 0, 0], "*"), resolution=(resolution, "*"))
     check_floating(caller, patches=patches, resolution=resolution)
@@ -114,56 +89,30 @@ def _spans_plane(
     """Return whether the second direction of each patch is more than rounding.
 
     A covariance holds squares, so its own rounding hides widths below the root of its precision;
-    the few patches that narrow are looked at again. Which these are depends on the data: as an
-    operator of its own, neither compilers nor vmap see that.
+    the few patches that narrow are looked at again: all of them where nobody can tell which.
     """
-    spans: Tensor = torch.ops.torchrg.spans_plane(patches, mask, values, resolution)
-    return spans
-
-
-# ``torch.library.custom_op`` would do all of this, and load the compiler at the first call.
-torch.library.define(
-    "torchrg::spans_plane",
-    "(Tensor patches, Tensor? mask, Tensor values, Tensor? resolution) -> Tensor",
-)
-
-
-@torch.library.impl("torchrg::spans_plane", "CompositeExplicitAutograd")
-def _look_again_at_narrow(
-    patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None
-) -> Tensor:
     if resolution is None:
         resolution = patch_resolution(patches, mask)
     lengths, widths = (values[..., axis].clamp(min=0).sqrt() for axis in (2, 1))
-    narrow = widths < 0.03 * lengths
-    if bool(narrow.any()):
+    flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
+    narrow = widths < _NARROW * lengths
+    any_narrow = _any(narrow)
+    if any_narrow is None:
+        widths = torch.where(narrow, _width(patches, mask), widths)
+    elif any_narrow:
         widths = widths.double()
         widths[narrow] = _width(patches[narrow], None if mask is None else mask[narrow])
-    flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     return widths > flat
 
 
-@torch.library.register_fake("torchrg::spans_plane")  # type: ignore[untyped-decorator]
-def _(patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None) -> Tensor:
-    return patches.new_empty(patches.shape[:-2], dtype=torch.bool)
-
-
-@torch.library.register_vmap("torchrg::spans_plane")  # type: ignore[untyped-decorator]
-def _(
-    info: Any,  # noqa: ANN401
-    in_dims: tuple[int | None, ...],
-    *arguments: Tensor | None,
-) -> tuple[Tensor, int]:
-    batched = [
-        argument
-        if argument is None
-        else argument.expand(info.batch_size, *argument.shape)
-        if dim is None
-        else argument.movedim(dim, 0)
-        for argument, dim in zip(arguments, in_dims, strict=True)
-    ]
-    spans: Tensor = torch.ops.torchrg.spans_plane(*batched)
-    return spans, 0
+def _any(condition: Tensor) -> bool | None:
+    """Return whether a condition holds anywhere; None in a compiler and under vmap: no values."""
+    if torch.compiler.is_compiling():
+        return None
+    try:
+        return bool(condition.any())
+    except RuntimeError:  # vmap's answer; it has no public way to ask beforehand
+        return None
 
 
 def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
@@ -178,18 +127,6 @@ def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def patch_resolution(patches: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the rounding of coordinate differences in each patch.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold NaN.
-
-    Returns:
-        Shape ``(*)``, in the unit of the cloud.
-
-    Example:
-        >>> patch_resolution(torch.full((8, 3), 1000.0)) > 1e-4
-        tensor(True)
-    """
+    """Return the rounding of coordinate differences in each patch, shape ``(*)``."""
     counted = patches if mask is None else torch.where(mask[..., None], patches, 0.0)
     return coordinate_resolution(counted.detach().flatten(-2))

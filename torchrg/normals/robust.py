@@ -8,6 +8,53 @@ from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, fit_mv
 from torchrg.structures import NormalFit
 
 
+def fit_normals_detmcd(
+    patches: Tensor,
+    mask: Tensor | None = None,
+    *,
+    support_fraction: float = 0.5,
+    quantile: float = 0.975,
+    resolution: Tensor | None = None,
+) -> NormalFit:
+    """Fit a plane to the inliers of each patch's DetMCD [1], eq. (6) and Algorithm 1.
+
+    Points whose squared robust distance is at most the chi-square quantile are inliers; the normal,
+    curvature and residual are those of PCA on them. (The paper prints the cut as 3.075; that is the
+    root, 3.0575, of the quantile 9.3484 that its eq. (6) asks for.)
+
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all.
+        support_fraction: Share of the points that the robust fit trusts, in [0.5, 1].
+        quantile: Quantile of the chi-square distribution at which squared distances are cut.
+        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in the unit
+            of the cloud. Default: rounding of the patch's own coordinates.
+
+    Returns:
+        The fit. Where the trusted share of the points lies exactly on one plane it is that plane,
+        with curvature 0; where no unique plane exists ``valid`` is False.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+        ConfigError: If a setting is out of range.
+
+    References:
+        [1] M. Hubert, P. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location and
+        scatter. Journal of Computational and Graphical Statistics 21(3), 2012.
+
+    Example:
+        >>> floor = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
+        >>> floor[:, 2] *= torch.arange(40) > 29
+        >>> fit_normals_detmcd(floor).normals.abs()
+        tensor([0., 0., 1.])
+    """
+    check_patches("fit_normals_detmcd", patches, mask, resolution)
+    robust = fit_detmcd(
+        patches.detach(), mask, support_fraction=support_fraction, quantile=quantile
+    )
+    return _fit_inliers(patches, robust, resolution)
+
+
 def fit_normals_fastmcd(
     patches: Tensor,
     mask: Tensor | None = None,
@@ -18,26 +65,10 @@ def fit_normals_fastmcd(
     generator: torch.Generator | None = None,
     resolution: Tensor | None = None,
 ) -> NormalFit:
-    """Fit a plane to the inliers of each patch's MCD with random starts.
+    """Fit a plane to the inliers of each patch's MCD with random starts [1].
 
-    As :func:`torchrg.normals.fit_normals_detmcd`, with :func:`torchrg.robust.fit_fastmcd` [1].
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        support_fraction: Share of the points that the MCD fits, in [0.5, 1].
-        quantile: Quantile of the chi-square distribution at which squared distances are cut.
-        num_starts: Number of random sets of four points.
-        generator: Source of the random sets. Default: always the same sets.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit. Where h or more points lie exactly on one plane it is that plane, with curvature 0;
-        where no unique plane exists ``valid`` is False.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a setting is out of range.
+    As :func:`fit_normals_detmcd`, with :func:`torchrg.robust.fit_fastmcd`: ``num_starts`` sets of
+    four points are drawn by the ``generator``, always the same sets where there is none.
 
     References:
         [1] P. Rousseeuw, K. Van Driessen. A fast algorithm for the minimum covariance determinant
@@ -58,7 +89,7 @@ def fit_normals_fastmcd(
         num_starts=num_starts,
         generator=generator,
     )
-    return fit_inliers(patches, robust, resolution)
+    return _fit_inliers(patches, robust, resolution)
 
 
 def fit_normals_mve(
@@ -71,26 +102,10 @@ def fit_normals_mve(
     generator: torch.Generator | None = None,
     resolution: Tensor | None = None,
 ) -> NormalFit:
-    """Fit a plane to the inliers of each patch's minimum volume ellipsoid.
+    """Fit a plane to the inliers of each patch's minimum volume ellipsoid [1].
 
-    As :func:`torchrg.normals.fit_normals_detmcd`, with :func:`torchrg.robust.fit_mve` [1].
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        support_fraction: Share of the points that the ellipsoid covers, in [0.5, 1].
-        quantile: Quantile of the chi-square distribution at which squared distances are cut.
-        num_starts: Number of random sets of four points.
-        generator: Source of the random sets. Default: always the same sets.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit. Where h or more points lie exactly on one plane it is that plane, with curvature 0;
-        where no unique plane exists ``valid`` is False.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a setting is out of range.
+    As :func:`fit_normals_fastmcd`, with :func:`torchrg.robust.fit_mve`, whose ellipsoid covers the
+    ``support_fraction`` of the points.
 
     References:
         [1] P. Rousseeuw. Multivariate estimation with high breakdown point. Mathematical
@@ -111,7 +126,7 @@ def fit_normals_mve(
         num_starts=num_starts,
         generator=generator,
     )
-    return fit_inliers(patches, robust, resolution)
+    return _fit_inliers(patches, robust, resolution)
 
 
 def fit_normals_detmm(
@@ -123,21 +138,8 @@ def fit_normals_detmm(
 ) -> NormalFit:
     """Fit a plane to the inliers of each patch's deterministic MM-estimate [1].
 
-    As :func:`torchrg.normals.fit_normals_detmcd`, with :func:`torchrg.robust.fit_detmm`.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        quantile: Quantile of the chi-square distribution at which squared distances are cut.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit. Where more than half of the points lie exactly on one plane it is that plane, with
-        curvature 0; where no unique plane exists ``valid`` is False.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a setting is out of range.
+    As :func:`fit_normals_detmcd`, with :func:`torchrg.robust.fit_detmm`, which trusts half of the
+    points.
 
     References:
         [1] A. Khaloo, D. Lattanzi. Robust normal estimation and region growing segmentation of
@@ -151,70 +153,9 @@ def fit_normals_detmm(
     """
     check_patches("fit_normals_detmm", patches, mask, resolution)
     robust = fit_detmm(patches.detach(), mask, quantile=quantile)
-    return fit_inliers(patches, robust, resolution)
+    return _fit_inliers(patches, robust, resolution)
 
 
-def fit_inliers(patches: Tensor, robust: RobustFit, resolution: Tensor | None) -> NormalFit:
-    """Return the planes of PCA on the points that a robust fit keeps.
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        robust: Their robust fits.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit, not ``valid`` and zero where the robust fit is not valid.
-
-    Example:
-        >>> floor = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
-        >>> fit_inliers(floor, fit_detmm(floor), None).valid
-        tensor(True)
-    """
+def _fit_inliers(patches: Tensor, robust: RobustFit, resolution: Tensor | None) -> NormalFit:
+    """Return the planes of PCA on the points that robust fits keep; none where they are invalid."""
     return fit_normals_pca(patches, robust.support & robust.valid[..., None], resolution=resolution)
-
-
-def fit_normals_detmcd(
-    patches: Tensor,
-    mask: Tensor | None = None,
-    *,
-    support_fraction: float = 0.5,
-    quantile: float = 0.975,
-    resolution: Tensor | None = None,
-) -> NormalFit:
-    """Fit a plane to the inliers of each patch's DetMCD, eq. (6) and Algorithm 1.
-
-    Points whose squared robust distance is at most the chi-square quantile are inliers; the normal,
-    curvature and residual are those of PCA on them. (The paper prints the cut as 3.075; that is the
-    root, 3.0575, of the quantile 9.3484 that its eq. (6) asks for.)
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        support_fraction: Share of the points that the MCD fits, in [0.5, 1].
-        quantile: Quantile of the chi-square distribution at which distances are cut.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
-
-    Returns:
-        The fit. Where h or more points lie exactly on one plane it is that plane, with curvature 0;
-        where no unique plane exists ``valid`` is False.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a setting is out of range.
-
-    References:
-        [1] M. Hubert, P. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location and
-        scatter. Journal of Computational and Graphical Statistics 21(3), 2012.
-
-    Example:
-        >>> import torch
-        >>> floor = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
-        >>> floor[:, 2] *= (torch.arange(40) > 29)
-        >>> fit_normals_detmcd(floor).normals.abs()
-        tensor([0., 0., 1.])
-    """
-    check_patches("fit_normals_detmcd", patches, mask, resolution)
-    robust = fit_detmcd(
-        patches.detach(), mask, support_fraction=support_fraction, quantile=quantile
-    )
-    return fit_inliers(patches, robust, resolution)

@@ -1,66 +1,11 @@
 """Which neighbours may join a region: tests of single edges, each a function of tensors."""
 
-import math
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
-from torchrg.linalg import signs
 from torchrg.neighbors import gather_patches
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors
-
-
-def sq_chord_limit(max_angle_deg: float) -> float:
-    """Return the squared chord of the unit sphere that an angle spans.
-
-    Args:
-        max_angle_deg: Angle in [0, 180].
-
-    Returns:
-        ``(2 sin(a / 2))^2``.
-
-    Example:
-        >>> round(sq_chord_limit(60.0), 6)
-        1.0
-    """
-    return (2 * math.sin(math.radians(max_angle_deg) / 2)) ** 2
-
-
-def sq_chords(
-    normals: Sequence[Tensor], neighbor_normals: Sequence[Tensor], *, signed: bool = False
-) -> Tensor:
-    """Return the squared distance on the unit sphere between normals and those of the neighbours.
-
-    Built from ``+ - *`` alone, hence the same to the last bit in every chunk; and exact where the
-    normals are equal, so that an angle limit of 0 accepts them.
-
-    Args:
-        normals: Unit normals of the points, three components of shape ``(n, 1)``.
-        neighbor_normals: Unit normals of their neighbours, three components of shape ``(n, K)``.
-        signed: Whether opposite normals are far apart (in [0, 4]) or equal (in [0, 2]).
-
-    Returns:
-        Shape ``(n, K)``.
-
-    Example:
-        >>> a = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
-        >>> sq_chords(a, -a), sq_chords(a, -a, signed=True)
-        (tensor([[0.]]), tensor([[4.]]))
-    """
-    pairs = list(zip(normals, neighbor_normals, strict=True))
-    if signed:
-        first, second, third = (b - a for a, b in pairs)
-    else:
-        (a0, b0), (a1, b1), (a2, b2) = pairs
-        dot = a0 * b0 + a1 * b1 + a2 * b2
-        sign = signs(dot)
-        first, second, third = (b - a * sign for a, b in pairs)
-    result = first.mul_(first)
-    result += second.mul_(second)
-    result += third.mul_(third)
-    return result
 
 
 def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:

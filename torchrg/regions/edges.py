@@ -13,14 +13,13 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import chunks_of, places_of, run_chunks
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
+from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
 from torchrg.regions.criteria import (
     coplanarity_limits,
     neighborhood_radii,
     patch_radii,
     plane_residuals,
-    sq_chord_limit,
-    sq_chords,
 )
 from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.structures import Neighbors
@@ -388,7 +387,7 @@ def _within_angle(normals: Tensor, rows: slice, indices: Tensor, config: Growing
     own = [column[rows, None] for column in columns]
     theirs = [column.index_select(0, flat).view(indices.shape) for column in columns]
     chords = sq_chords(own, theirs, signed=config.signed_normals)
-    return chords <= sq_chord_limit(config.max_angle_deg)
+    return chords <= deg_to_sq_chord(config.max_angle_deg)
 
 
 def _sq_differences(values: Tensor, rows: slice, indices: Tensor) -> Tensor:

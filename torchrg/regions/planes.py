@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.linalg import eigh3_of_few
+from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.measures import covered_areas, fit_rectangles, trace_outline
@@ -81,7 +81,7 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     origin = segments.first(points).double()
     starts = segments.spread_columns(origin)
     local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
-    resolution = origin.abs().amax(dim=1) * (4 * torch.finfo(points.dtype).eps)
+    resolution = coordinate_resolution(segments.first(points)).double()
     weights = torch.ones_like(local[0])
     for last in range(_NUM_ROUNDS):
         mean = _means(segments, local, weights)
@@ -125,15 +125,7 @@ def _means(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor
 
 def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
     """Return weighted second moments about zero, shape ``(M, 3, 3)``."""
-    total = segments.sum(weights)
-    weighted = [column * weights for column in columns]
-    entry = {
-        (i, j): segments.sum(weighted[i] * columns[j]) / total
-        for i in range(3)
-        for j in range(i, 3)
-    }
-    rows = [torch.stack([entry[min(i, j), max(i, j)] for j in range(3)], 1) for i in range(3)]
-    return torch.stack(rows, dim=1)
+    return second_moments(columns, weights, segments.sum, segments.sum(weights))
 
 
 def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:

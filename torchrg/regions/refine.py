@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from torchrg.config import GrowingConfig
-from torchrg.linalg import eigh3_of_few
+from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
-from torchrg.regions.criteria import neighborhood_radii, sq_chord_limit, sq_chords
+from torchrg.regions.criteria import neighborhood_radii
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.planes import FittedPlanes, are_curved, fit_planes
 from torchrg.structures import UNLABELED, Neighbors
@@ -60,7 +60,7 @@ def absorb_points(
     normal, center, reach = planes
     labels = labels.clone()
     nearest, counted = contact_neighbors(neighbors)
-    limit = sq_chord_limit(max_angle_deg)
+    limit = deg_to_sq_chord(max_angle_deg)
     waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
     while len(waiting):
         near = labels[nearest[waiting]]

@@ -25,7 +25,6 @@ _MAX_CANDIDATES = 16
 _LANES = 1024
 """Patches looked at together: what they need fits the cache."""
 _MIN_EDGE = 0.01
-_ROUNDING = 8
 
 
 class Flats(NamedTuple):
@@ -38,21 +37,6 @@ class Flats(NamedTuple):
 
     dimension: Tensor
     members: Tensor
-
-
-def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
-    """Return how far from its plane rounding alone can move a point, shape ``(B,)``.
-
-    Args:
-        patches: The points as they were given, shape ``(B, K, P)``: their coordinates were
-            rounded where they are, however far from the origin.
-        extent: Largest coordinate of each patch about its own middle, shape ``(B,)``.
-
-    Returns:
-        A length in the unit of the points.
-    """
-    eps = torch.finfo(patches.dtype).eps
-    return eps * (2 * patches.abs().amax(dim=(1, 2)) + _ROUNDING * extent)
 
 
 def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:

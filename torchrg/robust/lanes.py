@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.linalg import at_most, eigh3
+from torchrg.linalg import at_most, eigh3, second_moments
 
 
 def split_columns(patches: Tensor) -> list[Tensor]:
@@ -184,12 +184,5 @@ def covariance_entries(
     columns: list[Tensor], means: list[Tensor], weights: Tensor, denominator: Tensor | float
 ) -> Tensor:
     """Weighted covariance about the means, shape ``(M, P, P)``."""
-    size = len(columns)
     centered = [column - mean for column, mean in zip(columns, means, strict=True)]
-    entries: dict[tuple[int, int], Tensor] = {}
-    for i in range(size):
-        weighted = weights * centered[i]
-        for j in range(i, size):
-            entries[i, j] = entries[j, i] = sum_points(weighted * centered[j]) / denominator
-    rows = [torch.stack([entries[i, j] for j in range(size)], dim=-1) for i in range(size)]
-    return torch.stack(rows, dim=-2)
+    return second_moments(centered, weights, sum_points, denominator)

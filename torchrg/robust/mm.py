@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
+from torchrg.linalg import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,
@@ -138,7 +139,7 @@ def reweight_shape(
     With ``adapt_scale`` the scale takes one step to the M-scale before each reweighting: solving
     for it fully can lead to another local minimum.
     """
-    eps = torch.finfo(scale.dtype).eps
+    eps = machine_epsilon(scale.dtype)
     enough = 16 * eps if scale.dtype == torch.float32 else 4096 * eps
     weights, scales = start.weights.clone(), scale.clone()
     places = torch.arange(len(scale), device=scale.device)
@@ -193,7 +194,7 @@ def volume(ellipsoid: Ellipsoid) -> Tensor:
 def m_scale(distances: Tensor, cutoff: float) -> Tensor:
     """Scale at which the mean loss of each lane's distances is half of its maximum."""
     scale = (median_points(distances) / chi2_quantile(0.5, 1)).sqrt()
-    scale = scale.clamp(min=torch.finfo(scale.dtype).tiny)
+    scale = scale.clamp(min=smallest_normal(scale.dtype))
     for _ in range(50):
         scale = _m_scale_step(distances, scale, cutoff)
     return scale

@@ -10,7 +10,8 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import chunks_of, run_chunks
 from torchrg.errors import ConfigError
-from torchrg.robust.exact import find_flats, flatness_tolerance, refine_flat
+from torchrg.linalg import flatness_tolerance, smallest_normal
+from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     covariance_entries,
     join_columns,
@@ -62,7 +63,7 @@ def to_lanes(patches: Tensor) -> tuple[list[Tensor], Frame, Tensor]:
 
 def _power_of_two(length: Tensor) -> Tensor:
     """The power of two that brings a length to between 1/2 and 1; a finite one for zero."""
-    length = length.clamp(min=4 * torch.finfo(length.dtype).tiny)
+    length = length.clamp(min=4 * smallest_normal(length.dtype))
     return torch.frexp(length).mantissa / length
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg.linalg import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
     eigenvectors,
@@ -99,7 +100,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     norms = sum_squares(columns)
     half = smallest_points(norms, -(-len(norms) // 2))
     lengths = norms.sqrt()
-    lengths = torch.where(lengths > torch.finfo(norms.dtype).eps, lengths, 1.0)
+    lengths = torch.where(lengths > machine_epsilon(norms.dtype), lengths, 1.0)
     ones = torch.ones_like(norms)
     zeros = [torch.zeros_like(norms[0]) for _ in columns]
     inner = [sum_points(half * column) / sum_points(half) for column in columns]

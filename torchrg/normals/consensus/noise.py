@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import each_block
-from torchrg.linalg import covariance
+from torchrg.linalg import coordinate_resolution, covariance
 from torchrg.linalg.moments import (
-    coordinate_resolution,
     fit_planes,
     residuals,
     split_columns,
@@ -106,9 +105,7 @@ def survey_noise(
             values[block] = part
 
     each_block(work, len(points), chunk_size, points.device)
-    floor = torch.maximum(
-        coordinate_resolution(points), radius * (4 * torch.finfo(points.dtype).eps)
-    )
+    floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
     noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors, _QUANTILE)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
