@@ -14,8 +14,7 @@ from torchrg.batch.records import reason_to_convert
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
-from torchrg.io import Cloud, write_cloud
-from torchrg.io.counts import estimate_points
+from torchrg.io import Cloud, estimate_points, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.transforms import DepthConfig, segment_depth
 

@@ -25,8 +25,7 @@ from torchrg.datasets.rgbd import RGBDFrames
 from torchrg.datasets.rgbd_layouts import RGBDFrame
 from torchrg.depth.camera import depth_to_points
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import read_cloud
-from torchrg.io.counts import estimate_points
+from torchrg.io import estimate_points, read_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud
 from torchrg.transforms import DepthConfig, segment_depth

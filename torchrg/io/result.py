@@ -14,15 +14,7 @@ from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
 
 def with_segmentation(cloud: Cloud, segmentation: Segmentation) -> Cloud:
-    """Return a cloud with ``labels``, ``normals`` and ``curvature`` of a segmentation.
-
-    Args:
-        cloud: The cloud that was segmented; its other fields stay, in front.
-        segmentation: Its segmentation.
-
-    Returns:
-        A new cloud.
-    """
+    """Return a cloud with ``labels``, ``normals`` and ``curvature`` behind its other fields."""
     found = ("labels", "normals", "curvature")
     kept = {name: values for name, values in cloud.fields.items() if name not in found}
     results = {name: _array(getattr(segmentation, name)) for name in found}
@@ -30,17 +22,11 @@ def with_segmentation(cloud: Cloud, segmentation: Segmentation) -> Cloud:
 
 
 def result_arrays(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a result file.
+    """Return the arrays of a result file by name, in the coordinates of the cloud itself.
 
-    Args:
-        cloud: The cloud that was segmented.
-        segmentation: Its segmentation, about the cloud's origin.
-
-    Returns:
-        The arrays by name. Coordinates, offsets, centroids, centers and outlines of planes are the
-        input's own. What the table of planes does not have is left out. Rings of outlines follow
-        each other in ``outline_points``; ``outline_ring_sizes`` and ``outline_ring_planes`` say how
-        long each is and to which plane it belongs.
+    What the table of planes does not have is left out. Rings of outlines follow each other in
+    ``outline_points``; ``outline_ring_sizes`` and ``outline_ring_planes`` say how long each is and
+    to which plane it belongs.
     """
     return {
         "points": cloud.coordinates,
