@@ -32,27 +32,7 @@ class Scene(NamedTuple):
     files: tuple[Path, ...]
 
 
-def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a key that sorts names with numbers as people do, without regard to the locale.
-
-    Example:
-        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=natural_key)
-        ['Chair_1.txt', 'chair_2.txt', 'chair_10.txt']
-    """
-    parts = re.split(r"([0-9]+)", name)
-    key: list[tuple[int, int | str]] = [
-        (0, int(part)) if part.isdigit() else (1, part.lower()) for part in parts if part
-    ]
-    # Names that differ in case or leading zeros only still have one order.
-    return (*key, (2, name))
-
-
-def listed(folder: str | os.PathLike[str]) -> list[Path]:
-    """Return the entries of a folder in natural order, hidden ones included."""
-    return sorted(Path(folder).iterdir(), key=lambda path: natural_key(path.name))
-
-
-FIELD_KEYS = {"normals": "normal"}
+_FIELD_KEYS = {"normals": "normal"}
 """Fields of a cloud that have another name in a sample."""
 
 
@@ -86,9 +66,12 @@ class FolderOfClouds(Dataset[Any]):
     ) -> None:
         self.root = Path(root)
         self.transform = transform
-        if not self.root.is_dir():
-            raise FormatError(f"{root}: no such folder; check the spelling.")
-        paths = list(_clouds(self.root, tuple(suffix.lower() for suffix in suffixes)))
+        known = {suffix.lower() for suffix in suffixes}
+        paths = [
+            path
+            for path in files_below(self.root, is_item=_is_scene)
+            if path.is_dir() or path.suffix.lower() in known
+        ]
         if not paths:
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
@@ -114,18 +97,9 @@ class FolderOfClouds(Dataset[Any]):
         return sample if self.transform is None else self.transform(sample)
 
 
-def _clouds(folder: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
-    """Yield the clouds below a folder; one that is a folder itself ends the descent."""
-    if (folder / "coord.npy").is_file():
-        yield folder
-        return
-    for path in listed(folder):
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            yield from _clouds(path, suffixes)
-        elif path.suffix.lower() in suffixes:
-            yield path
+def _is_scene(folder: Path) -> bool:
+    """Whether a folder is a cloud itself, in Pointcept's layout."""
+    return (folder / "coord.npy").is_file()
 
 
 def _files_of(path: Path) -> tuple[Path, ...]:
@@ -142,9 +116,55 @@ def _read(path: Path) -> dict[str, Tensor]:
         return read_pointcept_scene(path)
     cloud = read_cloud(path)
     fields = {
-        FIELD_KEYS.get(name, name): as_tensor(str(path), name, values)
+        _FIELD_KEYS.get(name, name): as_tensor(str(path), name, values)
         for name, values in cloud.fields.items()
         if values.dtype.kind in "fiub"
     }
     origin = torch.from_numpy(cloud.origin).reshape(1, 3)
     return {**fields, "coord": cloud.points, "origin": origin}
+
+
+def check_folder(folder: Path) -> None:
+    """Check that a folder is there."""
+    if not folder.is_dir():
+        raise FormatError(f"{folder}: no such folder; check the spelling.")
+
+
+def files_below(
+    folder: Path, *, is_item: Callable[[Path], bool] = lambda folder: False
+) -> Iterator[Path]:
+    """Yield the files below a folder in natural order, without hidden ones.
+
+    A folder that ``is_item`` itself is yielded in place of what is in it.
+    """
+    check_folder(folder)
+    if is_item(folder):
+        yield folder
+        return
+    for path in listed(folder):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            yield from files_below(path, is_item=is_item)
+        else:
+            yield path
+
+
+def listed(folder: str | os.PathLike[str]) -> list[Path]:
+    """Return the entries of a folder in natural order, hidden ones included."""
+    return sorted(Path(folder).iterdir(), key=lambda path: _natural_key(path.name))
+
+
+def _natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Return a key that sorts names with numbers as people do, without regard to the locale.
+
+    Example:
+        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=_natural_key)
+        ['Chair_1.txt', 'chair_2.txt', 'chair_10.txt']
+    """
+    parts = re.split(r"([0-9]+)", name)
+    key: list[tuple[int, int | str]] = [
+        (0, int(part)) if part.isdigit() else (1, part.lower()) for part in parts if part
+    ]
+    # Names that differ in case or leading zeros only still have one order.
+    return (*key, (2, name))

@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -97,7 +98,7 @@ class RGBDFrames(Dataset[Any]):
         if layout not in LAYOUTS:
             names = ", ".join(sorted(LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = LAYOUTS[layout](root, intrinsics=intrinsics, depth_scale=depth_scale)
+        frames = LAYOUTS[layout](Path(root), intrinsics, depth_scale)
         return cls(frames, transform=transform)
 
     def __len__(self) -> int:
