@@ -12,13 +12,7 @@ from torch.utils.data import Dataset
 
 from torchrg.datasets.folder import Scene, listed
 from torchrg.datasets.room_cache import USER_CACHE, read_cached_room
-from torchrg.datasets.rooms import (
-    ANNOTATIONS,
-    Room,
-    _object_files,
-    class_names,
-    read_room,
-)
+from torchrg.datasets.rooms import ANNOTATIONS, Room, class_names, object_files, read_room
 from torchrg.errors import ConfigError, FormatError
 
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
@@ -91,14 +85,7 @@ class S3DIS(Dataset[Any]):
         return sample if self.transform is None else self.transform(sample)
 
     def read_room(self, index: int) -> Room:
-        """Return the arrays of a room and the report of what was unusual about it.
-
-        Args:
-            index: Place in :attr:`scenes`.
-
-        Returns:
-            The room.
-        """
+        """Return the arrays of the room of a scene and the report of what was unusual about it."""
         scene = self.scenes[index]
         if self.cache is None:
             return read_room(scene.path, class_order=self.class_order)
@@ -124,4 +111,4 @@ def _scenes_of_area(root: Path, area: int) -> list[Scene]:
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}.",
             stacklevel=3,
         )
-    return [Scene(f"{folder.name}/{room.name}", room, _object_files(room)) for room in rooms]
+    return [Scene(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]
