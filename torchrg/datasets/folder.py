@@ -152,14 +152,14 @@ def files_below(
 
 def listed(folder: str | os.PathLike[str]) -> list[Path]:
     """Return the entries of a folder in natural order, hidden ones included."""
-    return sorted(Path(folder).iterdir(), key=lambda path: _natural_key(path.name))
+    return sorted(Path(folder).iterdir(), key=lambda path: natural_key(path.name))
 
 
-def _natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
+def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     """Return a key that sorts names with numbers as people do, without regard to the locale.
 
     Example:
-        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=_natural_key)
+        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=natural_key)
         ['Chair_1.txt', 'chair_2.txt', 'chair_10.txt']
     """
     parts = re.split(r"([0-9]+)", name)
