@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import torch
 
 from torchrg._optional import require
-from torchrg.batch.scans import Converted, Scan, check_finite, write_results
+from torchrg.batch.scans import Converted, Scan, Source, check_finite, write_results
 from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,
@@ -26,7 +26,7 @@ from torchrg.datasets import (
 )
 from torchrg.datasets.rgbd import RGBDFrames
 from torchrg.datasets.rgbd_layouts import RGBDFrame
-from torchrg.depth.camera import depth_to_points
+from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import estimate_points, read_cloud
 from torchrg.pipeline import segment_planes
@@ -69,8 +69,8 @@ class FolderSource:
         return self.out == self.root
 
     def describe(self) -> dict[str, Any]:
-        """Return kind and options."""
-        return {"kind": "folder", "superpoint": self.superpoint}
+        """Return the kind and what else decides results."""
+        return _options(self, "folder", "superpoint")
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
@@ -140,9 +140,8 @@ class S3DISSource:
     bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
-        """Return kind and options."""
-        options = {"class_order": self.class_order, "superpoint": self.superpoint}
-        return {"kind": "s3dis", **options}
+        """Return the kind and what else decides results."""
+        return _options(self, "s3dis", "class_order", "superpoint")
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -213,26 +212,18 @@ class RGBDSource:
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
-        """Return kind, shape of the folder and what was said about the camera."""
-        return {
-            "kind": "rgbd",
-            "layout": self.layout,
-            "intrinsics": None if self.intrinsics is None else list(self.intrinsics),
-            "depth_scale": self.depth_scale,
-        }
+        """Return the kind and what else decides results."""
+        return _options(self, "rgbd", "layout", "intrinsics", "depth_scale")
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
-        matrix = None
-        if self.intrinsics is not None:
-            fx, fy, cx, cy = self.intrinsics
-            matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-        frames = RGBDFrames.from_folder(
+        matrix = None if self.intrinsics is None else make_intrinsics(*self.intrinsics)
+        data = RGBDFrames.from_folder(
             self.root, self.layout, intrinsics=matrix, depth_scale=self.depth_scale
-        ).frames
+        )
         return [
             Scan(frame.name, (frame.depth, *frame.sources), _num_pixels(frame.depth), _plain(frame))
-            for frame in frames
+            for frame in data.frames
         ]
 
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
@@ -288,3 +279,8 @@ def _frame(values: dict[str, Any]) -> RGBDFrame:
         for name in ("intrinsics", "pose")
     }
     return RGBDFrame(**(values | matrices))
+
+
+def _options(source: Source, kind: str, *names: str) -> dict[str, Any]:
+    """Return what a source is and which of its options decide results."""
+    return {"kind": kind, **{name: getattr(source, name) for name in names}}
