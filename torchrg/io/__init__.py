@@ -45,15 +45,14 @@ class Format(NamedTuple):
     """How a kind of file is read and written; a new kind is a codec, a row of FORMATS, and a test.
 
     Attributes:
-        read: Reads a file. Raises FormatError if it is damaged or cannot hold a cloud, and
-            MissingDependencyError without the package that the format needs, as all of these do.
+        read: Reads a file of so many bytes, not 0. Raises FormatError if it is damaged.
         write: Writes a cloud. Raises FormatError if the format cannot hold it.
         count: Number of points by the header, from path, open file and size; an estimate where the
             header does not say. May raise anything of a damaged file.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
     """
 
-    read: Callable[[Path], Cloud]
+    read: Callable[[Path, int], Cloud]
     write: Callable[[Path, Cloud], None]
     count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
     check: Callable[[Path, Cloud | None], None] | None = None
@@ -103,11 +102,11 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """
     source = Path(path)
     try:
-        check_file(source)
+        size = check_file(source)
         found = _format_of(source)
         # Files may hold any bits as numbers: values that overflow or signal are kept, not reported.
         with np.errstate(over="ignore", invalid="ignore"):
-            return found.read(source)
+            return found.read(source, size)
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
 

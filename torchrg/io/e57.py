@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, narrow_integers
-from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
+from torchrg.io.files import DAMAGES, atomic_path, check_promise, refusing
 from torchrg.structures import Cloud
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -42,7 +42,7 @@ _Block = dict[str, NDArray[Any]]
 """Columns of a scan by name."""
 
 
-def read_e57(path: Path) -> Cloud:
+def read_e57(path: Path, size: int) -> Cloud:
     """Read all scans of an E57 file.
 
     Every scan is moved by its pose, and its normals with it. Points marked as invalid are kept as
@@ -50,7 +50,6 @@ def read_e57(path: Path) -> Cloud:
     lack is zero there.
     """
     pye57 = _pye57("read")
-    size = check_file(path)
     errors = (pye57.libe57.E57Exception, *DAMAGES)
     with (
         refusing(f"{path}: expected an E57 file, got: ", *errors, repair="; fetch it again"),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.fields import WIDEN, Spelling, are_whole, assemble_cloud, flatten_cloud
-from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, first_line, refusing
+from torchrg.io.files import DAMAGES, atomic_path, check_promise, first_line, refusing
 from torchrg.structures import Cloud
 
 _POINTS_AT_ONCE = 1 << 20
@@ -36,7 +36,7 @@ number of points of 64 bits that version 1.4 has beside the old one, which may b
 _DATE_AT, _DATE_BYTES = 90, 4
 
 
-def read_las(path: Path) -> Cloud:
+def read_las(path: Path, size: int) -> Cloud:
     """Read a LAS or LAZ file.
 
     The cloud is float64, with every extra dimension and every standard one that is not zero
@@ -44,7 +44,6 @@ def read_las(path: Path) -> Cloud:
     writing.
     """
     laspy = _laspy("read")
-    size = check_file(path)
     _check_header(path, size)
     message = f"{path}: expected a LAS or LAZ file, got: "
     damages = (laspy.errors.LaspyException, *DAMAGES)

@@ -40,9 +40,8 @@ _EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 
 
-def read_npy(path: Path) -> Cloud:
+def read_npy(path: Path, size: int) -> Cloud:
     """Read a ``.npy`` file."""
-    size = check_file(path)
     with path.open("rb") as stream:
         values = _read_array(path, stream, size, content="the array")
     if values.dtype.names is not None:
@@ -70,9 +69,8 @@ def count_npy(path: Path, stream: IO[bytes], size: int) -> int:
     return shape[0] if shape else 0
 
 
-def read_npz(path: Path) -> Cloud:
+def read_npz(path: Path, size: int) -> Cloud:
     """Read a ``.npz`` file."""
-    size = check_file(path)
     message = f"{path}: expected an archive of NumPy arrays, got: "
     with (
         refusing(message, *ARCHIVE_DAMAGES, repair="; fetch or write it again"),

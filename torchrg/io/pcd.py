@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, write_records
-from torchrg.io.files import check_file, check_promise
+from torchrg.io.files import check_promise
 from torchrg.io.text import read_ascii
 from torchrg.structures import Cloud
 
@@ -34,13 +34,12 @@ _LARGEST_LZF_RATIO = 88
 _Fields = dict[str, NDArray[Any]]
 
 
-def read_pcd(path: Path) -> Cloud:
+def read_pcd(path: Path, size: int) -> Cloud:
     """Read a PCD file.
 
     Packed colours become ``color``, and the fourth channel of ``rgba`` becomes ``alpha``. An
     organised cloud has its ``grid_shape``, and the viewpoint is kept for writing.
     """
-    size = check_file(path)
     with path.open("rb") as stream:
         header = _read_header(path, stream)
         read = {"ascii": _read_text, "binary": _read_binary}.get(header.encoding, _read_compressed)

@@ -20,7 +20,7 @@ from torchrg.io.fields import (
     narrow_integers,
     write_records,
 )
-from torchrg.io.files import check_file, check_promise
+from torchrg.io.files import check_promise
 from torchrg.io.text import read_ascii
 from torchrg.structures import Cloud
 
@@ -47,9 +47,8 @@ _LENGTH, _LIST = " length", " list"
 """What a list is called in records. Names in a PLY file have no spaces, so these meet none."""
 
 
-def read_ply(path: Path) -> Cloud:
+def read_ply(path: Path, size: int) -> Cloud:
     """Read every property of the element ``vertex``; other elements are left out."""
-    size = check_file(path)
     with path.open("rb") as stream:
         header = _read_header(path, stream)
         elements = [element for element in header.elements if element.properties]

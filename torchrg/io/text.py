@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, name_columns
-from torchrg.io.files import atomic_path, check_file, check_promise
+from torchrg.io.files import atomic_path, check_promise
 from torchrg.structures import Cloud
 
 LINES_AT_ONCE = 65_536
@@ -26,9 +26,8 @@ _COUNTED_BYTES = 1 << 16
 _COMMENTS = ("#", "//")
 
 
-def read_text(path: Path) -> Cloud:
+def read_text(path: Path, size: int) -> Cloud:
     """Read points as text, always in float64."""
-    check_file(path)
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         lines = iter(stream)
         opening = _read_opening(path, lines)
