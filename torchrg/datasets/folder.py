@@ -16,6 +16,9 @@ from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud
 
+_FIELD_KEYS = {"normals": "normal"}
+"""Fields of a cloud that have another name in a sample."""
+
 
 class Scene(NamedTuple):
     """One item of a data set, and what it is made from.
@@ -32,11 +35,29 @@ class Scene(NamedTuple):
     files: tuple[Path, ...]
 
 
-_FIELD_KEYS = {"normals": "normal"}
-"""Fields of a cloud that have another name in a sample."""
+class SceneDataset(Dataset[Any]):
+    """A map-style data set whose items are known before they are read.
+
+    A data set sets :attr:`scenes` and :attr:`transform`, and says how to read a sample.
+    """
+
+    scenes: list[Scene]
+    transform: Callable[[dict[str, Any]], Any] | None
+
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a scene."""
+        raise NotImplementedError
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
+        """Return a sample, transformed."""
+        sample = self.read_sample(index)
+        return sample if self.transform is None else self.transform(sample)
 
 
-class FolderOfClouds(Dataset[Any]):
+class FolderOfClouds(SceneDataset):
     """All readable clouds below a folder, in natural order; hidden files are passed over.
 
     A sample has ``coord`` ``(N, 3)`` float32 about ``origin`` ``(1, 3)`` float64, the fields of the
@@ -87,14 +108,10 @@ class FolderOfClouds(Dataset[Any]):
             for brief, name, path in zip(short, names, paths, strict=True)
         ]
 
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
-        """Return a sample, transformed."""
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a cloud."""
         scene = self.scenes[index]
-        sample: dict[str, Tensor | str] = {**_read(scene.path), "name": scene.name}
-        return sample if self.transform is None else self.transform(sample)
+        return {**_read(scene.path), "name": scene.name}
 
 
 def _is_scene(folder: Path) -> bool:

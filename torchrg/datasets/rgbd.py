@@ -8,15 +8,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from torchrg.datasets.folder import Scene
+from torchrg.datasets.folder import Scene, SceneDataset
 from torchrg.datasets.rgbd_files import read_color, read_depth
 from torchrg.datasets.rgbd_layouts import LAYOUTS, RGBDFrame
 from torchrg.errors import ConfigError
 
 
-class RGBDFrames(Dataset[Any]):
+class RGBDFrames(SceneDataset):
     """Depth frames, read when they are asked for.
 
     A sample has
@@ -101,11 +100,8 @@ class RGBDFrames(Dataset[Any]):
         frames = LAYOUTS[layout](Path(root), intrinsics, depth_scale)
         return cls(frames, transform=transform)
 
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
-        """Return a sample, transformed.
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a frame.
 
         Raises:
             FormatError: If a file is missing, damaged, or not a depth image.
@@ -121,4 +117,4 @@ class RGBDFrames(Dataset[Any]):
             sample["pose"] = frame.pose.to(torch.float64)
         if frame.color is not None:
             sample["color"] = read_color(frame.color)
-        return sample if self.transform is None else self.transform(sample)
+        return sample

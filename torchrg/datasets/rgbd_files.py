@@ -137,7 +137,7 @@ def _check_readable(source: Path) -> None:
 
 def read_matrix(path: Path) -> Tensor:
     """Read a matrix of four rows of four numbers, shape ``(4, 4)``, float64."""
-    rows = _rows(path)
+    rows = _words(path)
     if [len(row) for row in rows] != [4] * 4:
         raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)
@@ -145,9 +145,7 @@ def read_matrix(path: Path) -> Tensor:
 
 def read_timed(path: Path) -> tuple[list[float], list[str]]:
     """Read rows of a time and a file name; return times, ascending, and names."""
-    rows = _rows(path)
-    if not rows or any(len(row) != 2 for row in rows):
-        raise FormatError(f"{path}: expected a time and a file name in each row.")
+    rows = _rows(path, 2, "a time and a file name")
     times = [row[0] for row in _numbers(path, [[row[0]] for row in rows])]
     order = sorted(range(len(times)), key=times.__getitem__)
     return [times[i] for i in order], [rows[i][1] for i in order]
@@ -158,9 +156,7 @@ def read_trajectory(path: Path) -> tuple[list[float], Tensor]:
 
     Poses are matrices from camera to world, shape ``(n, 4, 4)``, float64.
     """
-    rows = _rows(path)
-    if not rows or any(len(row) != 8 for row in rows):
-        raise FormatError(f"{path}: expected time tx ty tz qx qy qz qw in each row.")
+    rows = _rows(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
     values = values[values[:, 0].argsort(stable=True)]
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
@@ -201,7 +197,15 @@ def _rotations(quaternions: Tensor) -> Tensor:
     return matrices
 
 
-def _rows(path: Path) -> list[list[str]]:
+def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
+    """Return the words of each row, which are so many."""
+    rows = _words(path)
+    if not rows or any(len(row) != num_words for row in rows):
+        raise FormatError(f"{path}: expected {what} in each row.")
+    return rows
+
+
+def _words(path: Path) -> list[list[str]]:
     """Return the words of each row; ``#`` begins a comment."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
