@@ -82,7 +82,8 @@ def test_quaternions_have_any_length_and_zero_is_no_rotation(tmp_path):
     quaternions = ["0 0 2 2", "0 0 0 0", "nan nan nan nan", "0.1 0.2 0.3 -0.4"]
     rows = [f"{time} 0.5 0.25 2 {words}\n" for time, words in enumerate(quaternions)]
     write_text(tmp_path / "track.txt", "".join(rows))
-    times, poses = read_trajectory(tmp_path / "track.txt")
+    times, matrices = read_trajectory(tmp_path / "track.txt")
+    poses = torch.stack(matrices)
     assert times == [0, 1, 2, 3]
     torch.testing.assert_close(poses[0], expected_pose(), rtol=0, atol=1e-15)
     assert poses[1:3, :3, :3].isnan().all()

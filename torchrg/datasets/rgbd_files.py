@@ -151,10 +151,10 @@ def read_timed(path: Path) -> tuple[list[float], list[str]]:
     return [times[i] for i in order], [rows[i][1] for i in order]
 
 
-def read_trajectory(path: Path) -> tuple[list[float], Tensor]:
+def read_trajectory(path: Path) -> tuple[list[float], list[Tensor]]:
     """Read rows of ``time tx ty tz qx qy qz qw``; return times, ascending, and poses.
 
-    Poses are matrices from camera to world, shape ``(n, 4, 4)``, float64.
+    Poses are matrices from camera to world, shape ``(4, 4)``, float64.
     """
     rows = _rows(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
@@ -162,7 +162,7 @@ def read_trajectory(path: Path) -> tuple[list[float], Tensor]:
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
     poses[:, :3, :3] = _rotations(values[:, 4:])
     poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0].tolist(), poses
+    return values[:, 0].tolist(), list(poses)
 
 
 def nearest_times(times: list[float], others: list[float]) -> list[int | None]:

@@ -4,9 +4,10 @@ A new shape is a function here that finds the frames of a folder, a row of :data
 among the choices of ``torchrg convert rgbd``, and a test.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -102,29 +103,32 @@ def _find_tum(root: Path, intrinsics: Tensor | None, depth_scale: float | None) 
     for name, folder in _recordings(root, "depth.txt"):
         camera = _tum_camera(folder) if intrinsics is None else intrinsics
         times, images = read_timed(folder / "depth.txt")
-        lists = [folder / file for file in ("rgb.txt", "groundtruth.txt")]
-        colors: list[int | None] = [None] * len(times)
-        poses: list[int | None] = [None] * len(times)
-        if lists[0].is_file():
-            color_times, color_files = read_timed(lists[0])
-            colors = nearest_times(times, color_times)
-        if lists[1].is_file():
-            pose_times, matrices = read_trajectory(lists[1])
-            poses = nearest_times(times, pose_times)
-        sources = tuple(path for path in (folder / "depth.txt", *lists) if path.is_file())
+        lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
+        colors = _nearest(times, lists[1], read_timed)
+        poses = _nearest(times, lists[2], read_trajectory)
         frames += [
             RGBDFrame(
                 folder / image,
                 camera,
                 depth_scale or _TUM_SCALE,
                 f"{name}/{Path(image).stem}",
-                None if color is None else folder / color_files[color],
-                None if pose is None else matrices[pose],
-                sources=sources,
+                None if color is None else folder / color,
+                pose,
+                sources=tuple(path for path in lists if path.is_file()),
             )
             for image, color, pose in zip(images, colors, poses, strict=True)
         ]
     return frames
+
+
+def _nearest(
+    times: list[float], path: Path, read: Callable[[Path], tuple[list[float], Sequence[Any]]]
+) -> list[Any]:
+    """Return what a list by time has nearest to each of some times, None where that is nothing."""
+    if not path.is_file():
+        return [None] * len(times)
+    others, values = read(path)
+    return [None if i is None else values[i] for i in nearest_times(times, others)]
 
 
 def _tum_camera(folder: Path) -> Tensor:
