@@ -14,6 +14,9 @@ from torchrg.batch.scans import Converted, Job
 from torchrg.config import NormalsConfig, PipelineConfig
 from torchrg.io import atomic_path
 
+RECORD = "provenance.json"
+"""Written last beside the results of a scan, so that a scan without it is not done."""
+
 
 def describe_run(source: Path, settings: PipelineConfig | NormalsConfig) -> dict[str, Any]:
     """Return what is needed to make a result of one file again, ready for JSON.
@@ -49,10 +52,6 @@ def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-RECORD = "provenance.json"
-"""Written last beside the results of a scan, so that a scan without it is not done."""
 
 
 def describe_job(job: Job) -> dict[str, Any]:

@@ -93,16 +93,10 @@ def count_pcd(path: Path, stream: BinaryIO, size: int) -> int:
 
 
 class _Header(NamedTuple):
-    """What a header says, and where the data begin.
+    """What a header says, and how long it is.
 
-    Attributes:
-        dtype: A point; padding fields are called ``_ 0``, ``_ 1`` and so on.
-        width: Points in a row.
-        height: Rows; 1 for a cloud without order.
-        viewpoint: Position and quaternion (w x y z) of the sensor.
-        encoding: One of ``ascii``, ``binary``, ``binary_compressed``.
-        num_lines: Lines of the header.
-        num_bytes: Bytes of the header.
+    A point has ``dtype``, whose padding fields are called ``_ 0``, ``_ 1`` and so on; a cloud
+    without order is one row of ``width`` points.
     """
 
     dtype: np.dtype[np.void]

@@ -108,10 +108,7 @@ def _storable(path: Path, name: str, column: NDArray[Any]) -> NDArray[Any]:
 class _Property(NamedTuple):
     """A property of an element: one number, or a list with its length before it.
 
-    Attributes:
-        name: Its name.
-        code: NumPy's code of its type, without byte order.
-        length_code: The same of a list's length; None for a single number.
+    Codes are NumPy's, without byte order; that of the length is None for a single number.
     """
 
     name: str
@@ -128,14 +125,7 @@ class _Element(NamedTuple):
 
 
 class _Header(NamedTuple):
-    """What a header says, and where the data begin.
-
-    Attributes:
-        byte_order: ``<`` or ``>``; empty for ASCII.
-        elements: The elements in the order of their data.
-        num_lines: Lines of the header.
-        num_bytes: Bytes of the header.
-    """
+    """What a header says, and how long it is; the byte order is empty for ASCII."""
 
     byte_order: str
     elements: list[_Element]

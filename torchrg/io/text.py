@@ -160,14 +160,9 @@ def _num_columns(dtype: np.dtype[Any]) -> int:
 
 
 class _Opening(NamedTuple):
-    """What the lines up to the first point say.
+    """What the lines up to the first point say, and that point's line, numbered from one.
 
-    Attributes:
-        names: Names of the columns, None without a header.
-        delimiter: What stands between two numbers, None for white space.
-        num_columns: Numbers in a line.
-        line: The line of the first point.
-        line_number: Its number, counted from one.
+    Names are None without a header, the delimiter is None for white space.
     """
 
     names: list[str] | None
