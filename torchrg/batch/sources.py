@@ -1,7 +1,7 @@
 """The kinds of data sets that are converted.
 
-A new kind is a :class:`~torchrg.batch.scans.Source` here, its arguments in ``torchrg.cli.convert``,
-and a test; a source of your own needs neither.
+A new kind is a :class:`~torchrg.batch.scans.Source` here with a row of :data:`SOURCES`, its
+arguments in ``torchrg.cli.convert``, and a test; a source of your own needs no row.
 """
 
 import struct
@@ -70,7 +70,7 @@ class FolderSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return _options(self, "folder", "superpoint")
+        return _options(self, "superpoint")
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
@@ -141,7 +141,7 @@ class S3DISSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return _options(self, "s3dis", "class_order", "superpoint")
+        return _options(self, "class_order", "superpoint")
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -213,7 +213,7 @@ class RGBDSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return _options(self, "rgbd", "layout", "intrinsics", "depth_scale")
+        return _options(self, "layout", "intrinsics", "depth_scale")
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
@@ -281,6 +281,15 @@ def _frame(values: dict[str, Any]) -> RGBDFrame:
     return RGBDFrame(**(values | matrices))
 
 
-def _options(source: Source, kind: str, *names: str) -> dict[str, Any]:
-    """Return what a source is and which of its options decide results."""
+SOURCES: dict[str, type[Source]] = {
+    "folder": FolderSource,
+    "s3dis": S3DISSource,
+    "rgbd": RGBDSource,
+}
+"""Sources by the kind that records and ``torchrg convert`` call them."""
+
+
+def _options(source: Source, *names: str) -> dict[str, Any]:
+    """Return the kind of a source and those of its options that decide results."""
+    kind = next(kind for kind, known in SOURCES.items() if isinstance(source, known))
     return {"kind": kind, **{name: getattr(source, name) for name in names}}
