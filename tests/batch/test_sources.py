@@ -3,6 +3,7 @@
 import json
 import resource
 import signal
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -11,15 +12,32 @@ import torch
 from torchrg.batch.convert import convert_scan
 from torchrg.batch.plan import list_jobs
 from torchrg.batch.records import reason_to_convert
-from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
+from torchrg.batch.sources import SOURCES, FolderSource, RGBDSource, S3DISSource, find_areas
+from torchrg.cli.convert import KINDS, RGBDArguments
 from torchrg.config import load_config
+from torchrg.datasets.rgbd_layouts import LAYOUTS
 from torchrg.errors import ConfigError
-from torchrg.io import Cloud, write_cloud
-from torchrg.io.counts import estimate_points
+from torchrg.io import Cloud, estimate_points, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.transforms import DepthConfig, segment_depth
 
 CLASSIC = load_config("classic")
+
+
+def test_the_command_knows_every_kind_and_layout(tmp_path):
+    assert KINDS.keys() == SOURCES.keys()
+    assert set(get_args(get_type_hints(RGBDArguments)["layout"])) == LAYOUTS.keys()
+    settings, camera = DepthConfig(), (5.0, 5.0, 2.0, 1.0)
+    assert RGBDSource(tmp_path, settings, "images", camera, 9.0).describe() == {
+        "kind": "rgbd",
+        "layout": "images",
+        "intrinsics": camera,
+        "depth_scale": 9.0,
+    }
+    options = {"kind": "s3dis", "class_order": "spt", "superpoint": True}
+    assert S3DISSource(tmp_path, CLASSIC, (5,), "spt", superpoint=True).describe() == options
+    options = {"kind": "folder", "superpoint": False}
+    assert FolderSource(tmp_path, CLASSIC, tmp_path).describe() == options
 
 
 def grid(step=0.05, side=20, height=0.0):

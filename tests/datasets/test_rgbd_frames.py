@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrg.datasets import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd_files import read_color, read_depth
+from torchrg.datasets.rgbd_files import read_color, read_depth, read_trajectory
 from torchrg.errors import ConfigError, FormatError, ShapeError
 from torchrg.render import write_png
 from torchrg.transforms import DepthToCloud
@@ -76,6 +76,23 @@ def test_tum_frames_are_matched_in_time(tum):
         assert "pose" not in second
     names = [path.name for path in data.scenes[0].files]
     assert names == ["1.0.png", "1.05.png", "depth.txt", "rgb.txt", "groundtruth.txt"]
+
+
+def test_quaternions_have_any_length_and_zero_is_no_rotation(tmp_path):
+    quaternions = ["0 0 2 2", "0 0 0 0", "nan nan nan nan", "0.1 0.2 0.3 -0.4"]
+    rows = [f"{time} 0.5 0.25 2 {words}\n" for time, words in enumerate(quaternions)]
+    write_text(tmp_path / "track.txt", "".join(rows))
+    times, matrices = read_trajectory(tmp_path / "track.txt")
+    poses = torch.stack(matrices)
+    assert times == [0, 1, 2, 3]
+    torch.testing.assert_close(poses[0], expected_pose(), rtol=0, atol=1e-15)
+    assert poses[1:3, :3, :3].isnan().all()
+    assert (poses[:, :3, 3] == torch.tensor([0.5, 0.25, 2]).double()).all()
+    turn = poses[3, :3, :3]
+    torch.testing.assert_close(turn @ turn.T, torch.eye(3).double(), rtol=0, atol=1e-15)
+    # x y z w = (1, 2, 3, -4) / sqrt(30), by the formula of Hamilton, in thirtieths.
+    expected = torch.tensor([[4.0, 28, -10], [-20, 10, 20], [22, 4, 20]]).double() / 30
+    torch.testing.assert_close(turn, expected, rtol=0, atol=1e-15)
 
 
 def test_the_camera_of_tum_is_not_guessed(tum):

@@ -84,6 +84,22 @@ def test_normals_turn_with_the_points(tmp_path):
     )
 
 
+def test_poses_go_back_and_forth_to_the_last_digits():
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    scan = Scan("a", (0.1, -0.2, 0.3, 0.4), (5.0, -6.0, 7.0))
+    there = scan.to_world(points)
+    np.testing.assert_allclose(scan.to_scan(there), points, rtol=0, atol=1e-14)
+    # w x y z of any length: the rotation of a quaternion is q p q*.
+    w, v = 0.1, np.array([-0.2, 0.3, 0.4])
+    turned = points * (w * w - v @ v) + 2 * np.outer(points @ v, v) + 2 * w * np.cross(v, points)
+    np.testing.assert_allclose(there, turned / (w * w + v @ v) + [5, -6, 7], rtol=0, atol=1e-14)
+
+
+def test_a_quaternion_of_zeros_turns_nothing():
+    scan = Scan("a", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0))
+    assert scan.to_world(np.eye(3)).tolist() == [[1, 0, 2], [0, 1, 2], [0, 0, 3]]
+
+
 def test_shuffled_scans_are_written_as_one(tmp_path, scans):
     cloud = read_cloud(scans[0])
     order = np.random.default_rng(0).permutation(40)

@@ -320,7 +320,7 @@ def test_missing_files_directories_and_empty_files_are_refused(tmp_path, kind):
 
 
 def test_unreadable_files_are_one_line(tmp_path, monkeypatch):
-    def refuse(path):
+    def refuse(path, size):
         raise PermissionError(13, "Permission denied")
 
     (tmp_path / "a.ply").write_bytes(b"ply")

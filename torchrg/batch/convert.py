@@ -7,7 +7,7 @@ import platform
 import time
 import traceback
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.batch.records import RECORD, describe_job, read_record, write_record
@@ -15,7 +15,7 @@ from torchrg.batch.scans import Job
 from torchrg.errors import TorchrgError
 from torchrg.io.files import remove_leftovers
 
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,9 @@ def convert_scan(job: Job) -> ScanReport:
 
     The record of an earlier run is removed first, and the new one written last: whoever finds a
     record finds complete files.
-
-    Args:
-        job: The scan and its settings.
-
-    Returns:
-        The report.
     """
-    clock = StageClock()
-    where = f"{platform.node()} ({os.getpid()})"
+    clock = _StageClock()
+    outcome: dict[str, Any]
     reset_peak_memory()
     try:
         clock.begin("hash")
@@ -80,42 +74,28 @@ def convert_scan(job: Job) -> ScanReport:
         for name in earlier["outputs"].keys() - set(converted.files):
             (job.folder / name).unlink(missing_ok=True)
         write_record(job, description, converted)
+        outcome = {"status": "converted", **converted._asdict()}
+        del outcome["files"]
     except Exception as error:  # noqa: BLE001 One scan must never end the others.
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
-        return ScanReport(
-            job.scan.name,
-            "failed",
-            seconds=clock.end(),
-            peak_memory=peak_memory(),
-            reason=_reason(error),
-            details="" if _is_foreseen(error) else traceback.format_exc(),
-            disk_full=_is_disk_full(error),
-            host=where,
-        )
+        outcome = {
+            "status": "failed",
+            "reason": _reason(error),
+            "details": "" if _is_foreseen(error) else traceback.format_exc(),
+            "disk_full": _is_disk_full(error),
+        }
     return ScanReport(
         job.scan.name,
-        "converted",
-        num_points=converted.num_points,
-        num_regions=converted.num_regions,
         seconds=clock.end(),
         peak_memory=peak_memory(),
-        repairs=converted.repairs,
-        warnings=converted.warnings,
-        host=where,
+        host=f"{platform.node()} ({os.getpid()})",
+        **outcome,
     )
 
 
-class StageClock:
-    """Seconds of each stage; one that begins ends the one before it.
-
-    Example:
-        >>> clock = StageClock()
-        >>> clock.begin("read")
-        >>> clock.begin("done")
-        >>> list(clock.end())
-        ['read']
-    """
+class _StageClock:
+    """Seconds of each stage; one that begins ends the one before it."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -159,7 +139,7 @@ def _is_out_of_memory(error: Exception) -> bool:
 def _is_disk_full(error: BaseException | None) -> bool:
     """Return whether an error, or what caused it, is a full disk."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in DISK_FULL:
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
             return True
         error = error.__cause__
     return False

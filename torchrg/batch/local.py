@@ -53,6 +53,12 @@ def run_local(
     lost: list[Job] = []
     idle: list[_Worker] = []
     busy: dict[Connection, _Worker] = {}
+
+    def start(job: Job, *, attempt: int) -> None:
+        worker = idle.pop() if idle else _Worker(work, lock)
+        busy[worker.pipe] = worker
+        worker.begin(job, attempt=attempt)
+
     try:
         while waiting or lost or busy:
             while len(busy) < workers:
@@ -61,13 +67,9 @@ def run_local(
                 if job is None:
                     break
                 waiting.remove(job)
-                worker = idle.pop() if idle else _Worker(work, lock)
-                busy[worker.pipe] = worker
-                worker.begin(job, attempt=1)
+                start(job, attempt=1)
             if not busy:
-                worker = idle.pop() if idle else _Worker(work, lock)
-                busy[worker.pipe] = worker
-                worker.begin(lost.pop(0), attempt=2)
+                start(lost.pop(0), attempt=2)
             ready = connection.wait(busy, timeout=BEAT_SECONDS)
             if not ready:
                 yield None

@@ -3,10 +3,16 @@
 import os
 from pathlib import Path
 
-BASE_BYTES = 500_000_000
+_BASE_BYTES = 500_000_000
 """What a worker takes before the first point: Python, torch, scipy."""
-BYTES_PER_POINT = 1_100
+_BYTES_PER_POINT = 1_100
 """What each point adds at the peak."""
+_CGROUP = Path("/sys/fs/cgroup")
+_CGROUP_FILES = (
+    ("memory.max", "memory.current"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+)
+"""Limit and use of a control group, of versions 2 and 1."""
 SHARE = 0.8
 """Part of the available memory that a batch may take when no limit is given."""
 
@@ -18,7 +24,7 @@ def memory_of_scan(num_points: int) -> int:
         >>> memory_of_scan(1_000_000)
         1600000000
     """
-    return BASE_BYTES + BYTES_PER_POINT * num_points
+    return _BASE_BYTES + _BYTES_PER_POINT * num_points
 
 
 def available_memory() -> int:
@@ -27,15 +33,9 @@ def available_memory() -> int:
     The smaller of what the machine has free and what a control group (a container) leaves.
     """
     free = [_machine_memory()]
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        (
-            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-            "/sys/fs/cgroup/memory/memory.usage_in_bytes",
-        ),
-    ):
+    for limit, used in _CGROUP_FILES:
         try:
-            free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
+            free.append(int((_CGROUP / limit).read_text()) - int((_CGROUP / used).read_text()))
         except (OSError, ValueError):
             continue  # No such group, or one without a limit, which is the word "max".
     return max(0, min(free))
@@ -44,9 +44,7 @@ def available_memory() -> int:
 def _machine_memory() -> int:
     """Return the machine's available memory, or all of it where only that is known."""
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        table = dict(line.split(":", 1) for line in lines)
-        return int(table["MemAvailable"].split()[0]) * 1024
+        return _read_entry("/proc/meminfo", "MemAvailable")
     except (OSError, KeyError, ValueError):
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
@@ -62,10 +60,15 @@ def reset_peak_memory() -> None:
 def peak_memory() -> int:
     """Return the largest resident memory of this process since the last reset, in bytes."""
     try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        table = dict(line.split(":", 1) for line in lines if ":" in line)
-        return int(table["VmHWM"].split()[0]) * 1024
+        return _read_entry("/proc/self/status", "VmHWM")
     except (OSError, KeyError, ValueError):
         import resource
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _read_entry(path: str, name: str) -> int:
+    """Return an entry, in kibibytes, of a table that Linux shows as a file, in bytes."""
+    lines = Path(path).read_text(encoding="ascii").splitlines()
+    table = dict(line.split(":", 1) for line in lines if ":" in line)
+    return int(table[name].split()[0]) * 1024

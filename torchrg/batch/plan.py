@@ -81,9 +81,6 @@ def make_plan(
         force: Whether to convert those that are done too.
         threads: Scans looked at at a time.
         on_scan: Called when one has been looked at.
-
-    Returns:
-        The plan.
     """
 
     def look(job: Job) -> str:
@@ -93,26 +90,22 @@ def make_plan(
 
     with ThreadPoolExecutor(threads) as pool:
         reasons = list(pool.map(look, jobs))
-    named = {
-        job.scan.name: reason for job, reason in zip(jobs, reasons, strict=True) if reason != ""
-    }
+    named = {job.scan.name: reason for job, reason in zip(jobs, reasons, strict=True) if reason}
     return Plan(tuple(jobs), named)
 
 
 def check_space(plan: Plan) -> None:
-    """Check that the disk has room for the results.
-
-    Args:
-        plan: The plan.
+    """Check that the disk has room for the results, by the estimates of the scans.
 
     Raises:
-        FormatError: If it has not, by the estimates of the scans.
+        FormatError: If it has not.
     """
     if not plan.to_convert:
         return
     source, out = plan.jobs[0].source, plan.jobs[0].out
     needed = source.bytes_per_point * sum(job.scan.num_points for job in plan.to_convert)
-    free = shutil.disk_usage(_existing(out)).free
+    existing = next(place for place in (out, *out.absolute().parents) if place.exists())
+    free = shutil.disk_usage(existing).free
     if needed > free:
         raise FormatError(
             f"{out}: expected about {needed / 1e6:,.1f} MB of free disk for "
@@ -124,8 +117,3 @@ def check_space(plan: Plan) -> None:
 def too_large(plan: Plan, limit: int) -> list[Job]:
     """Return the jobs that need more memory than a limit by themselves."""
     return [job for job in plan.to_convert if memory_of_scan(job.scan.num_points) > limit]
-
-
-def _existing(path: Path) -> Path:
-    """Return the path, or the nearest folder above it that is there."""
-    return next(place for place in (path, *path.absolute().parents) if place.exists())

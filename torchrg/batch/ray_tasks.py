@@ -9,9 +9,9 @@ from torchrg.batch.local import BEAT_SECONDS, ONE_THREAD, Work
 from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.scans import Job
 
-RETRIES = 3
+_RETRIES = 3
 """How often Ray tries a scan again whose process or node was lost."""
-OBJECT_STORE_BYTES = 100_000_000
+_OBJECT_STORE_BYTES = 100_000_000
 """Only jobs and reports pass through Ray's object store, never points."""
 
 
@@ -50,7 +50,7 @@ def run_ray(
         largest = max(
             int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]
         )
-        convert = ray.remote(num_cpus=1, max_retries=RETRIES)(_convert)
+        convert = ray.remote(num_cpus=1, max_retries=_RETRIES)(_convert)
         waiting = sorted(jobs, key=lambda job: job.scan.num_points)
         while waiting or pending:
             while waiting and (workers is None or len(pending) < workers):
@@ -70,20 +70,19 @@ def run_ray(
 
 def _connect(ray: Any, address: str | None, workers: int | None, memory_limit: int) -> None:  # noqa: ANN401
     """Connect to a cluster, or start one on this machine."""
-    options: dict[str, Any] = {
-        "logging_level": "error",
-        "log_to_driver": False,
-        "runtime_env": {"env_vars": ONE_THREAD},
+    started = {
+        "num_cpus": workers,
+        "_memory": memory_limit,
+        "object_store_memory": _OBJECT_STORE_BYTES,
+        "include_dashboard": False,
     }
-    if address is None:
-        options |= {
-            "address": "local",
-            "num_cpus": workers,
-            "_memory": memory_limit,
-            "object_store_memory": OBJECT_STORE_BYTES,
-            "include_dashboard": False,
-        }
-    ray.init(**({"address": address} | options))
+    ray.init(
+        address="local" if address is None else address,
+        logging_level="error",
+        log_to_driver=False,
+        runtime_env={"env_vars": ONE_THREAD},
+        **(started if address is None else {}),
+    )
 
 
 def _convert(work: Work, job: Job) -> ScanReport:

@@ -14,6 +14,9 @@ from torchrg.batch.scans import Converted, Job
 from torchrg.config import NormalsConfig, PipelineConfig
 from torchrg.io import atomic_path
 
+RECORD = "provenance.json"
+"""Written last beside the results of a scan, so that a scan without it is not done."""
+
 
 def describe_run(source: Path, settings: PipelineConfig | NormalsConfig) -> dict[str, Any]:
     """Return what is needed to make a result of one file again, ready for JSON.
@@ -34,12 +37,7 @@ def describe_run(source: Path, settings: PipelineConfig | NormalsConfig) -> dict
 
 
 def describe_versions() -> dict[str, str]:
-    """Return the versions of what decides a result.
-
-    Example:
-        >>> sorted(describe_versions())
-        ['numpy', 'scipy', 'torch', 'torchrg']
-    """
+    """Return the versions of what decides a result."""
     from torchrg import __version__
 
     return {
@@ -56,21 +54,11 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-RECORD = "provenance.json"
-"""Written last beside the results of a scan, so that a scan without it is not done."""
-
-
 def describe_job(job: Job) -> dict[str, Any]:
     """Return what decides the results of a job, ready for JSON.
 
-    Args:
-        job: The job.
-
-    Returns:
-        Versions, settings, source with its options, and name, size and SHA-256 of each input.
-
-    Raises:
-        OSError: If an input cannot be read.
+    Versions, settings, source with its options, and name, size and SHA-256 of each input; raises
+    OSError if one cannot be read.
     """
     settings = dataclasses.asdict(job.source.settings)
     # It never changes a result, and lowering it after running out of memory must cost nothing.
@@ -88,16 +76,7 @@ def describe_job(job: Job) -> dict[str, Any]:
 
 
 def write_record(job: Job, description: dict[str, Any], converted: Converted) -> None:
-    """Write the record of a scan whose files are complete.
-
-    Args:
-        job: The job.
-        description: Its description from before the work.
-        converted: What was written.
-
-    Raises:
-        FormatError: If the record cannot be written.
-    """
+    """Write the record of a scan whose files are complete, with its description before the work."""
     record = {
         **description,
         "points": converted.num_points,
@@ -122,12 +101,8 @@ def read_record(job: Job) -> dict[str, Any] | None:
 def reason_to_convert(job: Job) -> str:
     """Return why a scan is not done, or nothing if it is.
 
-    Args:
-        job: The job.
-
-    Returns:
-        ``"new"`` without a record; else which of input, settings, version or results is another
-        than the record says; empty if all agree.
+    ``"new"`` without a record; else which of input, settings, version or results is another than
+    the record says.
     """
     record = read_record(job)
     if record is None:

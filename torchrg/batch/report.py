@@ -10,7 +10,7 @@ from torchrg.batch.plan import Plan
 from torchrg.batch.records import describe_versions, read_record
 from torchrg.batch.scans import Job
 
-STAGES = ("hash", "read", "neighbors", "normals", "regions", "planes", "write", "record")
+_STAGES = ("hash", "read", "neighbors", "normals", "regions", "planes", "write", "record")
 """Stages in the order of the table; those of other sources follow."""
 MOST_ROWS = 300
 """A longer batch is not printed scan by scan."""
@@ -45,7 +45,9 @@ class BatchReport:
         for scan in self.with_status("converted"):
             for stage, seconds in scan.seconds.items():
                 total[stage] = total.get(stage, 0.0) + seconds
-        return dict(sorted(total.items(), key=lambda item: _place(item[0])))
+        return {
+            stage: total[stage] for stage in dict.fromkeys((*_STAGES, *total)) if stage in total
+        }
 
     @property
     def num_points(self) -> int:
@@ -55,9 +57,8 @@ class BatchReport:
     def to_json(self) -> dict[str, Any]:
         """Return the report as JSON can hold it."""
         points, stages = self.num_points, self.stage_seconds
-        began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started))
         return {
-            "started": began,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started)),
             "seconds": self.seconds,
             "engine": self.engine,
             "workers": self.workers,
@@ -94,11 +95,7 @@ def kept_report(job: Job) -> ScanReport:
 def format_report(report: BatchReport) -> str:
     """Return a report as text: a row for each scan, notes below, then the sums.
 
-    Args:
-        report: The report. With more than :data:`MOST_ROWS` scans, only failures have a row.
-
-    Returns:
-        The text, without a final newline.
+    With more than :data:`MOST_ROWS` scans, only failures have a row.
     """
     stages = list(report.stage_seconds)
     shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
@@ -126,10 +123,8 @@ def format_report(report: BatchReport) -> str:
         if scan.status != "failed"
     ]
     rate = report.num_points / report.seconds if report.seconds else 0.0
-    summary = (
-        f"{report.num_points:,} points in {report.seconds:,.1f} s: {rate:,.0f} points a second"
-    )
-    return "\n".join([format_table(head, rows), *notes, summary])
+    speed = f"{report.num_points:,} points in {report.seconds:,.1f} s: {rate:,.0f} points a second"
+    return "\n".join([format_table(head, rows), *notes, speed])
 
 
 def format_plan(plan: Plan) -> str:
@@ -177,8 +172,3 @@ def _row(scan: ScanReport, stages: Sequence[str]) -> list[str]:
         *(f"{scan.seconds[stage]:.1f}" if stage in scan.seconds else "" for stage in stages),
         f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else "",
     ]
-
-
-def _place(stage: str) -> int:
-    """Return the place of a stage in the table."""
-    return STAGES.index(stage) if stage in STAGES else len(STAGES)

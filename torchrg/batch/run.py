@@ -17,7 +17,11 @@ from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 
 REPORT = "report.json"
-
+"""Name of the report in the output directory."""
+LOCK = ".torchrg.lock"
+"""Name of the file that is locked. It stays when the lock goes."""
+_PATIENCE_SECONDS = 5.0
+"""How long a lock that is held is waited for: workers of a command that was killed end by then."""
 Reports = Generator[ScanReport | None, None, None]
 
 
@@ -54,9 +58,6 @@ def run_plan(
         engine: Its name, for the report.
         workers: Most scans at a time, for the report.
         on_report: Called with everything that the engine yields.
-
-    Returns:
-        The report and how the batch ended.
     """
     started, begin = time.time(), time.perf_counter()
     found = {job.scan.name: kept_report(job) for job in plan.done}
@@ -77,25 +78,14 @@ def run_plan(
         for job in plan.jobs
     ]
     seconds = time.perf_counter() - begin
-    return Ending(
-        BatchReport(tuple(scans), started, seconds, engine, workers), interrupted, disk_full
-    )
+    whole = BatchReport(tuple(scans), started, seconds, engine, workers)
+    return Ending(whole, interrupted, disk_full)
 
 
 def write_report(out: Path, report: BatchReport) -> None:
-    """Write ``report.json`` into the output directory.
-
-    Raises:
-        FormatError: If it cannot be written.
-    """
+    """Write ``report.json`` into the output directory; raise FormatError if it cannot be."""
     with atomic_path(out / REPORT) as beside:
         beside.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")
-
-
-LOCK = ".torchrg.lock"
-"""Name of the file that is locked. It stays when the lock goes."""
-PATIENCE_SECONDS = 5.0
-"""How long a lock that is held is waited for: workers of a command that was killed end by then."""
 
 
 class DirectoryLock:
@@ -120,7 +110,7 @@ class DirectoryLock:
         nobody else writes here
     """
 
-    def __init__(self, folder: Path, *, patience: float = PATIENCE_SECONDS) -> None:
+    def __init__(self, folder: Path, *, patience: float = _PATIENCE_SECONDS) -> None:
         import fcntl
 
         self.descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)

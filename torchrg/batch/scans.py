@@ -103,13 +103,9 @@ class Job:
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:
-    """Return a warning if some points of a cloud cannot be used.
-
-    Raises:
-        FormatError: If none can.
+    """Return a warning if some points of a cloud are not finite; raise FormatError if none is.
 
     Example:
-        >>> import numpy as np
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]])))
         ('1 of 2 points are not finite; they stay in place, unlabelled',)
     """
@@ -142,9 +138,6 @@ def write_results(
 
     Returns:
         Names of the files.
-
-    Raises:
-        FormatError: If one cannot be written.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,

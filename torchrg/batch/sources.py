@@ -1,4 +1,8 @@
-"""A folder of clouds as a source: one result folder for each cloud."""
+"""The kinds of data sets that are converted.
+
+A new kind is a :class:`~torchrg.batch.scans.Source` here with a row of :data:`SOURCES`, its
+arguments in ``torchrg.cli.convert``, and a test; a source of your own needs no row.
+"""
 
 import struct
 from collections.abc import Callable
@@ -6,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 
 from torchrg._optional import require
-from torchrg.batch.scans import Converted, Scan, check_finite, write_results
+from torchrg.batch.scans import Converted, Scan, Source, check_finite, write_results
 from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,
@@ -23,16 +26,17 @@ from torchrg.datasets import (
 )
 from torchrg.datasets.rgbd import RGBDFrames
 from torchrg.datasets.rgbd_layouts import RGBDFrame
-from torchrg.depth.camera import depth_to_points
+from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import read_cloud
-from torchrg.io.counts import estimate_points
+from torchrg.io import estimate_points, read_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud
 from torchrg.transforms import DepthConfig, segment_depth
 
-COPIED = ("coord", "color", "strength", "segment", "instance")
+_COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
+_PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
+"""Width and height of a PNG, and where they are."""
 
 
 @dataclass(frozen=True)
@@ -65,16 +69,11 @@ class FolderSource:
         return self.out == self.root
 
     def describe(self) -> dict[str, Any]:
-        """Return kind and options."""
-        return {"kind": "folder", "superpoint": self.superpoint}
+        """Return the kind and what else decides results."""
+        return _options(self, "superpoint")
 
     def list_scans(self) -> list[Scan]:
-        """Return the clouds in natural order.
-
-        Raises:
-            FormatError: If there is none.
-            ConfigError: If results would go in among clouds that are files.
-        """
+        """Return the clouds in natural order, if results do not go in among them."""
         scenes = FolderOfClouds(self.root).scenes
         file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
         if file is not None and self.in_place:
@@ -89,16 +88,12 @@ class FolderSource:
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
         # In place, nothing but the coordinates decides what is added.
-        used = COPIED if not self.in_place else ("coord",)
+        used = _COPIED if not self.in_place else ("coord",)
         files = tuple(file for file in scene.files if file.stem in used)
         return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
 
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one cloud.
-
-        Raises:
-            FormatError: If it cannot be read or has no finite point, or a result not be written.
-        """
+        """Read, segment and write one cloud."""
         begin("read")
         first = scan.inputs[0]
         is_file = first.parent.relative_to(self.root).as_posix() != scan.name
@@ -115,7 +110,7 @@ class FolderSource:
             colors = {name: cloud.fields[name] for name in ("color",) if name in cloud.fields}
             files = write_results(folder, cloud.coordinates, seg, fields=colors, origin=origin)
         else:
-            kept = {name: sample[name] for name in COPIED if name in sample}
+            kept = {name: sample[name] for name in _COPIED if name in sample}
             files = write_pointcept_scene(
                 folder, kept, seg, superpoint=self.superpoint, origin=origin
             )
@@ -145,47 +140,26 @@ class S3DISSource:
     bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
-        """Return kind and options."""
-        return {
-            "kind": "s3dis",
-            "class_order": self.class_order,
-            "superpoint": self.superpoint,
-        }
+        """Return the kind and what else decides results."""
+        return _options(self, "class_order", "superpoint")
 
     def list_scans(self) -> list[Scan]:
-        """Return the rooms in natural order.
-
-        Raises:
-            FormatError: If an area is missing, or a room has no objects.
-            MissingDependencyError: If what reads rooms is not installed.
-
-        Warns:
-            UserWarning: If an area has not as many rooms as the release.
-        """
+        """Return the rooms in natural order; warn if an area has not as many as the release."""
         require("pyarrow", extra="s3dis", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one room.
-
-        Raises:
-            FormatError: If it cannot be read, or a result not be written.
-        """
+        """Read, segment and write one room."""
         begin("read")
         room = read_room(self.root / scan.name, class_order=self.class_order)
         cloud = Cloud(room.coord, source=scan.name)
         notes = (*check_finite(cloud), *_notes(room.report))
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         begin("write")
-        sample = {
-            "coord": room.coord,
-            "color": room.color,
-            "segment": room.segment,
-            "instance": room.instance,
-        }
+        arrays, origin = room._asdict(), cloud.origin.tolist()
         files = write_pointcept_scene(
-            folder, sample, seg, superpoint=self.superpoint, origin=cloud.origin.tolist()
+            folder, arrays, seg, superpoint=self.superpoint, origin=origin
         )
         repairs = tuple(
             f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
@@ -210,10 +184,6 @@ def _notes(report: RoomReport) -> tuple[str, ...]:
     """Return what was passed over in a room, a line each."""
     skipped = [f"{item.file.name} not read: {item.reason}" for item in report.skipped]
     return (*skipped, *(f"{file.name} taken as clutter" for file in report.as_clutter))
-
-
-PNG_SIZE = struct.Struct(">II")
-PNG_SIZE_AT = 16
 
 
 @dataclass(frozen=True)
@@ -242,39 +212,22 @@ class RGBDSource:
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
-        """Return kind, shape of the folder and what was said about the camera."""
-        return {
-            "kind": "rgbd",
-            "layout": self.layout,
-            "intrinsics": None if self.intrinsics is None else list(self.intrinsics),
-            "depth_scale": self.depth_scale,
-        }
+        """Return the kind and what else decides results."""
+        return _options(self, "layout", "intrinsics", "depth_scale")
 
     def list_scans(self) -> list[Scan]:
-        """Return the frames in natural order.
-
-        Raises:
-            FormatError: If there is none, or a file that says where they are is damaged.
-            ConfigError: If the layout has no intrinsics or scale, and they are not given.
-        """
-        matrix = None
-        if self.intrinsics is not None:
-            fx, fy, cx, cy = self.intrinsics
-            matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-        frames = RGBDFrames.from_folder(
+        """Return the frames in natural order."""
+        matrix = None if self.intrinsics is None else make_intrinsics(*self.intrinsics)
+        data = RGBDFrames.from_folder(
             self.root, self.layout, intrinsics=matrix, depth_scale=self.depth_scale
-        ).frames
+        )
         return [
             Scan(frame.name, (frame.depth, *frame.sources), _num_pixels(frame.depth), _plain(frame))
-            for frame in frames
+            for frame in data.frames
         ]
 
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one frame.
-
-        Raises:
-            FormatError: If it cannot be read or has no depth, or a result not be written.
-        """
+        """Read, segment and write one frame."""
         begin("read")
         frame = _frame(scan.item)
         sample = RGBDFrames([frame])[0]
@@ -296,12 +249,15 @@ class RGBDSource:
 
 
 def _num_pixels(path: Path) -> int:
-    """Return the number of pixels of a depth image from its header, 0 if it is damaged."""
+    """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage."""
     if path.suffix.lower() != ".png":
-        return estimate_points(path) if path.stat().st_size == 0 else path.stat().st_size // 2
+        return path.stat().st_size // 2
     with path.open("rb") as stream:
-        head = stream.read(PNG_SIZE_AT + PNG_SIZE.size)
-    return int(np.prod(PNG_SIZE.unpack_from(head, PNG_SIZE_AT))) if len(head) == 24 else 0
+        head = stream.read(_PNG_SIZE_AT + _PNG_SIZE.size)
+    if len(head) < _PNG_SIZE_AT + _PNG_SIZE.size:
+        return 0
+    width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
+    return int(width * height)
 
 
 def _plain(frame: RGBDFrame) -> dict[str, Any]:
@@ -323,3 +279,17 @@ def _frame(values: dict[str, Any]) -> RGBDFrame:
         for name in ("intrinsics", "pose")
     }
     return RGBDFrame(**(values | matrices))
+
+
+SOURCES: dict[str, type[Source]] = {
+    "folder": FolderSource,
+    "s3dis": S3DISSource,
+    "rgbd": RGBDSource,
+}
+"""Sources by the kind that records and ``torchrg convert`` call them."""
+
+
+def _options(source: Source, *names: str) -> dict[str, Any]:
+    """Return the kind of a source and those of its options that decide results."""
+    kind = next(kind for kind, known in SOURCES.items() if isinstance(source, known))
+    return {"kind": kind, **{name: getattr(source, name) for name in names}}

@@ -18,6 +18,10 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
   poses, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any (:class:`RGBDFrame`).
 * ``describe_planes(planes, *, origin=None)`` is the content of ``planes.json``.
 * ``collate_offset(samples)`` joins samples into a ragged batch.
+
+A new data set is a :class:`~torchrg.datasets.folder.SceneDataset` in a file of its own, exported
+here, and a test; a new folder of depth frames is a row of
+:data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
 """
 
 from torchrg.datasets.collate import collate_offset

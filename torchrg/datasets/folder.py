@@ -16,6 +16,9 @@ from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud
 
+_FIELD_KEYS = {"normals": "normal"}
+"""Fields of a cloud that have another name in a sample."""
+
 
 class Scene(NamedTuple):
     """One item of a data set, and what it is made from.
@@ -32,31 +35,29 @@ class Scene(NamedTuple):
     files: tuple[Path, ...]
 
 
-def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a key that sorts names with numbers as people do, without regard to the locale.
+class SceneDataset(Dataset[Any]):
+    """A map-style data set whose items are known before they are read.
 
-    Example:
-        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=natural_key)
-        ['Chair_1.txt', 'chair_2.txt', 'chair_10.txt']
+    A data set sets :attr:`scenes` and :attr:`transform`, and says how to read a sample.
     """
-    parts = re.split(r"([0-9]+)", name)
-    key: list[tuple[int, int | str]] = [
-        (0, int(part)) if part.isdigit() else (1, part.lower()) for part in parts if part
-    ]
-    # Names that differ in case or leading zeros only still have one order.
-    return (*key, (2, name))
+
+    scenes: list[Scene]
+    transform: Callable[[dict[str, Any]], Any] | None
+
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a scene."""
+        raise NotImplementedError
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
+        """Return a sample, transformed."""
+        sample = self.read_sample(index)
+        return sample if self.transform is None else self.transform(sample)
 
 
-def listed(folder: str | os.PathLike[str]) -> list[Path]:
-    """Return the entries of a folder in natural order, hidden ones included."""
-    return sorted(Path(folder).iterdir(), key=lambda path: natural_key(path.name))
-
-
-FIELD_KEYS = {"normals": "normal"}
-"""Fields of a cloud that have another name in a sample."""
-
-
-class FolderOfClouds(Dataset[Any]):
+class FolderOfClouds(SceneDataset):
     """All readable clouds below a folder, in natural order; hidden files are passed over.
 
     A sample has ``coord`` ``(N, 3)`` float32 about ``origin`` ``(1, 3)`` float64, the fields of the
@@ -86,9 +87,12 @@ class FolderOfClouds(Dataset[Any]):
     ) -> None:
         self.root = Path(root)
         self.transform = transform
-        if not self.root.is_dir():
-            raise FormatError(f"{root}: no such folder; check the spelling.")
-        paths = list(_clouds(self.root, tuple(suffix.lower() for suffix in suffixes)))
+        known = {suffix.lower() for suffix in suffixes}
+        paths = [
+            path
+            for path in files_below(self.root, is_item=_is_scene)
+            if path.is_dir() or path.suffix.lower() in known
+        ]
         if not paths:
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
@@ -104,28 +108,15 @@ class FolderOfClouds(Dataset[Any]):
             for brief, name, path in zip(short, names, paths, strict=True)
         ]
 
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
-        """Return a sample, transformed."""
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a cloud."""
         scene = self.scenes[index]
-        sample: dict[str, Tensor | str] = {**_read(scene.path), "name": scene.name}
-        return sample if self.transform is None else self.transform(sample)
+        return {**_read(scene.path), "name": scene.name}
 
 
-def _clouds(folder: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
-    """Yield the clouds below a folder; one that is a folder itself ends the descent."""
-    if (folder / "coord.npy").is_file():
-        yield folder
-        return
-    for path in listed(folder):
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            yield from _clouds(path, suffixes)
-        elif path.suffix.lower() in suffixes:
-            yield path
+def _is_scene(folder: Path) -> bool:
+    """Whether a folder is a cloud itself, in Pointcept's layout."""
+    return (folder / "coord.npy").is_file()
 
 
 def _files_of(path: Path) -> tuple[Path, ...]:
@@ -142,9 +133,55 @@ def _read(path: Path) -> dict[str, Tensor]:
         return read_pointcept_scene(path)
     cloud = read_cloud(path)
     fields = {
-        FIELD_KEYS.get(name, name): as_tensor(str(path), name, values)
+        _FIELD_KEYS.get(name, name): as_tensor(str(path), name, values)
         for name, values in cloud.fields.items()
         if values.dtype.kind in "fiub"
     }
     origin = torch.from_numpy(cloud.origin).reshape(1, 3)
     return {**fields, "coord": cloud.points, "origin": origin}
+
+
+def check_folder(folder: Path) -> None:
+    """Check that a folder is there."""
+    if not folder.is_dir():
+        raise FormatError(f"{folder}: no such folder; check the spelling.")
+
+
+def files_below(
+    folder: Path, *, is_item: Callable[[Path], bool] = lambda folder: False
+) -> Iterator[Path]:
+    """Yield the files below a folder in natural order, without hidden ones.
+
+    A folder that ``is_item`` itself is yielded in place of what is in it.
+    """
+    check_folder(folder)
+    if is_item(folder):
+        yield folder
+        return
+    for path in listed(folder):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            yield from files_below(path, is_item=is_item)
+        else:
+            yield path
+
+
+def listed(folder: str | os.PathLike[str]) -> list[Path]:
+    """Return the entries of a folder in natural order, hidden ones included."""
+    return sorted(Path(folder).iterdir(), key=lambda path: natural_key(path.name))
+
+
+def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Return a key that sorts names with numbers as people do, without regard to the locale.
+
+    Example:
+        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=natural_key)
+        ['Chair_1.txt', 'chair_2.txt', 'chair_10.txt']
+    """
+    parts = re.split(r"([0-9]+)", name)
+    key: list[tuple[int, int | str]] = [
+        (0, int(part)) if part.isdigit() else (1, part.lower()) for part in parts if part
+    ]
+    # Names that differ in case or leading zeros only still have one order.
+    return (*key, (2, name))

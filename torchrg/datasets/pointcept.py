@@ -25,73 +25,13 @@ from torchrg.io import atomic_path
 from torchrg.io.npy import map_array
 from torchrg.structures import PLANE_KINDS, Planes, Segmentation
 
-
-def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
-    """Return a plane table as JSON can hold it.
-
-    Args:
-        planes: The table.
-        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
-            Default: they are the same.
-
-    Returns:
-        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and ``normal``,
-        ``offset`` (``normal . x = offset``), ``centroid``, ``area``, ``count``, ``rms``,
-        ``extent``, ``axes``, ``center``, ``curved``; ``kind`` and ``outline`` (rings of points)
-        where they are known.
-        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
-
-    Example:
-        >>> from torchrg.pipeline import segment_planes
-        >>> grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
-        >>> plane = describe_planes(segment_planes(grid).planes, origin=[0, 0, 5])["planes"][0]
-        >>> plane["count"], plane["normal"], plane["offset"]
-        (81, [0.0, 0.0, 1.0], 6.0)
-    """
-    shift = torch.as_tensor([0.0] * 3 if origin is None else origin, dtype=torch.float64)
-    normal = planes.normal.detach().cpu().double()
-    columns: dict[str, Any] = {
-        "id": torch.arange(len(normal)),
-        "normal": normal,
-        "offset": planes.offset.detach().cpu().double() + normal @ shift,
-        "centroid": planes.centroid.detach().cpu().double() + shift,
-        "area": planes.area,
-        "count": planes.count,
-        "rms": planes.rms,
-        "extent": planes.extent,
-        "axes": planes.axes,
-        "center": planes.center.detach().cpu().double() + shift,
-        "curved": planes.curved,
-    }
-    lists = {name: values.tolist() for name, values in columns.items()}
-    if planes.kind is not None:
-        lists["kind"] = [PLANE_KINDS[kind] for kind in planes.kind.tolist()]
-    if planes.outline is not None:
-        lists["outline"] = [
-            [(ring.detach().cpu().double() + shift).tolist() for ring in rings]
-            for rings in planes.outline
-        ]
-    table: dict[str, Any] = {"planes": _rows(lists)}
-    if planes.adjacency is not None:
-        pairs, lengths, angles = (part.tolist() for part in planes.adjacency)
-        table["adjacency"] = _rows(
-            {"pair": pairs, "boundary_length": lengths, "dihedral_deg": angles}
-        )
-    return table
-
-
-def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    """Turn a table of columns into a list of rows."""
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
 POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "instance",
     "superpoint", "plane", "curvature",
 )  # fmt: skip
 """Arrays of a scene folder that have a row for each point."""
-LABELS = ("segment", "instance", "superpoint", "plane")
-TABLE = "planes.json"
+_LABELS = ("segment", "instance", "superpoint", "plane")
+_TABLE = "planes.json"
 
 
 def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -117,7 +57,7 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
         _check_rows(paths[name], values, len(arrays["coord"]))
     sample = {name: as_tensor("scene", name, values) for name, values in arrays.items()}
     return {
-        name: values.reshape(-1).long() if name in LABELS else values
+        name: values.reshape(-1).long() if name in _LABELS else values
         for name, values in sample.items()
     }
 
@@ -169,12 +109,68 @@ def write_pointcept_scene(
     with ExitStack() as stack:
         # Files take their places in reverse: the claim on them first, the coordinates last.
         beside = [stack.enter_context(atomic_path(place / f"{name}.npy")) for name in new]
-        claim = stack.enter_context(atomic_path(place / TABLE))
+        claim = stack.enter_context(atomic_path(place / _TABLE))
         for name, path in zip(new, beside, strict=True):
             with path.open("wb") as stream:
                 npy_format.write_array(stream, arrays[name], allow_pickle=False)
         claim.write_text(json.dumps(table, indent=1), encoding="utf-8")
-    return [*(f"{name}.npy" for name in new), TABLE]
+    return [*(f"{name}.npy" for name in new), _TABLE]
+
+
+def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
+    """Return a plane table as JSON can hold it.
+
+    Args:
+        planes: The table.
+        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
+            Default: they are the same.
+
+    Returns:
+        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and ``normal``,
+        ``offset`` (``normal . x = offset``), ``centroid``, ``area``, ``count``, ``rms``,
+        ``extent``, ``axes``, ``center``, ``curved``; ``kind`` and ``outline`` (rings of points)
+        where they are known.
+        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
+
+    Example:
+        >>> from torchrg.pipeline import segment_planes
+        >>> grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
+        >>> plane = describe_planes(segment_planes(grid).planes, origin=[0, 0, 5])["planes"][0]
+        >>> plane["count"], plane["normal"], plane["offset"]
+        (81, [0.0, 0.0, 1.0], 6.0)
+    """
+    shift = torch.as_tensor([0.0] * 3 if origin is None else origin, dtype=torch.float64)
+
+    def exact(values: Tensor) -> Tensor:
+        return values.detach().cpu().double()
+
+    columns = {"id": torch.arange(len(planes.normal)), **planes._asdict()}
+    columns["offset"] = exact(planes.offset) + exact(planes.normal) @ shift
+    columns["centroid"] = exact(planes.centroid) + shift
+    columns["center"] = exact(planes.center) + shift
+    lists = {
+        name: columns[name].tolist()
+        for name in columns
+        if name not in ("kind", "outline", "adjacency")
+    }
+    if planes.kind is not None:
+        lists["kind"] = [PLANE_KINDS[kind] for kind in planes.kind.tolist()]
+    if planes.outline is not None:
+        lists["outline"] = [
+            [(exact(ring) + shift).tolist() for ring in rings] for rings in planes.outline
+        ]
+    table: dict[str, Any] = {"planes": _rows(lists)}
+    if planes.adjacency is not None:
+        pairs, lengths, angles = (part.tolist() for part in planes.adjacency)
+        table["adjacency"] = _rows(
+            {"pair": pairs, "boundary_length": lengths, "dihedral_deg": angles}
+        )
+    return table
+
+
+def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Turn a table of columns into a list of rows."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _arrays_of(
@@ -208,13 +204,13 @@ def _short(labels: NDArray[Any]) -> NDArray[Any]:
 def _owned(place: Path) -> set[str]:
     """Return the names of the arrays that torchrg wrote here."""
     try:
-        written = json.loads((place / TABLE).read_text(encoding="utf-8"))["written"]
+        written = json.loads((place / _TABLE).read_text(encoding="utf-8"))["written"]
         return set(written) & set(POINT_ARRAYS)
     except (FileNotFoundError, NotADirectoryError):
         return set()
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise FormatError(
-            f"{place / TABLE}: expected a table of planes that torchrg wrote, got another file; "
+            f"{place / _TABLE}: expected a table of planes that torchrg wrote, got another file; "
             "move it away."
         ) from error
 

@@ -3,19 +3,19 @@
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from torchrg.datasets.folder import Scene
+from torchrg.datasets.folder import Scene, SceneDataset
 from torchrg.datasets.rgbd_files import read_color, read_depth
 from torchrg.datasets.rgbd_layouts import LAYOUTS, RGBDFrame
 from torchrg.errors import ConfigError
 
 
-class RGBDFrames(Dataset[Any]):
+class RGBDFrames(SceneDataset):
     """Depth frames, read when they are asked for.
 
     A sample has
@@ -97,14 +97,11 @@ class RGBDFrames(Dataset[Any]):
         if layout not in LAYOUTS:
             names = ", ".join(sorted(LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = LAYOUTS[layout](root, intrinsics=intrinsics, depth_scale=depth_scale)
+        frames = LAYOUTS[layout](Path(root), intrinsics, depth_scale)
         return cls(frames, transform=transform)
 
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
-        """Return a sample, transformed.
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a frame.
 
         Raises:
             FormatError: If a file is missing, damaged, or not a depth image.
@@ -120,4 +117,4 @@ class RGBDFrames(Dataset[Any]):
             sample["pose"] = frame.pose.to(torch.float64)
         if frame.color is not None:
             sample["color"] = read_color(frame.color)
-        return sample if self.transform is None else self.transform(sample)
+        return sample

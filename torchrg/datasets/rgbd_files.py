@@ -3,6 +3,7 @@
 import os
 from bisect import bisect_left
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,8 @@ from torchrg.errors import ConfigError, FormatError
 
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
+_MOST_SECONDS = 0.02
+"""Images and poses further apart in time do not belong together."""
 
 
 def read_depth(
@@ -75,13 +78,8 @@ def read_color(path: str | os.PathLike[str]) -> Tensor:
             ...
         torchrg.errors.FormatError: missing.png: cannot be read: No such file or directory.
     """
-    from kornia_rs import io
-
-    source = _existing(Path(path))
-    try:
-        image = np.asarray(io.read_image(str(source)))
-    except Exception as error:
-        raise FormatError(f"{source}: expected a PNG or JPEG image, got {error}.") from error
+    source = Path(path)
+    image = _read_image(source, "PNG or JPEG")
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (1, 3, 4):
         raise FormatError(
             f"{source}: expected a colour image of 8 bits a channel, got shape {image.shape} and "
@@ -93,14 +91,7 @@ def read_color(path: str | os.PathLike[str]) -> Tensor:
 
 def _read_png16(source: Path) -> NDArray[np.uint16]:
     """Return the values of a gray PNG of 16 bits, shape ``(H, W)``."""
-    from kornia_rs import io
-
-    _existing(source)
-    try:
-        # Without a mode, the library says how many bits and channels there are.
-        image = np.asarray(io.read_image(str(source)))
-    except Exception as error:
-        raise FormatError(f"{source}: expected a PNG image, got {error}.") from error
+    image = _read_image(source, "PNG")
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 1:
         raise FormatError(
             f"{source}: expected a gray PNG of 16 bits, got shape {image.shape} and {image.dtype}; "
@@ -110,9 +101,21 @@ def _read_png16(source: Path) -> NDArray[np.uint16]:
     return values
 
 
+def _read_image(source: Path, kinds: str) -> NDArray[Any]:
+    """Return what an image holds, shape ``(H, W, C)``."""
+    from kornia_rs import io
+
+    _check_readable(source)
+    try:
+        # Without a mode, the library says how many bits and channels there are.
+        return np.asarray(io.read_image(str(source)))
+    except Exception as error:
+        raise FormatError(f"{source}: expected a {kinds} image, got {error}.") from error
+
+
 def _read_npy(source: Path) -> NDArray[np.number]:
     """Return the values of a ``.npy`` file, shape ``(H, W)``."""
-    _existing(source)
+    _check_readable(source)
     try:
         values: NDArray[np.number] = np.load(source, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
@@ -124,82 +127,42 @@ def _read_npy(source: Path) -> NDArray[np.number]:
     return values
 
 
-def _existing(source: Path) -> Path:
-    """Return a path to a file that can be opened.
-
-    Raises:
-        FormatError: If it cannot.
-    """
+def _check_readable(source: Path) -> None:
+    """Check that a file can be opened."""
     try:
-        with source.open("rb"):
-            return source
+        source.open("rb").close()
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror}.") from error
 
 
-MOST_SECONDS = 0.02
-"""Images and poses further apart in time do not belong together."""
-
-
 def read_matrix(path: Path) -> Tensor:
-    """Read a matrix of four rows of four numbers.
-
-    Args:
-        path: A text file.
-
-    Returns:
-        Shape ``(4, 4)``, float64.
-
-    Raises:
-        FormatError: If the file is missing or holds something else.
-    """
-    rows = _rows(path)
+    """Read a matrix of four rows of four numbers, shape ``(4, 4)``, float64."""
+    rows = _words(path)
     if [len(row) for row in rows] != [4] * 4:
         raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)
 
 
 def read_timed(path: Path) -> tuple[list[float], list[str]]:
-    """Read a list of times and file names.
-
-    Args:
-        path: A text file with a time and a name in each row; ``#`` begins a comment.
-
-    Returns:
-        Times, ascending, and names.
-
-    Raises:
-        FormatError: If the file is missing or holds something else.
-    """
-    rows = _rows(path)
-    if not rows or any(len(row) != 2 for row in rows):
-        raise FormatError(f"{path}: expected a time and a file name in each row.")
+    """Read rows of a time and a file name; return times, ascending, and names."""
+    rows = _rows(path, 2, "a time and a file name")
     times = [row[0] for row in _numbers(path, [[row[0]] for row in rows])]
     order = sorted(range(len(times)), key=times.__getitem__)
     return [times[i] for i in order], [rows[i][1] for i in order]
 
 
-def read_trajectory(path: Path) -> tuple[list[float], Tensor]:
-    """Read poses by time.
+def read_trajectory(path: Path) -> tuple[list[float], list[Tensor]]:
+    """Read rows of ``time tx ty tz qx qy qz qw``; return times, ascending, and poses.
 
-    Args:
-        path: A text file with ``time tx ty tz qx qy qz qw`` in each row; ``#`` begins a comment.
-
-    Returns:
-        Times, ascending, and matrices from camera to world, shape ``(n, 4, 4)``, float64.
-
-    Raises:
-        FormatError: If the file is missing or holds something else.
+    Poses are matrices from camera to world, shape ``(4, 4)``, float64.
     """
-    rows = _rows(path)
-    if not rows or any(len(row) != 8 for row in rows):
-        raise FormatError(f"{path}: expected time tx ty tz qx qy qz qw in each row.")
+    rows = _rows(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
     values = values[values[:, 0].argsort(stable=True)]
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
     poses[:, :3, :3] = _rotations(values[:, 4:])
     poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0].tolist(), poses
+    return values[:, 0].tolist(), list(poses)
 
 
 def nearest_times(times: list[float], others: list[float]) -> list[int | None]:
@@ -214,24 +177,36 @@ def nearest_times(times: list[float], others: list[float]) -> list[int | None]:
         place = bisect_left(others, time)
         around = [i for i in (place - 1, place) if 0 <= i < len(others)]
         best = min(around, key=lambda i: abs(others[i] - time), default=None)
-        near = best is not None and abs(others[best] - time) <= MOST_SECONDS
+        near = best is not None and abs(others[best] - time) <= _MOST_SECONDS
         found.append(best if near else None)
     return found
 
 
 def _rotations(quaternions: Tensor) -> Tensor:
-    """Return rotation matrices of quaternions x y z w of any length, shape ``(n, 3, 3)``."""
-    x, y, z, w = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(dim=1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    """Return rotation matrices of quaternions x y z w of any length, shape ``(n, 3, 3)``.
+
+    They are not numbers where the quaternion is zero or not, as after tracking that was lost.
+    """
+    from scipy.spatial.transform import Rotation
+
+    matrices = torch.full((len(quaternions), 3, 3), torch.nan, dtype=torch.float64)
+    known = quaternions.norm(dim=1) > 0
+    if known.any():
+        found = Rotation.from_quat(quaternions[known].numpy()).as_matrix()
+        matrices[known] = torch.from_numpy(found)
+    return matrices
 
 
-def _rows(path: Path) -> list[list[str]]:
-    """Return the words of each row that is not a comment."""
+def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
+    """Return the words of each row, which are so many."""
+    rows = _words(path)
+    if not rows or any(len(row) != num_words for row in rows):
+        raise FormatError(f"{path}: expected {what} in each row.")
+    return rows
+
+
+def _words(path: Path) -> list[list[str]]:
+    """Return the words of each row; ``#`` begins a comment."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:

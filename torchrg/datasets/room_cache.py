@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +15,11 @@ from torchrg.datasets.rooms import Repair, Room, RoomReport, Skipped, class_name
 from torchrg.errors import FormatError
 from torchrg.io.npy import map_array
 
-CACHE_VERSION = 1
-ARRAYS = ("coord", "color", "segment", "instance")
-STORED_ORDER = "pointcept"
 USER_CACHE = "~/.cache/torchrg"
+_VERSION = 1
+"""To be raised when the same files are read as other arrays."""
+_ARRAYS = ("coord", "color", "segment", "instance")
+_STORED_ORDER = "pointcept"
 
 
 def read_cached_room(scene: Scene, cache: Path, *, class_order: str = "pointcept") -> Room:
@@ -25,24 +27,15 @@ def read_cached_room(scene: Scene, cache: Path, *, class_order: str = "pointcept
 
     An entry counts as long as path, size and time of change of every input file are what they were
     and torchrg reads them the same way; a damaged entry is made again. Processes may share a cache.
-
-    Args:
-        scene: The room.
-        cache: Folder of the cache; it is made. Old entries are not removed.
-        class_order: See :func:`torchrg.datasets.read_room`.
-
-    Returns:
-        The room. Its arrays are mapped copy-on-write: changing them changes no file.
-
-    Raises:
-        FormatError: If the room cannot be read, or the cache not be written.
+    The cache is a folder that is made; old entries are not removed. Its arrays are mapped
+    copy-on-write: changing them changes no file.
     """
     entry = cache / "s3dis" / f"{scene.name.replace('/', '-')}-{_fingerprint(scene)}"
     room = _load(entry)
     if room is None:
-        room = _store(entry, read_room(scene.path, class_order=STORED_ORDER))
-    if class_order != STORED_ORDER:
-        stored, wanted = class_names(STORED_ORDER), class_names(class_order)
+        room = _store(entry, read_room(scene.path, class_order=_STORED_ORDER))
+    if class_order != _STORED_ORDER:
+        stored, wanted = class_names(_STORED_ORDER), class_names(class_order)
         table = np.array([wanted.index(name) for name in stored], room.segment.dtype)
         room = room._replace(segment=table[room.segment])
     return room
@@ -54,14 +47,14 @@ def _fingerprint(scene: Scene) -> str:
         (os.path.realpath(file), (status := file.stat()).st_size, status.st_mtime_ns)
         for file in scene.files
     ]
-    return hashlib.sha256(json.dumps([CACHE_VERSION, state]).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([_VERSION, state]).encode()).hexdigest()[:16]
 
 
 def _load(entry: Path) -> Room | None:
     """Return what an entry holds, None if it is not there or damaged."""
     try:
         report = json.loads((entry / "report.json").read_text(encoding="utf-8"))
-        coord, color, segment, instance = (map_array(entry / f"{name}.npy") for name in ARRAYS)
+        coord, color, segment, instance = (map_array(entry / f"{name}.npy") for name in _ARRAYS)
         return Room(coord, color, segment, instance, _report_of(report))
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -72,7 +65,7 @@ def _store(entry: Path, room: Room) -> Room:
     beside = entry.with_name(f".{entry.name}.{secrets.token_hex(4)}")
     try:
         beside.mkdir(parents=True)
-        for name in ARRAYS:
+        for name in _ARRAYS:
             np.save(beside / f"{name}.npy", getattr(room, name), allow_pickle=False)
         (beside / "report.json").write_text(json.dumps(_plain(room.report)), encoding="utf-8")
         if entry.exists() and _load(entry) is None:
@@ -93,29 +86,23 @@ def _store(entry: Path, room: Room) -> Room:
     return _load(entry) or room
 
 
-def _plain(report: RoomReport) -> dict[str, list[list[str | int]]]:
+def _plain(report: RoomReport) -> dict[str, Any]:
     """Return a report as JSON can hold it; latin-1 keeps every byte."""
     return {
         "repairs": [
-            [str(r.file), r.line, r.column, r.before.decode("latin-1"), r.after.decode("latin-1")]
-            for r in report.repairs
+            [str(file), line, column, before.decode("latin-1"), after.decode("latin-1")]
+            for file, line, column, before, after in report.repairs
         ],
         "skipped": [[str(file), reason] for file, reason in report.skipped],
         "as_clutter": [[str(file)] for file in report.as_clutter],
     }
 
 
-def _report_of(plain: dict[str, list[list[str]]]) -> RoomReport:
+def _report_of(plain: dict[str, Any]) -> RoomReport:
     """Return the report that JSON holds."""
     return RoomReport(
         tuple(
-            Repair(
-                Path(file),
-                int(line),
-                int(column),
-                before.encode("latin-1"),
-                after.encode("latin-1"),
-            )
+            Repair(Path(file), line, column, before.encode("latin-1"), after.encode("latin-1"))
             for file, line, column, before, after in plain["repairs"]
         ),
         tuple(Skipped(Path(file), reason) for file, reason in plain["skipped"]),

@@ -1,9 +1,9 @@
-r"""One annotated object of S3DIS: a text file with ``x y z r g b`` on each line.
+r"""The rooms of S3DIS as they are released: a folder of text files, one for each annotated object.
 
-The two releases hold six known broken bytes. In all of them a character lost its bit 0x20
-(``\x10`` for ``0``, ``\x00`` for a space), so setting that bit again repairs them exactly; a space
-in their place, as is often done, would make two numbers of one. Each repair is reported, and every
-other line that is not six numbers is an error.
+A file has ``x y z r g b`` on each line. The two releases hold six known broken bytes. In all of
+them a character lost its bit 0x20 (``\x10`` for ``0``, ``\x00`` for a space), so setting that bit
+again repairs them exactly; a space in their place, as is often done, would make two numbers of one.
+Each repair is reported, and every other line that is not six numbers is an error.
 """
 
 import filecmp
@@ -20,11 +20,27 @@ from torchrg.datasets.folder import listed
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import check_file
 
-COLUMNS = ("x", "y", "z", "red", "green", "blue")
-CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
-LOST_BIT = 0x20
-LARGEST = float(np.finfo(np.float32).max)
-NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+CLASS_ORDERS = {
+    "pointcept": (
+        "ceiling", "floor", "wall", "beam", "column", "window", "door",
+        "table", "chair", "sofa", "bookcase", "board", "clutter",
+    ),
+    "spt": (
+        "ceiling", "floor", "wall", "beam", "column", "window", "door",
+        "chair", "table", "bookcase", "sofa", "board", "clutter",
+    ),
+}  # fmt: skip
+"""Names of the classes by number: the order of Pointcept, MMDetection3D and PointNet, and that of
+Superpoint Transformer and KPConv."""
+_OTHER_CLASS = "clutter"
+ANNOTATIONS = "Annotations"
+_OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
+"""Names of the files of objects, and of their copies."""
+_COLUMNS = ("x", "y", "z", "red", "green", "blue")
+_CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
+_LOST_BIT = 0x20
+_LARGEST = float(np.finfo(np.float32).max)
+_NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 class Repair(NamedTuple):
@@ -43,160 +59,6 @@ class Repair(NamedTuple):
     column: int
     before: bytes
     after: bytes
-
-
-class Annotation(NamedTuple):
-    """The points of one object.
-
-    Attributes:
-        coord: Coordinates, shape ``(N, 3)``, float32.
-        color: Colours, shape ``(N, 3)``, uint8.
-        repairs: Bytes that were repaired.
-    """
-
-    coord: NDArray[np.float32]
-    color: NDArray[np.uint8]
-    repairs: tuple[Repair, ...]
-
-
-def read_annotation(path: Path) -> Annotation:
-    r"""Read the points of one object.
-
-    Convention:
-        Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
-        Colours may be written as ``106.000000`` and are rounded.
-
-    Args:
-        path: The text file.
-
-    Returns:
-        Points, colours and repairs, in the order of the file.
-
-    Raises:
-        FormatError: If the file is missing or empty, or a line is not six finite numbers with
-            colours in 0 to 255, once lost bits are set.
-        MissingDependencyError: If pyarrow is not installed.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "wall_1.txt"
-        ...     _ = path.write_bytes(b"1.5 2.5 \x13.5 10 20 30\n")
-        ...     wall = read_annotation(path)
-        >>> wall.coord.tolist(), wall.repairs[0].line, wall.repairs[0].column
-        ([[1.5, 2.5, 3.5]], 1, 9)
-    """
-    check_file(path)
-    original = path.read_bytes()
-    content, repairs = _repair(path, original)
-    table = _parse_fast(content)
-    if table is None or not _are_points(table):
-        table = _parse_lines(path, content, original)
-    coord = np.empty((len(table[0]), 3), np.float32)
-    color = np.empty((len(table[0]), 3), np.uint8)
-    for i in range(3):
-        coord[:, i] = table[i]
-        color[:, i] = np.rint(table[3 + i])
-    return Annotation(coord, color, repairs)
-
-
-def _repair(path: Path, original: bytes) -> tuple[bytes, tuple[Repair, ...]]:
-    """Set the lost bit of control bytes."""
-    if len(original.translate(None, CONTROL_BYTES)) == len(original):
-        return original, ()
-    table = bytes(byte | LOST_BIT if byte in CONTROL_BYTES else byte for byte in range(256))
-    content = original.translate(table)
-    places = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
-    ends = np.flatnonzero(np.frombuffer(original, np.uint8) == ord("\n"))
-    repairs = []
-    for place, line in zip(places.tolist(), np.searchsorted(ends, places).tolist(), strict=True):
-        begin = int(ends[line - 1]) + 1 if line else 0
-        end = int(ends[line]) if line < len(ends) else len(original)
-        before, after = (text[begin:end].rstrip(b"\r") for text in (original, content))
-        repairs.append(Repair(path, line + 1, place - begin + 1, before, after))
-    return content, tuple(repairs)
-
-
-def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
-    """Parse lines of six numbers between single spaces; None if they are not."""
-    # A lone CR would end a line here, and a minus that lost its bit is one.
-    if content.count(b"\r") != content.count(b"\r\n"):
-        return None
-    arrow = require("pyarrow", extra="s3dis", purpose="read S3DIS")
-    csv = require("pyarrow.csv", extra="s3dis", purpose="read S3DIS")
-    try:
-        table = csv.read_csv(
-            arrow.BufferReader(content),
-            csv.ReadOptions(column_names=COLUMNS, use_threads=torch.get_num_threads() > 1),
-            csv.ParseOptions(delimiter=" ", quote_char=False),
-            csv.ConvertOptions(
-                column_types=dict.fromkeys(COLUMNS, arrow.float64()),
-                null_values=[],
-                check_utf8=False,
-            ),
-        )
-    except arrow.ArrowInvalid:
-        return None
-    return [column.to_numpy() for column in table.columns] if table.num_rows else None
-
-
-def _are_points(table: list[NDArray[np.float64]]) -> bool:
-    """Whether columns hold coordinates that float32 holds, and colours that fit a byte."""
-    lows, highs = [-LARGEST] * 3 + [0.0] * 3, [LARGEST] * 3 + [255.0] * 3
-    return all(
-        bool(low <= np.rint(column.min()) and np.rint(column.max()) <= high)
-        for column, low, high in zip(table, lows, highs, strict=True)
-    )
-
-
-def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np.float64]]:
-    """Parse line by line, and name the first line that is not a point."""
-    rows: list[list[float]] = []
-    for number, line in enumerate(content.split(b"\n"), start=1):
-        text = line.removesuffix(b"\r")
-        words = text.split()
-        if not words:
-            continue
-        row = [float(word) for word in words if NUMBER.fullmatch(word)]
-        if len(words) != 6 or len(row) != 6 or b"\r" in text or not _is_point(row):
-            shown: Any = original.split(b"\n")[number - 1].removesuffix(b"\r")
-            shown = shown if len(shown) <= 80 else shown[:77] + b"..."
-            raise FormatError(
-                f"{path}: line {number}: expected x y z and colours in 0 to 255, six numbers, "
-                f"got {shown!r}; repair or delete this line in a copy."
-            )
-        rows.append(row)
-    if not rows:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
-    return list(np.array(rows).T)
-
-
-def _is_point(row: list[float]) -> bool:
-    """Whether six numbers are a point."""
-    return _are_points([np.array([value]) for value in row])
-
-
-CLASS_ORDERS = {
-    "pointcept": (
-        "ceiling", "floor", "wall", "beam", "column", "window", "door",
-        "table", "chair", "sofa", "bookcase", "board", "clutter",
-    ),
-    "spt": (
-        "ceiling", "floor", "wall", "beam", "column", "window", "door",
-        "chair", "table", "bookcase", "sofa", "board", "clutter",
-    ),
-}  # fmt: skip
-"""Names of the classes by number: the order of Pointcept, MMDetection3D and PointNet, and that of
-Superpoint Transformer and KPConv."""
-
-
-OTHER_CLASS = "clutter"
-
-
-ANNOTATIONS = "Annotations"
-
-
-_OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
 
 
 class Skipped(NamedTuple):
@@ -244,54 +106,6 @@ class Room(NamedTuple):
     report: RoomReport
 
 
-class RoomFiles(NamedTuple):
-    """What the ``Annotations`` folder of a room holds.
-
-    Attributes:
-        objects: Class and file of each object, in natural order.
-        skipped: What is no object.
-    """
-
-    objects: tuple[tuple[str, Path], ...]
-    skipped: tuple[Skipped, ...]
-
-
-def list_room(path: Path) -> RoomFiles:
-    """List the objects of a room without reading them.
-
-    Args:
-        path: Folder of the room, the one above ``Annotations``.
-
-    Returns:
-        Objects, and the entries that are not: hidden files, files that are not named
-        ``CLASS_NUMBER.txt``, and copies named ``CLASS_NUMBER (2).txt`` of a file that is there.
-
-    Raises:
-        FormatError: If there is no object.
-    """
-    folder = path / ANNOTATIONS
-    if not folder.is_dir():
-        raise FormatError(f"{path}: expected a folder {ANNOTATIONS}, got none; fetch it again.")
-    objects, skipped = [], []
-    for file in listed(folder):
-        match = _OBJECT.fullmatch(file.stem)
-        if file.name.startswith(".") or file.suffix != ".txt" or not match or file.is_dir():
-            skipped.append(Skipped(file, "not named CLASS_NUMBER.txt"))
-        elif match[3] and (original := folder / f"{match[1]}_{match[2]}.txt").is_file():
-            equal = filecmp.cmp(file, original, shallow=False)
-            reason = f"a copy of {original.name}" + (
-                "" if equal else " by its name, but it differs"
-            )
-            skipped.append(Skipped(file, reason))
-        else:
-            objects.append((match[1], file))
-    if not objects:
-        raise FormatError(
-            f"{folder}: expected objects as CLASS_NUMBER.txt, got none; fetch it again."
-        )
-    return RoomFiles(tuple(objects), tuple(skipped))
-
-
 def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
     """Read a room from the raw release; nothing is written.
 
@@ -308,9 +122,9 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
         MissingDependencyError: If pyarrow is not installed.
     """
     classes = class_names(class_order)
-    files = list_room(path)
-    parts = [read_annotation(file) for _, file in files.objects]
-    known = [name if name in classes else OTHER_CLASS for name, _ in files.objects]
+    objects, skipped = _list_room(path)
+    parts = [read_annotation(file) for _, file in objects]
+    known = [name if name in classes else _OTHER_CLASS for name, _ in objects]
     counts = [len(part.coord) for part in parts]
     dtype = np.int16 if len(parts) <= np.iinfo(np.int16).max else np.int32
     return Room(
@@ -320,23 +134,14 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
         np.repeat(np.arange(len(parts), dtype=dtype), counts),
         RoomReport(
             tuple(repair for part in parts for repair in part.repairs),
-            files.skipped,
-            tuple(file for name, file in files.objects if name not in classes),
+            tuple(skipped),
+            tuple(file for name, file in objects if name not in classes),
         ),
     )
 
 
 def class_names(class_order: str) -> tuple[str, ...]:
-    """Return the names of the classes in an order.
-
-    Args:
-        class_order: A key of :data:`CLASS_ORDERS`.
-
-    Returns:
-        13 names.
-
-    Raises:
-        ConfigError: If there is no such order.
+    """Return the names of the 13 classes in an order, a key of :data:`CLASS_ORDERS`.
 
     Example:
         >>> class_names("pointcept")[7], class_names("spt")[7]
@@ -350,9 +155,146 @@ def class_names(class_order: str) -> tuple[str, ...]:
     return CLASS_ORDERS[class_order]
 
 
-def _object_files(room: Path) -> tuple[Path, ...]:
+def object_files(room: Path) -> tuple[Path, ...]:
     """Return the files of a room's objects; none of a broken room, which fails when it is read."""
     try:
-        return tuple(file for _, file in list_room(room).objects)
+        return tuple(file for _, file in _list_room(room)[0])
     except FormatError:
         return ()
+
+
+def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[Skipped]]:
+    """Return class and file of each object of a room in natural order, and what is no object.
+
+    That is hidden files, files that are not named ``CLASS_NUMBER.txt``, and copies named
+    ``CLASS_NUMBER (2).txt`` of a file that is there.
+    """
+    folder = path / ANNOTATIONS
+    if not folder.is_dir():
+        raise FormatError(f"{path}: expected a folder {ANNOTATIONS}, got none; fetch it again.")
+    objects, skipped = [], []
+    for file in listed(folder):
+        match = _OBJECT.fullmatch(file.stem)
+        if file.name.startswith(".") or file.suffix != ".txt" or not match or file.is_dir():
+            skipped.append(Skipped(file, "not named CLASS_NUMBER.txt"))
+        elif match[3] and (original := folder / f"{match[1]}_{match[2]}.txt").is_file():
+            equal = filecmp.cmp(file, original, shallow=False)
+            but = "" if equal else " by its name, but it differs"
+            skipped.append(Skipped(file, f"a copy of {original.name}{but}"))
+        else:
+            objects.append((match[1], file))
+    if not objects:
+        raise FormatError(
+            f"{folder}: expected objects as CLASS_NUMBER.txt, got none; fetch it again."
+        )
+    return objects, skipped
+
+
+class _Annotation(NamedTuple):
+    """The points of one object: coordinates, colours, and bytes that were repaired."""
+
+    coord: NDArray[np.float32]
+    color: NDArray[np.uint8]
+    repairs: tuple[Repair, ...]
+
+
+def read_annotation(path: Path) -> _Annotation:
+    r"""Read the points of one object, in the order of the file.
+
+    Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
+    Colours may be written as ``106.000000`` and are rounded.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "wall_1.txt"
+        ...     _ = path.write_bytes(b"1.5 2.5 \x13.5 10 20 30\n")
+        ...     wall = read_annotation(path)
+        >>> wall.coord.tolist(), wall.repairs[0].line, wall.repairs[0].column
+        ([[1.5, 2.5, 3.5]], 1, 9)
+    """
+    check_file(path)
+    original = path.read_bytes()
+    content, repairs = _repair(path, original)
+    table = _parse_fast(content)
+    if table is None or not _are_points(table):
+        table = _parse_lines(path, content, original)
+    coord = np.stack([column.astype(np.float32) for column in table[:3]], axis=1)
+    color = np.stack([np.rint(column).astype(np.uint8) for column in table[3:]], axis=1)
+    return _Annotation(coord, color, repairs)
+
+
+def _repair(path: Path, original: bytes) -> tuple[bytes, tuple[Repair, ...]]:
+    """Set the lost bit of control bytes."""
+    if len(original.translate(None, _CONTROL_BYTES)) == len(original):
+        return original, ()
+    table = bytes(byte | _LOST_BIT if byte in _CONTROL_BYTES else byte for byte in range(256))
+    content = original.translate(table)
+    places = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
+    ends = np.flatnonzero(np.frombuffer(original, np.uint8) == ord("\n"))
+    repairs = []
+    for place, line in zip(places.tolist(), np.searchsorted(ends, places).tolist(), strict=True):
+        begin = int(ends[line - 1]) + 1 if line else 0
+        end = int(ends[line]) if line < len(ends) else len(original)
+        before, after = (text[begin:end].rstrip(b"\r") for text in (original, content))
+        repairs.append(Repair(path, line + 1, place - begin + 1, before, after))
+    return content, tuple(repairs)
+
+
+def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
+    """Parse lines of six numbers between single spaces; None if they are not."""
+    # A lone CR would end a line here, and a minus that lost its bit is one.
+    if content.count(b"\r") != content.count(b"\r\n"):
+        return None
+    arrow = require("pyarrow", extra="s3dis", purpose="read S3DIS")
+    csv = require("pyarrow.csv", extra="s3dis", purpose="read S3DIS")
+    try:
+        table = csv.read_csv(
+            arrow.BufferReader(content),
+            csv.ReadOptions(column_names=_COLUMNS, use_threads=torch.get_num_threads() > 1),
+            csv.ParseOptions(delimiter=" ", quote_char=False),
+            csv.ConvertOptions(
+                column_types=dict.fromkeys(_COLUMNS, arrow.float64()),
+                null_values=[],
+                check_utf8=False,
+            ),
+        )
+    except arrow.ArrowInvalid:
+        return None
+    return [column.to_numpy() for column in table.columns] if table.num_rows else None
+
+
+def _are_points(table: list[NDArray[np.float64]]) -> bool:
+    """Whether columns hold coordinates that float32 holds, and colours that fit a byte."""
+    lows, highs = [-_LARGEST] * 3 + [0.0] * 3, [_LARGEST] * 3 + [255.0] * 3
+    return all(
+        bool(low <= np.rint(column.min()) and np.rint(column.max()) <= high)
+        for column, low, high in zip(table, lows, highs, strict=True)
+    )
+
+
+def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np.float64]]:
+    """Parse line by line, and name the first line that is not a point."""
+    rows: list[list[float]] = []
+    for number, line in enumerate(content.split(b"\n"), start=1):
+        text = line.removesuffix(b"\r")
+        words = text.split()
+        if not words:
+            continue
+        row = [float(word) for word in words if _NUMBER.fullmatch(word)]
+        if (
+            len(words) != 6
+            or len(row) != 6
+            or b"\r" in text
+            or not _are_points([np.array([x]) for x in row])
+        ):
+            shown: Any = original.split(b"\n")[number - 1].removesuffix(b"\r")
+            shown = shown if len(shown) <= 80 else shown[:77] + b"..."
+            raise FormatError(
+                f"{path}: line {number}: expected x y z and colours in 0 to 255, six numbers, "
+                f"got {shown!r}; repair or delete this line in a copy."
+            )
+        rows.append(row)
+    if not rows:
+        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+    return list(np.array(rows).T)

@@ -7,25 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.utils.data import Dataset
 
-from torchrg.datasets.folder import Scene, listed
+from torchrg.datasets.folder import Scene, SceneDataset, listed
 from torchrg.datasets.room_cache import USER_CACHE, read_cached_room
-from torchrg.datasets.rooms import (
-    ANNOTATIONS,
-    Room,
-    _object_files,
-    class_names,
-    read_room,
-)
+from torchrg.datasets.rooms import ANNOTATIONS, Room, class_names, object_files, read_room
 from torchrg.errors import ConfigError, FormatError
 
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms of each area in the release, 272 in all."""
 
 
-class S3DIS(Dataset[Any]):
+class S3DIS(SceneDataset):
     """The rooms of S3DIS, read from ``ROOT/Area_i/<room>/Annotations/*.txt``, aligned or not.
 
     A sample has ``coord`` ``(N, 3)`` float32 in metres, ``color`` ``(N, 3)`` uint8, ``segment``
@@ -75,30 +67,19 @@ class S3DIS(Dataset[Any]):
         self.transform = transform
         self.scenes = [scene for area in areas for scene in _scenes_of_area(self.root, area)]
 
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
-        """Return a sample, transformed."""
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a room."""
         room = self.read_room(index)
-        sample: dict[str, Tensor | str] = {
+        return {
             "coord": torch.from_numpy(room.coord),
             "color": torch.from_numpy(room.color),
             "segment": torch.from_numpy(room.segment).long(),
             "instance": torch.from_numpy(room.instance).long(),
             "name": self.scenes[index].name,
         }
-        return sample if self.transform is None else self.transform(sample)
 
     def read_room(self, index: int) -> Room:
-        """Return the arrays of a room and the report of what was unusual about it.
-
-        Args:
-            index: Place in :attr:`scenes`.
-
-        Returns:
-            The room.
-        """
+        """Return the arrays of the room of a scene and the report of what was unusual about it."""
         scene = self.scenes[index]
         if self.cache is None:
             return read_room(scene.path, class_order=self.class_order)
@@ -124,4 +105,4 @@ def _scenes_of_area(root: Path, area: int) -> list[Scene]:
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}.",
             stacklevel=3,
         )
-    return [Scene(f"{folder.name}/{room.name}", room, _object_files(room)) for room in rooms]
+    return [Scene(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]

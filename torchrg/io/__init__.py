@@ -5,58 +5,71 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.e57 import check_e57, read_e57, write_e57
+from torchrg.io.e57 import check_e57, count_e57, read_e57, write_e57
 from torchrg.io.fields import checked_coordinates
 from torchrg.io.files import atomic_path, check_file, check_place
-from torchrg.io.las import check_las, read_las, write_las
+from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import (
+    ARCHIVE_DAMAGES,
     cloud_arrays,
+    count_npy,
+    count_npz,
     read_npy,
     read_npz,
     write_arrays,
     write_npy,
     write_npz,
 )
-from torchrg.io.pcd import read_pcd, write_pcd
-from torchrg.io.ply import read_ply, write_ply
+from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
+from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.result import check_segmentation, result_arrays, with_segmentation
-from torchrg.io.text import read_text, write_text
+from torchrg.io.text import count_text, read_text, write_text
 from torchrg.structures import Cloud, Segmentation
 
-__all__ = ["FORMATS", "atomic_path", "check_output", "read_cloud", "write_cloud"]
+__all__ = [
+    "FORMATS",
+    "atomic_path",
+    "check_output",
+    "estimate_points",
+    "read_cloud",
+    "write_cloud",
+]
 
 
 class Format(NamedTuple):
-    """How a kind of file is read and written.
+    """How a kind of file is read and written; a new kind is a codec, a row of FORMATS, and a test.
 
     Attributes:
-        read: Reads a file.
-        write: Writes a cloud.
+        read: Reads a file of so many bytes, not 0. Raises FormatError if it is damaged.
+        write: Writes a cloud. Raises FormatError if the format cannot hold it.
+        count: Number of points by the header, from path, open file and size; an estimate where the
+            header does not say. May raise anything of a damaged file.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
     """
 
-    read: Callable[[Path], Cloud]
+    read: Callable[[Path, int], Cloud]
     write: Callable[[Path, Cloud], None]
+    count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
     check: Callable[[Path, Cloud | None], None] | None = None
 
 
 FORMATS: dict[str, Format] = {
-    ".npz": Format(read_npz, write_npz),
-    ".npy": Format(read_npy, write_npy),
-    ".ply": Format(read_ply, write_ply),
-    ".pcd": Format(read_pcd, write_pcd),
-    ".las": Format(read_las, write_las, check_las),
-    ".laz": Format(read_las, write_las, check_las),
-    ".e57": Format(read_e57, write_e57, check_e57),
-    ".xyz": Format(read_text, write_text),
-    ".txt": Format(read_text, write_text),
+    ".npz": Format(read_npz, write_npz, count_npz),
+    ".npy": Format(read_npy, write_npy, count_npy),
+    ".ply": Format(read_ply, write_ply, count_ply),
+    ".pcd": Format(read_pcd, write_pcd, count_pcd),
+    ".las": Format(read_las, write_las, count_las, check_las),
+    ".laz": Format(read_las, write_las, count_las, check_las),
+    ".e57": Format(read_e57, write_e57, count_e57, check_e57),
+    ".xyz": Format(read_text, write_text, count_text),
+    ".txt": Format(read_text, write_text, count_text),
 }
-"""Reader and writer by suffix."""
+"""What is known of each format, by suffix."""
 
 
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
@@ -89,11 +102,11 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """
     source = Path(path)
     try:
-        check_file(source)
+        size = check_file(source)
         found = _format_of(source)
         # Files may hold any bits as numbers: values that overflow or signal are kept, not reported.
         with np.errstate(over="ignore", invalid="ignore"):
-            return found.read(source)
+            return found.read(source, size)
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
 
@@ -184,6 +197,31 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> No
     check_place(path)
     if found.check is not None:
         found.check(Path(path), cloud)
+
+
+def estimate_points(path: Path) -> int:
+    r"""Return the number of points that a file says it holds, without reading them.
+
+    Args:
+        path: A file.
+
+    Returns:
+        The number; for text, which has no header, and for E57 an estimate from the size; 0 for a
+        file that is damaged or of no known format, which reading will tell.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "corner.xyz"
+        ...     _ = path.write_text("0 0 0\n1 0 0\n0 1 0\n")
+        ...     estimate_points(path)
+        3
+    """
+    try:
+        with path.open("rb") as stream:
+            return _format_of(path).count(path, stream, path.stat().st_size)
+    except (OSError, FormatError, *ARCHIVE_DAMAGES):
+        return 0
 
 
 def _format_of(path: Path) -> Format:

@@ -10,7 +10,7 @@ import re
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,97 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, narrow_integers
-from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, first_line
+from torchrg.io.files import DAMAGES, atomic_path, check_promise, refusing
 from torchrg.structures import Cloud
 
-SHORTEST_QUATERNION = 1e-300
+_AXES = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_STATE = "cartesianInvalidState"
+_STATES = (_STATE, "sphericalInvalidState")
+_COLOR = ("colorRed", "colorGreen", "colorBlue")
+_CHANNELS = dict(zip(_COLOR, ("red", "green", "blue"), strict=True))
+_NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
+_SPELLING = Spelling(normals=_NORMALS, color=_COLOR)
+_PLAIN = ("intensity", "rowIndex", "columnIndex", "returnIndex", "returnCount")
+_STANDARD = {*_NORMALS, *_COLOR, *_PLAIN}
+"""Names that the standard knows; others go into an extension."""
+_EXTENSIONS = {
+    "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
+    "torchrg": "urn:torchrg:point-fields",
+}
+_BYTES_PER_POINT = 12
+"""A guess: three coordinates of 32 bits. The header is XML somewhere in the file."""
+_Block = dict[str, NDArray[Any]]
+"""Columns of a scan by name."""
+
+
+def read_e57(path: Path, size: int) -> Cloud:
+    """Read all scans of an E57 file.
+
+    Every scan is moved by its pose, and its normals with it. Points marked as invalid are kept as
+    not-a-number. Of several scans, ``scan`` is the number of each point's; a field that some scans
+    lack is zero there.
+    """
+    pye57 = _pye57("read")
+    errors = (pye57.libe57.E57Exception, *DAMAGES)
+    with (
+        refusing(f"{path}: expected an E57 file, got: ", *errors, repair="; fetch it again"),
+        pye57.E57(str(path)) as file,
+    ):
+        headers = [file.get_header(i) for i in range(file.scan_count)]
+        num_points = sum(header.point_count for header in headers)
+        # Coordinates that differ at all take a bit.
+        check_promise(
+            path, 0, num_points // 8, f"{num_points:,} points", available=size, at_least=True
+        )
+        scans = tuple(_scan_of(header) for header in headers)
+        blocks = [
+            _to_world(path, _read_points(pye57, file, header), scan)
+            for header, scan in zip(headers, scans, strict=True)
+        ]
+    if not blocks:
+        raise FormatError(f"{path}: expected at least one scan, got none; fetch the file again.")
+    return assemble_cloud(path, _joined(blocks), header={"scans": scans})
+
+
+def check_e57(path: Path, cloud: Cloud | None) -> None:
+    """Check that pye57 is installed; E57 holds any cloud."""
+    _pye57("write")
+
+
+def write_e57(path: Path, cloud: Cloud) -> None:
+    """Write an E57 file; points that are not finite are marked as invalid.
+
+    If the cloud came from an E57 file, its scans are written with their poses, otherwise one is.
+    """
+    pye57 = _pye57("write")
+    stored = cloud.header.get("scans", ())
+    columns = flatten_cloud(path, cloud, _SPELLING)
+    for name, column in columns.items():
+        columns[name] = column = narrow_integers(column, ("i8",))
+        if column.dtype == np.uint64:
+            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
+    errors = (pye57.libe57.E57Exception, ValueError, RuntimeError)
+    with (
+        refusing(f"{path}: cannot be written: ", *errors),
+        atomic_path(path) as beside,
+        pye57.E57(str(beside), "w") as file,
+    ):
+        for prefix, uri in _EXTENSIONS.items():
+            file.image_file.extensionsAdd(prefix, uri)
+        for scan, rows in _groups(columns, stored):
+            block = {name: column[rows] for name, column in columns.items()}
+            _write_points(pye57.libe57, file, scan, _to_scan(block, scan))
+
+
+def count_e57(path: Path, stream: BinaryIO, size: int) -> int:
+    """Return about the number of points, by the size of the file."""
+    return size // _BYTES_PER_POINT
+
+
+def _pye57(verb: str) -> Any:  # noqa: ANN401
+    """Return the module."""
+    return require("pye57", extra="e57", purpose=f"{verb} E57 files")
 
 
 class Scan(NamedTuple):
@@ -29,7 +116,7 @@ class Scan(NamedTuple):
 
     Attributes:
         name: Its name.
-        rotation: Quaternion w x y z.
+        rotation: Quaternion w x y z of any length; zero turns nothing.
         translation: What is added after the rotation.
 
     Example:
@@ -50,71 +137,41 @@ class Scan(NamedTuple):
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The rotation as a matrix, shape ``(3, 3)``."""
-        length = max(float(np.linalg.norm(self.rotation)), SHORTEST_QUATERNION)
-        w, x, y, z = np.array(self.rotation) / length
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        from scipy.spatial.transform import Rotation
+
+        w, x, y, z = self.rotation if any(self.rotation) else Scan().rotation
+        matrix: NDArray[np.float64] = Rotation.from_quat([x, y, z, w]).as_matrix()
+        return matrix
 
     def to_world(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the scan to the world, shape ``(N, 3)``."""
-        if not self.is_moved:
-            return points
-        moved: NDArray[np.float64] = points.astype(np.float64) @ self.matrix.T
-        moved += np.array(self.translation)
-        return moved
+        return points @ self.matrix.T + np.array(self.translation) if self.is_moved else points
 
     def to_scan(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the world to the scan, shape ``(N, 3)``."""
-        if not self.is_moved:
-            return points
-        moved: NDArray[np.float64] = points.astype(np.float64)
-        moved -= np.array(self.translation)
-        moved @= self.matrix
-        return moved
+        return (points - np.array(self.translation)) @ self.matrix if self.is_moved else points
 
-    def rotate(self, vectors: NDArray[np.floating], *, back: bool = False) -> NDArray[np.floating]:
-        """Turn vectors from the scan to the world, or back, shape ``(N, 3)``, in their own type."""
-        if not self.is_moved:
-            return vectors
-        matrix = self.matrix if back else self.matrix.T
-        turned: NDArray[np.float64] = vectors.astype(np.float64) @ matrix
-        return turned.astype(vectors.dtype)
+    def turn_normals(self, block: _Block, *, back: bool = False) -> None:
+        """Turn the normals of a block, if it has any, to the world or back, in their own type."""
+        if self.is_moved and all(name in block for name in _NORMALS):
+            normals = np.stack([block[name] for name in _NORMALS], axis=1)
+            turned = normals @ (self.matrix if back else self.matrix.T)
+            block.update(zip(_NORMALS, turned.astype(normals.dtype).T, strict=True))
 
 
-def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Cartesian coordinates of range, azimuth and elevation (radians), shape ``(N, 3)``."""
-    distance, azimuth, elevation = spherical.T
-    flat = distance * np.cos(elevation)
-    return np.stack(
-        [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1
-    )
+def _scan_of(header: Any) -> Scan:  # noqa: ANN401
+    """Return the name and the pose of a scan."""
+    name = header["name"].value() if "name" in header.scan_fields else ""
+    if not header.has_pose():
+        return Scan(name)
+    return Scan(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
 
 
-AXES = ("cartesianX", "cartesianY", "cartesianZ")
-STATE = "cartesianInvalidState"
-COLOR = ("colorRed", "colorGreen", "colorBlue")
-Block = dict[str, NDArray[Any]]
-
-
-def read_points(pye57: Any, file: Any, header: Any) -> Block:  # noqa: ANN401
-    """Return what the points of a scan hold.
-
-    Args:
-        pye57: The module.
-        file: The open ``pye57.E57``.
-        header: The scan's ``pye57.ScanHeader``.
-
-    Returns:
-        Columns by the standard's names: int64, float32 or float64; texts are left out.
-    """
+def _read_points(pye57: Any, file: Any, header: Any) -> _Block:  # noqa: ANN401
+    """Return what the points of a scan hold, by the standard's names; texts are left out."""
     libe57, count = pye57.libe57, header.point_count
     prototype = libe57.StructureNode(header.points.prototype())
-    block: Block = {}
+    block: _Block = {}
     buffers = libe57.VectorSourceDestBuffer()
     for name in header.point_fields:
         node = pye57.utils.get_node(prototype, name)
@@ -141,16 +198,83 @@ def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
     return "f" if single else "d"
 
 
-def write_points(libe57: Any, file: Any, scan: Scan, block: Block) -> None:  # noqa: ANN401
-    """Add a scan to a file.
+def _to_world(path: Path, block: _Block, scan: Scan) -> _Block:
+    """Move the points of a scan by its pose, and give the fields the names of columns."""
+    if all(axis in block for axis in _AXES):
+        points = np.stack([block.pop(axis) for axis in _AXES], axis=1)
+    elif all(axis in block for axis in _SPHERICAL):
+        spherical = [block.pop(axis).astype("d") for axis in _SPHERICAL]
+        points = to_cartesian(np.stack(spherical, axis=1))
+    else:
+        raise FormatError(
+            f"{path}: expected points with {', '.join(_AXES)}, got {', '.join(block) or 'none'}."
+        )
+    for name in _STATES:
+        if name in block:
+            points[block.pop(name) != 0] = np.nan
+    scan.turn_normals(block)
+    named = {_CHANNELS.get(name, name.rpartition(":")[2]): c for name, c in block.items()}
+    return {**named, **dict(zip("xyz", scan.to_world(points).T, strict=True))}
 
-    Args:
-        libe57: The module.
-        file: The ``pye57.E57`` open for writing.
-        scan: Name and pose.
-        block: Columns by the standard's names, in the frame of the scan.
-    """
-    image, count = file.image_file, len(block[AXES[0]])
+
+def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return Cartesian coordinates of range, azimuth and elevation (radians), shape ``(N, 3)``."""
+    distance, azimuth, elevation = spherical.T
+    flat = distance * np.cos(elevation)
+    return np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1
+    )
+
+
+def _joined(blocks: Sequence[_Block]) -> _Block:
+    """Put scans one after the other; number them if there are several."""
+    counts = [len(block["x"]) for block in blocks]
+    names = dict.fromkeys(name for block in blocks for name in block)
+    columns = {
+        name: np.concatenate(
+            [b.get(name, np.zeros(n, np.uint8)) for b, n in zip(blocks, counts, strict=True)]
+        )
+        for name in names
+    }
+    if len(blocks) > 1:
+        columns["scan"] = np.repeat(np.arange(len(blocks), dtype=np.int32), counts)
+    return columns
+
+
+def _groups(columns: _Block, scans: Sequence[Scan]) -> Iterator[tuple[Scan, slice]]:
+    """Give the rows of each scan, and take ``scan`` out if it says no more than they do."""
+    count = len(columns["x"])
+    number = columns.get("scan")
+    if len(scans) > 1 and number is not None and (np.diff(number) >= 0).all():
+        bounds = np.searchsorted(number, np.arange(len(scans) + 1))
+        if bounds[0] == 0 and bounds[-1] == count:
+            del columns["scan"]
+            for scan, start, stop in zip(scans, bounds, bounds[1:], strict=False):
+                if start < stop:
+                    yield scan, slice(start, stop)
+            return
+    yield scans[0] if len(scans) == 1 else Scan(), slice(0, count)
+
+
+def _to_scan(block: _Block, scan: Scan) -> _Block:
+    """Move points back to the frame of their scan, and give the fields the standard's names."""
+    points = scan.to_scan(np.stack([block.pop(axis) for axis in "xyz"], axis=1))
+    scan.turn_normals(block, back=True)
+    named: _Block = {}
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        points = np.where(finite[:, None], points, 0)
+        # 2: there is nothing meaningful in the coordinates.
+        named[_STATE] = np.where(finite, 0, 2)
+    for name, column in block.items():
+        word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+        named[name if name in _STANDARD else f"torchrg:{word}"] = column
+    return {**dict(zip(_AXES, points.T, strict=True)), **named}
+
+
+def _write_points(libe57: Any, file: Any, scan: Scan, block: _Block) -> None:  # noqa: ANN401
+    """Add a scan to a file, its columns by the standard's names and in its own frame."""
+    image, count = file.image_file, len(block[_AXES[0]])
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
     # libe57 keeps the addresses of the columns, so they have to live until it is done.
@@ -174,9 +298,9 @@ def write_points(libe57: Any, file: Any, scan: Scan, block: Block) -> None:  # n
     writer.close()
 
 
-def _facts(scan: Scan, block: Block) -> dict[str, Any]:
+def _facts(scan: Scan, block: _Block) -> dict[str, Any]:
     """Return what is said about a scan as a whole: identity, pose, limits."""
-    there = block.get(STATE, np.zeros(len(block[AXES[0]]))) == 0
+    there = block.get(_STATE, np.zeros(len(block[_AXES[0]]))) == 0
     facts: dict[str, Any] = {
         "guid": f"{{{uuid.uuid4()}}}",
         "name": scan.name,
@@ -186,7 +310,7 @@ def _facts(scan: Scan, block: Block) -> dict[str, Any]:
         },
         "cartesianBounds": {
             f"{axis[-1].lower()}{end}": float(limit(block[axis][there])) if there.any() else 0.0
-            for axis in AXES
+            for axis in _AXES
             for end, limit in (("Minimum", np.min), ("Maximum", np.max))
         },
     }
@@ -196,10 +320,10 @@ def _facts(scan: Scan, block: Block) -> dict[str, Any]:
             "intensityMinimum": float(known.min()) if known.size else 0.0,
             "intensityMaximum": float(known.max()) if known.size else 0.0,
         }
-    if all(name in block for name in COLOR):
+    if all(name in block for name in _COLOR):
         facts["colorLimits"] = {
             f"{name}{end}": value
-            for name in COLOR
+            for name in _COLOR
             for end, value in (("Minimum", 0), ("Maximum", 255))
         }
     return facts
@@ -215,179 +339,3 @@ def _tree(libe57: Any, image: Any, facts: dict[str, Any]) -> Any:  # noqa: ANN40
         else:
             node.set(name, kinds[type(fact)](image, fact))
     return node
-
-
-SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-STATES = (STATE, "sphericalInvalidState")
-NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
-CHANNELS = ("red", "green", "blue")
-SPELLING = Spelling(normals=NORMALS, color=COLOR)
-STANDARD = {*NORMALS, *COLOR, "intensity", "rowIndex", "columnIndex", "returnIndex", "returnCount"}
-EXTENSIONS = {
-    "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
-    "torchrg": "urn:torchrg:point-fields",
-}
-
-
-def read_e57(path: Path) -> Cloud:
-    """Read all scans of an E57 file.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The cloud, every scan moved by its pose, and its normals with it. Points marked as invalid
-        are kept as not-a-number. Of several scans, ``scan`` is the number of each point's; a field
-        that some scans lack is zero there.
-
-    Raises:
-        FormatError: If the file is damaged or has no points.
-        MissingDependencyError: If pye57 is not installed.
-    """
-    pye57 = require("pye57", extra="e57", purpose="read E57 files")
-    size = check_file(path)
-    try:
-        with pye57.E57(str(path)) as file:
-            headers = [file.get_header(i) for i in range(file.scan_count)]
-            num_points = sum(header.point_count for header in headers)
-            check_promise(
-                path,
-                byte=0,
-                # Coordinates that differ at all take a bit.
-                promised=num_points // 8,
-                available=size,
-                content=f"{num_points:,} points",
-                at_least=True,
-            )
-            scans = tuple(_pose(header) for header in headers)
-            blocks = [
-                _to_world(path, read_points(pye57, file, header), scan)
-                for header, scan in zip(headers, scans, strict=True)
-            ]
-    except FormatError:
-        raise
-    except (pye57.libe57.E57Exception, *DAMAGES) as error:
-        raise FormatError(
-            f"{path}: expected an E57 file, got: {first_line(error)}; fetch it again."
-        ) from error
-    if not blocks:
-        raise FormatError(f"{path}: expected at least one scan, got none; fetch the file again.")
-    return assemble_cloud(path, _joined(blocks), header={"scans": scans})
-
-
-def check_e57(path: Path, cloud: Cloud | None) -> None:
-    """Check that pye57 is installed; E57 holds any cloud.
-
-    Raises:
-        MissingDependencyError: If pye57 is not installed.
-    """
-    require("pye57", extra="e57", purpose="write E57 files")
-
-
-def write_e57(path: Path, cloud: Cloud) -> None:
-    """Write a cloud as an E57 file.
-
-    Args:
-        path: The file.
-        cloud: The cloud. If it came from an E57 file, its scans are written with their poses,
-            otherwise one scan is. Points that are not finite are marked as invalid.
-
-    Raises:
-        FormatError: If a field has no place in an E57 file, or the file cannot be written.
-        MissingDependencyError: If pye57 is not installed.
-    """
-    pye57 = require("pye57", extra="e57", purpose="write E57 files")
-    stored = cloud.header.get("scans", ())
-    columns = flatten_cloud(path, cloud, SPELLING)
-    for name, column in columns.items():
-        columns[name] = column = narrow_integers(column, ("i8",))
-        if column.dtype == np.uint64:
-            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
-    try:
-        with atomic_path(path) as beside, pye57.E57(str(beside), "w") as file:
-            for prefix, uri in EXTENSIONS.items():
-                file.image_file.extensionsAdd(prefix, uri)
-            for scan, rows in _groups(columns, stored):
-                block = {name: column[rows] for name, column in columns.items()}
-                write_points(pye57.libe57, file, scan, _to_scan(block, scan))
-    except (pye57.libe57.E57Exception, ValueError, RuntimeError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"{path}: cannot be written: {first_line(error)}.") from error
-
-
-def _pose(header: Any) -> Scan:  # noqa: ANN401
-    """Return the name and the pose of a scan."""
-    name = header["name"].value() if "name" in header.scan_fields else ""
-    if not header.has_pose():
-        return Scan(name)
-    return Scan(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
-
-
-def _to_world(path: Path, block: Block, scan: Scan) -> Block:
-    """Move the points of a scan by its pose, and give the fields the names of columns."""
-    if all(axis in block for axis in AXES):
-        points = np.stack([block.pop(axis) for axis in AXES], axis=1)
-    elif all(axis in block for axis in SPHERICAL):
-        points = to_cartesian(np.stack([block.pop(axis).astype("d") for axis in SPHERICAL], axis=1))
-    else:
-        raise FormatError(
-            f"{path}: expected points with {', '.join(AXES)}, got {', '.join(block) or 'none'}."
-        )
-    for name in STATES:
-        if name in block:
-            points[block.pop(name) != 0] = np.nan
-    if all(name in block for name in NORMALS):
-        normals = scan.rotate(np.stack([block[name] for name in NORMALS], axis=1))
-        block |= dict(zip(NORMALS, normals.T, strict=True))
-    channels = dict(zip(COLOR, CHANNELS, strict=True))
-    named = {channels.get(name, name.rpartition(":")[2]): c for name, c in block.items()}
-    return {**named, **dict(zip("xyz", scan.to_world(points).T, strict=True))}
-
-
-def _joined(blocks: Sequence[Block]) -> Block:
-    """Put scans one after the other; number them if there are several."""
-    counts = [len(block["x"]) for block in blocks]
-    names = dict.fromkeys(name for block in blocks for name in block)
-    columns = {
-        name: np.concatenate(
-            [b.get(name, np.zeros(n, np.uint8)) for b, n in zip(blocks, counts, strict=True)]
-        )
-        for name in names
-    }
-    if len(blocks) > 1:
-        columns["scan"] = np.repeat(np.arange(len(blocks), dtype=np.int32), counts)
-    return columns
-
-
-def _groups(columns: Block, scans: Sequence[Scan]) -> Iterator[tuple[Scan, slice]]:
-    """Give the rows of each scan, and take ``scan`` out if it says no more than they do."""
-    count = len(columns["x"])
-    number = columns.get("scan")
-    if len(scans) > 1 and number is not None and (np.diff(number) >= 0).all():
-        bounds = np.searchsorted(number, np.arange(len(scans) + 1))
-        if bounds[0] == 0 and bounds[-1] == count:
-            del columns["scan"]
-            for scan, start, stop in zip(scans, bounds, bounds[1:], strict=False):
-                if start < stop:
-                    yield scan, slice(start, stop)
-            return
-    yield scans[0] if len(scans) == 1 else Scan(), slice(0, count)
-
-
-def _to_scan(block: Block, scan: Scan) -> Block:
-    """Move points back to the frame of their scan, and give the fields the standard's names."""
-    points = scan.to_scan(np.stack([block.pop(axis) for axis in "xyz"], axis=1))
-    if all(name in block for name in NORMALS):
-        normals = scan.rotate(np.stack([block[name] for name in NORMALS], axis=1), back=True)
-        block |= dict(zip(NORMALS, normals.T, strict=True))
-    named: Block = {}
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        points = np.where(finite[:, None], points, 0)
-        # 2: there is nothing meaningful in the coordinates.
-        named[STATE] = np.where(finite, 0, 2)
-    for name, column in block.items():
-        word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
-        named[name if name in STANDARD else f"torchrg:{word}"] = column
-    return {**dict(zip(AXES, points.T, strict=True)), **named}

@@ -11,7 +11,21 @@ from pathlib import Path
 
 from torchrg.errors import FormatError
 
+DAMAGES = (
+    ValueError,
+    LookupError,
+    ArithmeticError,
+    EOFError,
+    RuntimeError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+    MemoryError,
+    struct.error,
+)
+"""What libraries raise on damaged files beside their own errors, found by flipping bytes."""
 _BESIDE = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")
+"""Names that :func:`atomic_path` writes under."""
 
 
 @contextmanager
@@ -100,33 +114,8 @@ def check_place(path: str | os.PathLike[str]) -> None:
         raise FormatError(f"{path}: there is no folder {target.parent}; make it first.")
 
 
-# What libraries raise on damaged files beside their own errors, found by flipping bytes.
-DAMAGES = (
-    ValueError,
-    LookupError,
-    ArithmeticError,
-    EOFError,
-    RuntimeError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-    MemoryError,
-    struct.error,
-)
-
-
 def check_file(path: Path) -> int:
-    """Check that a path is a file with something in it.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its size in bytes.
-
-    Raises:
-        FormatError: If there is no such file, it is a directory, or it is empty.
-    """
+    """Return the size of a file in bytes; it is there, no directory, and not empty."""
     if path.is_dir():
         raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
     try:
@@ -139,22 +128,12 @@ def check_file(path: Path) -> int:
 
 
 def check_promise(
-    path: Path, *, byte: int, promised: int, available: int, content: str, at_least: bool = False
+    path: Path, byte: int, promised: int, content: str, *, available: int, at_least: bool = False
 ) -> None:
-    """Compare a size that a header promises with what the file can hold.
+    """Compare the bytes that a header promises from a place on with those that can be there.
 
-    This comes before memory is taken, so that a damaged header cannot ask for all of it.
-
-    Args:
-        path: The file.
-        byte: Where the content begins.
-        promised: Bytes that the header asks for.
-        available: Bytes that are there.
-        content: What is promised, for the message.
-        at_least: Whether ``promised`` is a lower bound of what is needed.
-
-    Raises:
-        FormatError: If more is promised than available.
+    This comes before memory is taken, so that a damaged header cannot ask for all of it. With
+    ``at_least``, ``promised`` is a lower bound of what is needed.
     """
     if promised > available:
         least = "at least " if at_least else ""
@@ -162,6 +141,20 @@ def check_promise(
             f"{path}: byte {byte}: expected {least}{promised:,} bytes for {content}, got "
             f"{available:,}; the file is cut off or its header is wrong, fetch it again."
         )
+
+
+@contextmanager
+def refusing(message: str, *errors: type[BaseException], repair: str = "") -> Iterator[None]:
+    """Raise errors of a library as a FormatError: the message, the error's first line, the repair.
+
+    A FormatError passes as it is, though it is a ValueError.
+    """
+    try:
+        yield
+    except FormatError:
+        raise
+    except errors as error:
+        raise FormatError(f"{message}{first_line(error)}{repair}.") from error
 
 
 def first_line(error: BaseException) -> str:

@@ -15,39 +15,154 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud
-from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, first_line
+from torchrg.io.fields import WIDEN, Spelling, are_whole, assemble_cloud, flatten_cloud
+from torchrg.io.files import DAMAGES, atomic_path, check_promise, first_line, refusing
 from torchrg.structures import Cloud
 
-FIRST_LAYERED_FORMAT = 6
+_POINTS_AT_ONCE = 1 << 20
+_SPELLING = Spelling(
+    normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16
+)
+_WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
+"""By point format without colour, the one that adds it."""
+_FIRST_LAYERED_FORMAT = 6
+"""Point formats from here on are compressed field by field."""
+_UNFIT = "_value"
+"""Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
+_LARGEST_INTEGER = 2**31 - 1
+_VERSION_AT, _RECORDS_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 100, 107, 235, 247
+"""Places in the header: minor version, number of records, of points, extended records, and the
+number of points of 64 bits that version 1.4 has beside the old one, which may be 0 there."""
+_DATE_AT, _DATE_BYTES = 90, 4
 
 
-def check_header(path: Path, size: int) -> None:
+def read_las(path: Path, size: int) -> Cloud:
+    """Read a LAS or LAZ file.
+
+    The cloud is float64, with every extra dimension and every standard one that is not zero
+    everywhere; colours are uint8 where eight bits hold them, else uint16. The header is kept for
+    writing.
+    """
+    laspy = _laspy("read")
+    _check_header(path, size)
+    message = f"{path}: expected a LAS or LAZ file, got: "
+    damages = (laspy.errors.LaspyException, *DAMAGES)
+    try:
+        # The parallel backend takes what memory a damaged table of chunks asks for.
+        with (
+            refusing(message, *damages, repair="; fetch it again"),
+            laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
+        ):
+            header = reader.header
+            _check_points(path, header, size)
+            # By blocks, so that memory grows with the points that are really there.
+            blocks = [_columns(block) for block in reader.chunk_iterator(_POINTS_AT_ONCE)]
+    except BaseException as error:
+        # A panic of lazrs, which is written in Rust, is no Exception and has no importable name.
+        if type(error).__name__ != "PanicException":
+            raise
+        raise FormatError(
+            f"{path}: expected whole compressed points, got: {first_line(error)}; fetch it again."
+        ) from error
+    if not blocks:
+        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+    columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    unused = _unused(header.point_format, columns)
+    named = {
+        name.removesuffix(_UNFIT) if name.removesuffix(_UNFIT) in unused else name: column
+        for name, column in columns.items()
+        if name not in unused
+    }
+    return assemble_cloud(path, named, header={"las": header})
+
+
+def check_las(path: Path, cloud: Cloud | None) -> None:
+    """Check that laspy is installed, and that all points of a cloud that is known are finite."""
+    _laspy("write")
+    if cloud is not None and not cloud.finite.all():
+        raise FormatError(
+            f"{path}: expected finite coordinates, as LAS has no others, got "
+            f"{int((~cloud.finite).sum())} points that are not (first: "
+            f"{int(np.argmin(cloud.finite))}); write .npz, .ply or .pcd."
+        )
+
+
+def write_las(path: Path, cloud: Cloud) -> None:
+    """Write a LAS file, or a LAZ file if the suffix says so.
+
+    If the cloud came from a LAS file, scale, offset, reference system and point format are kept;
+    otherwise the scale is the smallest power of ten that the grid of 32 bits allows.
+    """
+    laspy = _laspy("write")
+    columns = flatten_cloud(path, cloud, _SPELLING)
+    header, has_date = _header(
+        laspy, cloud, colored=all(name in columns for name in _SPELLING.color)
+    )
+    named = _fitted(path, header.point_format, columns)
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name, column.dtype.str[1:])
+            for name, column in named.items()
+            if name not in header.point_format.dimension_names
+        ]
+    )
+    errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
+    with refusing(f"{path}: cannot be written: ", *errors):
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = cloud.coordinates.T.astype(np.float64)
+        for name, column in named.items():
+            data[name] = column
+        with atomic_path(path) as beside:
+            data.write(beside)
+            if not has_date:
+                _erase_date(beside)
+
+
+def count_las(path: Path, stream: BinaryIO, size: int) -> int:
+    """Return the number of points by the header."""
+    head = stream.read(_COUNT14_AT + 8)
+    (count,) = struct.unpack_from("<I", head, _COUNT_AT)
+    if head[_VERSION_AT] >= 4:
+        (count,) = struct.unpack_from("<Q", head, _COUNT14_AT)
+    return int(count)
+
+
+def _laspy(verb: str) -> Any:  # noqa: ANN401
+    """Return the module."""
+    return require("laspy", extra="las", purpose=f"{verb} LAS and LAZ files")
+
+
+def _check_header(path: Path, size: int) -> None:
     """Check the numbers of records that laspy would otherwise loop over."""
     with path.open("rb") as stream:
         head = stream.read(255)
         if head[:4] != b"LASF" or len(head) < 227:
             raise FormatError(f"{path}: byte 0: expected the header of a LAS file; fetch it again.")
-        (num_records,) = struct.unpack_from("<I", head, 100)
-        check_promise(
-            path, byte=100, promised=54 * num_records, available=size, content="header records"
-        )
-        if head[25] < 4 or len(head) < 247:
+        (num_records,) = struct.unpack_from("<I", head, _RECORDS_AT)
+        check_promise(path, _RECORDS_AT, 54 * num_records, "header records", available=size)
+        if head[_VERSION_AT] < 4 or len(head) < 247:
             return
-        start, num_extended = struct.unpack_from("<QI", head, 235)
+        start, num_extended = struct.unpack_from("<QI", head, _EXTENDED_AT)
+        content = f"{num_extended:,} extended header records"
         for _ in range(num_extended):
-            content = f"{num_extended:,} extended header records"
-            check_promise(path, byte=start, promised=60, available=size - start, content=content)
+            check_promise(path, start, 60, content, available=size - start)
             stream.seek(start)
             (length,) = struct.unpack_from("<Q", stream.read(60), 20)
             start += 60
-            check_promise(
-                path, byte=start, promised=length, available=size - start, content=content
-            )
+            check_promise(path, start, length, content, available=size - start)
             start += length
 
 
-def check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
+def _check_points(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
+    """Check the number of points."""
+    start, content = header.offset_to_point_data, f"{header.point_count:,} points"
+    least = 0 if header.are_points_compressed else header.point_count * header.point_format.size
+    check_promise(path, start, least, content, available=size - start)
+    if header.are_points_compressed:
+        _check_chunks(path, header, size)
+
+
+def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
     """Check the number of compressed chunks; lazrs ends the process if memory for it fails."""
     start = header.offset_to_point_data
     with path.open("rb") as stream:
@@ -62,18 +177,12 @@ def check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
             raise FormatError(
                 f"{path}: byte {start}: expected the place of {content}; fetch it again."
             )
-        check_promise(path, byte=offset, promised=8, available=size - offset, content=content)
+        check_promise(path, offset, 8, content, available=size - offset)
         stream.seek(offset)
         _, num_chunks = struct.unpack("<II", stream.read(8))
         # The first point of a chunk is stored as it is.
-        check_promise(
-            path,
-            byte=offset + 4,
-            promised=num_chunks * header.point_format.size,
-            available=size,
-            content=f"{num_chunks:,} chunks",
-            at_least=True,
-        )
+        least, content = num_chunks * header.point_format.size, f"{num_chunks:,} chunks"
+        check_promise(path, offset + 4, least, content, available=size, at_least=True)
         lazrs = require("lazrs", extra="las", purpose="read LAZ files")
         (record,) = header.vlrs.get("LasZipVlr")
         layout = lazrs.LazVlr(record.record_data)
@@ -84,7 +193,7 @@ def check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
             )
         stream.seek(start)
         table = lazrs.read_chunk_table(stream, layout)
-        if header.point_format.id >= FIRST_LAYERED_FORMAT:
+        if header.point_format.id >= _FIRST_LAYERED_FORMAT:
             _check_layers(path, stream, header, [num_bytes for _, num_bytes in table])
 
 
@@ -100,145 +209,9 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
         place = start + point_format.size + 4
         stream.seek(place)
         sizes = np.frombuffer(stream.read(4 * num_layers), "<u4")
-        check_promise(
-            path,
-            byte=place,
-            promised=int(sizes.sum(dtype=np.uint64)),
-            available=num_bytes,
-            content="the layers of a chunk",
-        )
+        total = int(sizes.sum(dtype=np.uint64))
+        check_promise(path, place, total, "the layers of a chunk", available=num_bytes)
         start += num_bytes
-
-
-POINTS_AT_ONCE = 1 << 20
-SPELLING = Spelling(normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16)
-COLOR = ("red", "green", "blue")
-WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
-"""By point format without colour, the one that adds it."""
-UNFIT = "_value"
-"""Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
-LARGEST_INTEGER = 2**31 - 1
-DATE_BYTES = (90, 4)
-
-
-def read_las(path: Path) -> Cloud:
-    """Read a LAS or LAZ file.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The cloud in float64, with every extra dimension and every standard one that is not zero
-        everywhere; colours as uint8 where eight bits hold them, else uint16. The header is kept for
-        writing.
-
-    Raises:
-        FormatError: If the file is damaged.
-        MissingDependencyError: If laspy is not installed.
-    """
-    laspy = require("laspy", extra="las", purpose="read LAS and LAZ files")
-    size = check_file(path)
-    check_header(path, size)
-    try:
-        # The parallel backend takes what memory a damaged table of chunks asks for.
-        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
-            header = reader.header
-            start = header.offset_to_point_data
-            least = 0 if header.are_points_compressed else header.point_format.size
-            check_promise(
-                path,
-                byte=start,
-                promised=header.point_count * least,
-                available=size - start,
-                content=f"{header.point_count:,} points",
-            )
-            if header.are_points_compressed:
-                check_chunks(path, header, size)
-            # By blocks, so that memory grows with the points that are really there.
-            blocks = [_columns(block) for block in reader.chunk_iterator(POINTS_AT_ONCE)]
-    except FormatError:
-        raise
-    except (laspy.errors.LaspyException, *DAMAGES) as error:
-        raise FormatError(
-            f"{path}: expected a LAS or LAZ file, got: {first_line(error)}; fetch it again."
-        ) from error
-    except BaseException as error:
-        # A panic of lazrs, which is written in Rust, is no Exception and has no importable name.
-        if type(error).__name__ != "PanicException":
-            raise
-        raise FormatError(
-            f"{path}: expected whole compressed points, got: {first_line(error)}; fetch it again."
-        ) from error
-    if not blocks:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
-    columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    unused = _unused(header.point_format, columns)
-    named = {
-        name.removesuffix(UNFIT) if name.removesuffix(UNFIT) in unused else name: column
-        for name, column in columns.items()
-        if name not in unused
-    }
-    return assemble_cloud(path, named, header={"las": header})
-
-
-def check_las(path: Path, cloud: Cloud | None) -> None:
-    """Check that a cloud can be written as LAS: laspy is installed, and all points are finite.
-
-    Args:
-        path: The file to write.
-        cloud: The cloud; None if it is not known yet.
-
-    Raises:
-        FormatError: If a point is not finite.
-        MissingDependencyError: If laspy is not installed.
-    """
-    require("laspy", extra="las", purpose="write LAS and LAZ files")
-    if cloud is not None and not cloud.finite.all():
-        raise FormatError(
-            f"{path}: expected finite coordinates, as LAS has no others, got "
-            f"{int((~cloud.finite).sum())} points that are not (first: "
-            f"{int(np.argmin(cloud.finite))}); write .npz, .ply or .pcd."
-        )
-
-
-def write_las(path: Path, cloud: Cloud) -> None:
-    """Write a cloud as a LAS file, or a LAZ file if its suffix says so.
-
-    Args:
-        path: The file.
-        cloud: The cloud, all of it finite. If it came from a LAS file, scale, offset, reference
-            system and point format are kept; otherwise the scale is the smallest power of ten that
-            the grid of 32 bits allows.
-
-    Raises:
-        FormatError: If a point is off the grid, a field has no place in a LAS file, or the file
-            cannot be written.
-        MissingDependencyError: If laspy is not installed.
-    """
-    laspy = require("laspy", extra="las", purpose="write LAS and LAZ files")
-    columns = flatten_cloud(path, cloud, SPELLING)
-    header, has_date = _header(laspy, cloud, colored=all(name in columns for name in COLOR))
-    named = _fitted(path, header.point_format, columns)
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(name, column.dtype.str[1:])
-            for name, column in named.items()
-            if name not in header.point_format.dimension_names
-        ]
-    )
-    try:
-        data = laspy.LasData(header)
-        data.x, data.y, data.z = cloud.coordinates.T.astype(np.float64)
-        for name, column in named.items():
-            data[name] = column
-        with atomic_path(path) as beside:
-            data.write(beside)
-            if not has_date:
-                _erase_date(beside)
-    except (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"{path}: cannot be written: {first_line(error)}.") from error
 
 
 def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
@@ -259,8 +232,8 @@ def _unused(point_format: Any, columns: dict[str, NDArray[Any]]) -> set[str]:  #
     """Return the standard dimensions that are zero everywhere; the channels of a colour as one."""
     standard = set(point_format.standard_dimension_names)
     used = {name for name, column in columns.items() if name not in standard or column.any()}
-    if not used.isdisjoint(COLOR):
-        used.update(COLOR)
+    if not used.isdisjoint(_SPELLING.color):
+        used.update(_SPELLING.color)
     return columns.keys() - used
 
 
@@ -273,10 +246,10 @@ def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # 
         middle = np.rint((low.astype(np.float64) + high) / 2)
         reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
         header.offsets = middle
-        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
         return header, False
     number = stored.point_format.id
-    number = WITH_COLOR.get(number, number) if colored else number
+    number = _WITH_COLOR.get(number, number) if colored else number
     least = laspy.LasHeader(point_format=number).version
     header = copy.deepcopy(stored)
     header.set_version_and_point_format(max(stored.version, least), laspy.PointFormat(number))
@@ -293,11 +266,11 @@ def _fitted(
     for name, column in columns.items():
         if name in ("x", "y", "z"):
             continue
-        if name in COLOR and column.dtype == np.uint8:
-            column = column.astype(np.uint16) * 257
+        if name in _SPELLING.color and column.dtype == np.uint8:
+            column = column.astype(np.uint16) * WIDEN
         known = name in point_format.dimension_names
         if known and not _holds(point_format.dimension_by_name(name), column):
-            name = f"{name}{UNFIT}"
+            name = f"{name}{_UNFIT}"
         if name in ("X", "Y", "Z") or len(name.encode()) > 32:
             raise FormatError(
                 f"{path}: expected names of at most 32 bytes other than X, Y, Z, got {name!r}; "
@@ -311,13 +284,12 @@ def _holds(dimension: Any, column: NDArray[Any]) -> bool:  # noqa: ANN401
     """Whether a standard dimension holds all values of a column exactly."""
     if dimension.dtype is not None and dimension.dtype.kind == "f":
         return bool((column.astype(dimension.dtype) == column).all())
-    whole = np.isfinite(column).all() and (column == np.floor(column)).all()
-    return bool(whole and column.min() >= dimension.min and column.max() <= dimension.max)
+    whole = are_whole(column)
+    return whole and bool(column.min() >= dimension.min and column.max() <= dimension.max)
 
 
 def _erase_date(path: Path) -> None:
     """Set the date of creation to none; laspy writes the day, so that equal runs would differ."""
-    start, length = DATE_BYTES
     with path.open("rb+") as stream:
-        stream.seek(start)
-        stream.write(bytes(length))
+        stream.seek(_DATE_AT)
+        stream.write(bytes(_DATE_BYTES))

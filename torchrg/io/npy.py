@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -27,30 +27,21 @@ from torchrg.io.fields import (
     cloud_of,
     flatten_cloud,
     name_columns,
+    to_records,
 )
-from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, first_line
+from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
 from torchrg.structures import Cloud
 
-COORDINATES = ("points", "coord")
-NOT_PER_POINT = "plane_"
-# Deflate packs at most 1032 bytes into one.
-LARGEST_DEFLATE_RATIO = 1032
-EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+_COORDINATES = ("points", "coord")
+_NOT_PER_POINT = "plane_"
+_LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
+"""Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
+_EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 
 
-def read_npy(path: Path) -> Cloud:
-    """Read a ``.npy`` file.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The cloud.
-
-    Raises:
-        FormatError: If the file is damaged, holds Python objects, or is no table of points.
-    """
-    size = check_file(path)
+def read_npy(path: Path, size: int) -> Cloud:
+    """Read a ``.npy`` file."""
     with path.open("rb") as stream:
         values = _read_array(path, stream, size, content="the array")
     if values.dtype.names is not None:
@@ -64,54 +55,33 @@ def read_npy(path: Path) -> Cloud:
 
 
 def write_npy(path: Path, cloud: Cloud) -> None:
-    """Write a cloud as a ``.npy`` file.
-
-    Args:
-        path: The file.
-        cloud: The cloud. Without fields an array of shape (N, 3) is written, with fields a
-            structured array whose names are those of a PLY file.
-
-    Raises:
-        FormatError: If a field cannot be a column, or the file cannot be written.
-    """
+    """Write coordinates of shape (N, 3), or with fields a structured array named as in PLY."""
     values: NDArray[Any] = cloud.coordinates
     if cloud.fields:
-        columns = flatten_cloud(path, cloud, Spelling())
-        values = np.empty(len(cloud), [(name, c.dtype) for name, c in columns.items()])
-        for name, column in columns.items():
-            values[name] = column
+        values = to_records(flatten_cloud(path, cloud, Spelling()))
     with atomic_path(path) as beside, beside.open("wb") as stream:
         npy_format.write_array(stream, values, allow_pickle=False)
 
 
-def read_npz(path: Path) -> Cloud:
-    """Read a ``.npz`` file.
+def count_npy(path: Path, stream: IO[bytes], size: int) -> int:
+    """Return the number of rows of an array."""
+    shape, _ = _read_shape(stream)
+    return shape[0] if shape else 0
 
-    Args:
-        path: The file.
 
-    Returns:
-        The cloud.
-
-    Raises:
-        FormatError: If the file is damaged, holds Python objects, or has no points.
-    """
-    size = check_file(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {
-                member.filename.removesuffix(".npy"): _read_member(path, archive, member, size)
-                for member in archive.infolist()
-                if member.filename.endswith(".npy")
-            }
-    except FormatError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, *DAMAGES) as error:
-        raise FormatError(
-            f"{path}: expected an archive of NumPy arrays, got: {first_line(error)}; "
-            "fetch or write it again."
-        ) from error
-    name = next((name for name in COORDINATES if name in arrays), None)
+def read_npz(path: Path, size: int) -> Cloud:
+    """Read a ``.npz`` file."""
+    message = f"{path}: expected an archive of NumPy arrays, got: "
+    with (
+        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch or write it again"),
+        zipfile.ZipFile(path) as archive,
+    ):
+        arrays = {
+            member.filename.removesuffix(".npy"): _read_member(path, archive, member, size)
+            for member in archive.infolist()
+            if member.filename.endswith(".npy")
+        }
+    name = next((name for name in _COORDINATES if name in arrays), None)
     if name is None:
         found = ", ".join(map(repr, arrays)) or "none"
         raise FormatError(
@@ -121,55 +91,35 @@ def read_npz(path: Path) -> Cloud:
     fields = {
         name: values
         for name, values in arrays.items()
-        if values.shape[:1] == coordinates.shape[:1] and not name.startswith(NOT_PER_POINT)
+        if values.shape[:1] == coordinates.shape[:1] and not name.startswith(_NOT_PER_POINT)
     }
     return cloud_of(path, coordinates, fields)
 
 
 def write_npz(path: Path, cloud: Cloud) -> None:
-    """Write a cloud as a ``.npz`` file: ``points`` and every field under its name.
-
-    Args:
-        path: The file.
-        cloud: The cloud.
-
-    Raises:
-        FormatError: If a field holds Python objects or has another length than the cloud, or the
-            file cannot be written.
-    """
+    """Write ``points`` and every field under its name."""
     write_arrays(path, cloud_arrays(path, cloud))
 
 
+def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
+    """Return the number of rows of the coordinates."""
+    with zipfile.ZipFile(stream) as archive:
+        known = [f"{name}.npy" for name in _COORDINATES if f"{name}.npy" in archive.namelist()]
+        with archive.open(known[0]) as member:
+            return count_npy(path, member, size)
+
+
 def cloud_arrays(path: Path, cloud: Cloud) -> dict[str, NDArray[Any]]:
-    """Return ``points`` and the fields of a cloud, checked to have one row a point.
-
-    Args:
-        path: The file to write, for messages.
-        cloud: The cloud.
-
-    Returns:
-        The arrays by name.
-
-    Raises:
-        FormatError: If a field has another length than the cloud, or the name of the coordinates.
-    """
+    """Return ``points`` and the fields of a cloud, checked to have one row a point."""
     for name, values in cloud.fields.items():
         check_length(path, name, values, len(cloud))
-        if name in COORDINATES:
+        if name in _COORDINATES:
             raise FormatError(f"{path}: expected fields beside points, got {name!r}; rename it.")
     return {"points": cloud.coordinates, **cloud.fields}
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as a ``.npz`` file; equal arrays give equal bytes, whenever and wherever.
-
-    Args:
-        path: The file.
-        arrays: The arrays by name.
-
-    Raises:
-        FormatError: If one holds Python objects, or the file cannot be written.
-    """
+    """Write a ``.npz`` file; equal arrays give equal bytes, whenever and wherever."""
     for name, values in arrays.items():
         if values.dtype.hasobject:
             raise FormatError(
@@ -177,37 +127,9 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             )
     with atomic_path(path) as beside, zipfile.ZipFile(beside, "w", allowZip64=True) as archive:
         for name, values in arrays.items():
-            member = zipfile.ZipInfo(f"{name}.npy", EARLIEST_ZIP_TIME)
+            member = zipfile.ZipInfo(f"{name}.npy", _EARLIEST_ZIP_TIME)
             with archive.open(member, "w", force_zip64=True) as stream:
                 npy_format.write_array(stream, np.asarray(values, order="C"), allow_pickle=False)
-
-
-def _read_member(
-    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, size: int
-) -> NDArray[Any]:
-    """Read one array of an archive."""
-    ratio = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: LARGEST_DEFLATE_RATIO}
-    if member.compress_type not in ratio:
-        raise FormatError(
-            f"{path}: expected {member.filename!r} stored or deflated, got compression "
-            f"{member.compress_type}; write it with numpy.savez."
-        )
-    check_promise(
-        path,
-        byte=member.header_offset,
-        promised=member.file_size,
-        available=min(member.compress_size, size) * ratio[member.compress_type],
-        content=repr(member.filename),
-    )
-    try:
-        with archive.open(member) as stream:
-            return _read_array(path, stream, member.file_size, content=repr(member.filename))
-    except FormatError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, *DAMAGES) as error:
-        raise FormatError(
-            f"{path}: {member.filename!r}: {first_line(error)}; fetch the file again."
-        ) from error
 
 
 def map_array(path: Path) -> NDArray[Any]:
@@ -225,9 +147,28 @@ def map_array(path: Path) -> NDArray[Any]:
     size = check_file(path)
     with path.open("rb") as stream:
         shape = _read_header(path, stream, size, content="the array")
-    if 0 in shape:
-        return np.asarray(np.load(path, allow_pickle=False))
-    return np.asarray(np.load(path, mmap_mode="c", allow_pickle=False))
+    # There is nothing to map in an empty array, and trying fails.
+    values = np.load(path, mmap_mode=None if 0 in shape else "c", allow_pickle=False)
+    return np.asarray(values)
+
+
+def _read_member(
+    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, size: int
+) -> NDArray[Any]:
+    """Read one array of an archive."""
+    if member.compress_type not in _LARGEST_RATIO:
+        raise FormatError(
+            f"{path}: expected {member.filename!r} stored or deflated, got compression "
+            f"{member.compress_type}; write it with numpy.savez."
+        )
+    content = repr(member.filename)
+    most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
+    check_promise(path, member.header_offset, member.file_size, content, available=most)
+    with (
+        refusing(f"{path}: {content}: ", *ARCHIVE_DAMAGES, repair="; fetch the file again"),
+        archive.open(member) as stream,
+    ):
+        return _read_array(path, stream, member.file_size, content=content)
 
 
 def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> NDArray[Any]:
@@ -240,18 +181,10 @@ def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> ND
 
 def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> tuple[int, ...]:
     """Read the header of an array, check it against the file, and return the shape."""
-    try:
-        version = npy_format.read_magic(stream)
-        # Versions 2 and 3 differ in the encoding of field names only, which sizes do not need.
-        read = npy_format.read_array_header_1_0
-        if version != (1, 0):
-            read = npy_format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    except (*DAMAGES, SyntaxError, tokenize.TokenError) as error:
-        raise FormatError(
-            f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
-            f"{first_line(error)}; write it again with numpy.save or numpy.savez."
-        ) from error
+    message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
+    repair = "; write it again with numpy.save or numpy.savez"
+    with refusing(message, *DAMAGES, SyntaxError, tokenize.TokenError, repair=repair):
+        shape, dtype = _read_shape(stream)
     if dtype.hasobject:
         raise FormatError(
             f"{path}: expected numbers or text in {content}, got pickled Python objects, which are "
@@ -262,12 +195,17 @@ def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> t
             f"{path}: byte 0: expected a shape and a type in {content}, got {shape} of {dtype}; "
             "write it again."
         )
-    start = stream.tell()
-    check_promise(
-        path,
-        byte=start,
-        promised=math.prod(shape) * dtype.itemsize,
-        available=size - start,
-        content=f"{content} of shape {shape}",
-    )
-    return tuple(shape)
+    start, promised = stream.tell(), math.prod(shape) * dtype.itemsize
+    check_promise(path, start, promised, f"{content} of shape {shape}", available=size - start)
+    return shape
+
+
+def _read_shape(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read shape and type of an array, and leave the stream at the first value."""
+    version = npy_format.read_magic(stream)
+    # Versions 2 and 3 differ in the encoding of field names only, which sizes do not need.
+    read = npy_format.read_array_header_1_0
+    if version != (1, 0):
+        read = npy_format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    return tuple(shape), dtype

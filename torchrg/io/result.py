@@ -14,15 +14,7 @@ from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
 
 def with_segmentation(cloud: Cloud, segmentation: Segmentation) -> Cloud:
-    """Return a cloud with ``labels``, ``normals`` and ``curvature`` of a segmentation.
-
-    Args:
-        cloud: The cloud that was segmented; its other fields stay, in front.
-        segmentation: Its segmentation.
-
-    Returns:
-        A new cloud.
-    """
+    """Return a cloud with ``labels``, ``normals`` and ``curvature`` behind its other fields."""
     found = ("labels", "normals", "curvature")
     kept = {name: values for name, values in cloud.fields.items() if name not in found}
     results = {name: _array(getattr(segmentation, name)) for name in found}
@@ -30,17 +22,11 @@ def with_segmentation(cloud: Cloud, segmentation: Segmentation) -> Cloud:
 
 
 def result_arrays(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a result file.
+    """Return the arrays of a result file by name, in the coordinates of the cloud itself.
 
-    Args:
-        cloud: The cloud that was segmented.
-        segmentation: Its segmentation, about the cloud's origin.
-
-    Returns:
-        The arrays by name. Coordinates, offsets, centroids, centers and outlines of planes are the
-        input's own. What the table of planes does not have is left out. Rings of outlines follow
-        each other in ``outline_points``; ``outline_ring_sizes`` and ``outline_ring_planes`` say how
-        long each is and to which plane it belongs.
+    What the table of planes does not have is left out. Rings of outlines follow each other in
+    ``outline_points``; ``outline_ring_sizes`` and ``outline_ring_planes`` say how long each is and
+    to which plane it belongs.
     """
     return {
         "points": cloud.coordinates,
@@ -59,27 +45,20 @@ def _plane_arrays(planes: Planes, origin: NDArray[np.float64]) -> dict[str, NDAr
     def moved(places: Tensor) -> NDArray[np.float64]:
         return _array(places).astype(np.float64) + origin
 
-    normal = _array(planes.normal)
-    arrays = {
-        "plane_normal": normal,
-        "plane_offset": _array(planes.offset).astype(np.float64) + normal @ origin,
-        "plane_centroid": moved(planes.centroid),
-        "plane_area": _array(planes.area),
-        "plane_count": _array(planes.count),
-        "plane_rms": _array(planes.rms),
-        "plane_extent": _array(planes.extent),
-        "plane_axes": _array(planes.axes),
-        "plane_center": moved(planes.center),
-        "plane_curved": _array(planes.curved),
-    }
-    if planes.kind is not None:
-        arrays["plane_kind"] = np.array(PLANE_KINDS)[_array(planes.kind)]
-    if planes.adjacency is not None:
-        arrays["adjacency_pairs"] = _array(planes.adjacency.pairs)
-        arrays["adjacency_boundary_length"] = _array(planes.adjacency.boundary_length)
-        arrays["adjacency_dihedral_deg"] = _array(planes.adjacency.dihedral_deg)
-    if planes.outline is not None:
-        rings = [(plane, ring) for plane, own in enumerate(planes.outline) for ring in own]
+    table = planes._asdict()
+    kind, outline, adjacency = (table.pop(name) for name in ("kind", "outline", "adjacency"))
+    arrays = {f"plane_{name}": _array(values) for name, values in table.items()}
+    arrays["plane_offset"] = (
+        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ origin
+    )
+    arrays |= {f"plane_{name}": moved(table[name]) for name in ("centroid", "center")}
+    if kind is not None:
+        arrays["plane_kind"] = np.array(PLANE_KINDS)[_array(kind)]
+    if adjacency is not None:
+        names = (f"adjacency_{name}" for name in adjacency._fields)
+        arrays |= zip(names, map(_array, adjacency), strict=True)
+    if outline is not None:
+        rings = [(plane, ring) for plane, own in enumerate(outline) for ring in own]
         arrays["outline_points"] = moved(torch.cat([planes.center[:0], *(r for _, r in rings)]))
         arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], dtype=np.int64)
         arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)

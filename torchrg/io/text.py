@@ -2,54 +2,103 @@
 
 A first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns;
 without it :func:`torchrg.io.fields.name_columns` does. A line of one number before the first point
-is the count of points that some programs write, and is skipped.
+is the count of points that some programs write, and is skipped. The rows of numbers in ASCII files
+of other formats are read here, too.
 """
 
-import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, name_columns
-from torchrg.io.files import atomic_path, check_file
+from torchrg.io.files import atomic_path, check_promise
 from torchrg.structures import Cloud
 
 LINES_AT_ONCE = 65_536
+"""Lines that are parsed or formatted together; bounds memory."""
+_COUNTED_BYTES = 1 << 16
+"""How much of a file is read to tell how long its lines are."""
+_COMMENTS = ("#", "//")
 
 
-def read_table(
+def read_text(path: Path, size: int) -> Cloud:
+    """Read points as text, always in float64."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        lines = iter(stream)
+        opening = _read_opening(path, lines)
+        table = _read_table(
+            path,
+            chain([opening.line], lines),
+            np.dtype([("row", "f8", (opening.num_columns,))]),
+            first_line=opening.line_number,
+            delimiter=opening.delimiter,
+            comments=_COMMENTS[0],
+        )["row"]
+    if opening.names is None:
+        return assemble_cloud(path, name_columns(table))
+    return assemble_cloud(path, {name: table[:, i] for i, name in enumerate(opening.names)})
+
+
+def write_text(path: Path, cloud: Cloud) -> None:
+    """Write points as text that reads back to the same values, names of fields in a comment."""
+    columns = flatten_cloud(path, cloud, Spelling())
+    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
+        if cloud.fields:
+            stream.write(f"# {' '.join(columns)}\n")
+        stream.writelines(_format_table(columns.values()))
+
+
+def count_text(path: Path, stream: BinaryIO, size: int) -> int:
+    """Return about the number of lines, by the length of the first."""
+    sample = stream.read(_COUNTED_BYTES)
+    return round(sample.count(b"\n") * size / max(len(sample), 1))
+
+
+def read_ascii(
+    path: Path,
+    stream: BinaryIO,
+    dtype: np.dtype[Any],
+    *,
+    num_rows: int,
+    size: int,
+    num_lines: int,
+    skipped: int = 0,
+    content: str,
+) -> NDArray[np.void]:
+    """Read rows of a structured type from an ASCII file of ``size`` bytes.
+
+    The stream stands behind the header of ``num_lines`` lines; ``skipped`` lines come before the
+    rows, of which the header promises ``num_rows``. ``content`` is what rows are, for messages.
+    """
+    start = stream.tell()
+    # A digit and what separates it from the next; the last may end with the file.
+    least = num_rows * _num_columns(dtype) * 2 - 1
+    content = f"{num_rows:,} {content}"
+    check_promise(path, start, least, content, available=size - start, at_least=True)
+    lines = (raw.decode("latin-1") for raw in stream)
+    first_line = num_lines + 1 + sum(1 for _ in islice(lines, skipped))
+    return _read_table(path, lines, dtype, first_line=first_line, num_rows=num_rows)
+
+
+def _read_table(
     path: Path,
     lines: Iterator[str],
-    dtype: DTypeLike,
+    dtype: np.dtype[Any],
     *,
     first_line: int,
     num_rows: int | None = None,
     delimiter: str | None = None,
     comments: str | None = None,
 ) -> NDArray[np.void]:
-    """Read rows of numbers; blank lines do not count.
+    """Read rows of numbers, all by default; blank lines do not count.
 
-    Args:
-        path: The file, for messages.
-        lines: Its lines from the first row on; read only as far as needed.
-        dtype: A structured type; the lengths of its subarrays add up to the columns of a row.
-        first_line: Number of the first line, counted from one, for messages.
-        num_rows: Rows to read. Default: all.
-        delimiter: What stands between two numbers. Default: white space.
-        comments: What starts a comment. Default: nothing does.
-
-    Returns:
-        The rows, shape ``(num_rows,)``.
-
-    Raises:
-        FormatError: If a line does not hold the numbers of a row, or there are too few lines.
+    Lines are read only as far as needed, the first of them being number ``first_line`` of the file.
     """
-    dtype = np.dtype(dtype)
     blocks, count, line_number = [np.empty(0, dtype)], 0, first_line
     while num_rows is None or count < num_rows:
         limit = LINES_AT_ONCE if num_rows is None else min(LINES_AT_ONCE, num_rows - count)
@@ -71,76 +120,49 @@ def read_table(
 def _parse(
     path: Path,
     block: Sequence[str],
-    dtype: np.dtype[np.void],
+    dtype: np.dtype[Any],
     line_number: int,
     delimiter: str | None,
     comments: str | None,
 ) -> NDArray[np.void]:
     """Parse a block of lines, and name the first one that is wrong."""
-    filled = [line for line in block if not _is_blank(line, comments)]
-    if not filled:
+
+    def parse(lines: list[str]) -> NDArray[np.void]:
+        return np.loadtxt(lines, dtype, delimiter=delimiter, comments=comments, ndmin=1)
+
+    numbered = [
+        (number, line)
+        for number, line in enumerate(block, start=line_number)
+        if (text := line.strip()) and (comments is None or not text.startswith(comments))
+    ]
+    if not numbered:
         return np.empty(0, dtype)
     try:
-        return np.loadtxt(filled, dtype, delimiter=delimiter, comments=comments, ndmin=1)
+        return parse([line for _, line in numbered])
     except (ValueError, OverflowError):
         pass
-    for number, line in enumerate(block, start=line_number):
-        if _is_blank(line, comments):
-            continue
+    for number, line in numbered:
         try:
-            np.loadtxt([line], dtype, delimiter=delimiter, comments=comments, ndmin=1)
+            parse([line])
         except (ValueError, OverflowError) as error:
-            columns = sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
             text = line.strip()
             shown = text if len(text) <= 60 else f"{text[:57]}..."
             raise FormatError(
-                f"{path}: line {number}: expected {columns} numbers, got {shown!r}; "
+                f"{path}: line {number}: expected {_num_columns(dtype)} numbers, got {shown!r}; "
                 "repair or delete this line."
             ) from error
     raise FormatError(f"{path}: line {line_number}: expected rows of numbers; write it again.")
 
 
-def _is_blank(line: str, comments: str | None) -> bool:
-    """Whether a line holds no row."""
-    text = line.strip()
-    return not text or (comments is not None and text.startswith(comments))
+def _num_columns(dtype: np.dtype[Any]) -> int:
+    """Return the number of columns of a row."""
+    return sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
 
 
-def format_table(columns: Iterable[NDArray[np.generic]]) -> Iterator[str]:
-    r"""Format columns of numbers as text that reads back to the same values.
+class _Opening(NamedTuple):
+    """What the lines up to the first point say, and that point's line, numbered from one.
 
-    Args:
-        columns: Columns of equal length ``N``, of whole numbers or floating point.
-
-    Yields:
-        Rows separated by newlines, a block at a time.
-
-    Example:
-        >>> "".join(format_table([np.array([0.1, 2.0]), np.array([3, 4], dtype=np.uint8)]))
-        '0.1 3\n2.0 4\n'
-    """
-    kept = list(columns)
-    # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
-    marks = {"f4": "%.9g", "f8": "%r"}
-    row = " ".join(marks.get(column.dtype.str[1:], "%d") for column in kept) + "\n"
-    for start in range(0, len(kept[0]), LINES_AT_ONCE):
-        block = [column[start : start + LINES_AT_ONCE].tolist() for column in kept]
-        values = tuple(chain.from_iterable(zip(*block, strict=True)))
-        yield row * len(block[0]) % values
-
-
-COMMENTS = ("#", "//")
-
-
-class Opening(NamedTuple):
-    """What the lines up to the first point say.
-
-    Attributes:
-        names: Names of the columns, None without a header.
-        delimiter: What stands between two numbers, None for white space.
-        num_columns: Numbers in a line.
-        line: The line of the first point.
-        line_number: Its number, counted from one.
+    Names are None without a header, the delimiter is None for white space.
     """
 
     names: list[str] | None
@@ -150,59 +172,13 @@ class Opening(NamedTuple):
     line_number: int
 
 
-def read_text(path: Path) -> Cloud:
-    """Read points as text, always in float64.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The cloud.
-
-    Raises:
-        FormatError: If a line is not numbers, or has not as many as the first.
-    """
-    check_file(path)
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        lines = iter(stream)
-        opening = _read_opening(path, lines)
-        table = read_table(
-            path,
-            itertools.chain([opening.line], lines),
-            [("row", "f8", (opening.num_columns,))],
-            first_line=opening.line_number,
-            delimiter=opening.delimiter,
-            comments=COMMENTS[0],
-        )["row"]
-    if opening.names is None:
-        return assemble_cloud(path, name_columns(table))
-    return assemble_cloud(path, {name: table[:, i] for i, name in enumerate(opening.names)})
-
-
-def write_text(path: Path, cloud: Cloud) -> None:
-    """Write points as text that reads back to the same values, with the names in a first comment.
-
-    Args:
-        path: The file.
-        cloud: The cloud. A cloud without fields has no comment.
-
-    Raises:
-        FormatError: If a field cannot be a column, or the file cannot be written.
-    """
-    columns = flatten_cloud(path, cloud, Spelling())
-    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
-        if cloud.fields:
-            stream.write(f"# {' '.join(columns)}\n")
-        stream.writelines(format_table(columns.values()))
-
-
-def _read_opening(path: Path, lines: Iterator[str]) -> Opening:
+def _read_opening(path: Path, lines: Iterator[str]) -> _Opening:
     """Read up to the first line of numbers."""
     names: list[str] | None = None
     for number, line in enumerate(lines, start=1):
         text = line.strip()
-        is_comment = text.startswith(COMMENTS)
-        bare = text.lstrip("#/") if is_comment else text.split(COMMENTS[0])[0]
+        is_comment = text.startswith(_COMMENTS)
+        bare = text.lstrip("#/") if is_comment else text.split(_COMMENTS[0])[0]
         delimiter = next((mark for mark in ",;" if mark in bare), None)
         words = [word.strip().strip("\"'") for word in bare.split(delimiter)]
         are_numbers = [_is_number(word) for word in words]
@@ -224,7 +200,7 @@ def _read_opening(path: Path, lines: Iterator[str]) -> Opening:
                 "repair or delete this line."
             )
         else:
-            return Opening(names, delimiter, len(words), f"{text}\n", number)
+            return _Opening(names, delimiter, len(words), f"{text}\n", number)
     raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
 
 
@@ -240,3 +216,20 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _format_table(columns: Iterable[NDArray[np.generic]]) -> Iterator[str]:
+    r"""Yield columns as text that reads back to the same values, a block of lines at a time.
+
+    Example:
+        >>> "".join(_format_table([np.array([0.1, 2.0]), np.array([3, 4], dtype=np.uint8)]))
+        '0.1 3\n2.0 4\n'
+    """
+    kept = list(columns)
+    # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
+    marks = {"f4": "%.9g", "f8": "%r"}
+    row = " ".join(marks.get(column.dtype.str[1:], "%d") for column in kept) + "\n"
+    for start in range(0, len(kept[0]), LINES_AT_ONCE):
+        block = [column[start : start + LINES_AT_ONCE].tolist() for column in kept]
+        values = tuple(chain.from_iterable(zip(*block, strict=True)))
+        yield row * len(block[0]) % values
