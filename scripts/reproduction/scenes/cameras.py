@@ -1,4 +1,4 @@
-"""Pinhole cameras."""
+"""Depth cameras: pinhole geometry, the noise of a Kinect, and frames fused to a cloud."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from reproduction.scenes.rays import cast_rays
 from torchrg.errors import ConfigError
-from torchrg.scenes.geometry import Array, Frame, cos_sin, cross, unit
-from torchrg.scenes.rooms import RoomLayout, build_room
-from torchrg.scenes.sampling import cast_rays
-from torchrg.scenes.scene import Scene, SceneModel, label_points, random_stream
+from torchrg.scenes import RoomLayout, Scene, SceneModel, build_room
+from torchrg.scenes.geometry import Array, Frame, unit
+from torchrg.scenes.scene import label_points, seeded_generator
 from torchrg.structures import UNLABELED
 
-_CAMERA_STREAM = 300
+_CAMERAS = 300
 _GOLDEN_ANGLE = (3 - np.sqrt(5)) * np.pi
 _STEEPEST = 0.5  # tangent of the steepest look downwards
 
@@ -82,8 +82,8 @@ class Camera:
         if not forwards[:2].any():
             raise ConfigError("Camera: expected a target not above or below the position.")
         forwards = unit(forwards)
-        right = unit(cross(forwards, np.array([0, 0, 1.0])))
-        frame = Frame(origin, np.stack([right, cross(forwards, right), forwards]))
+        right = unit(np.cross(forwards, np.array([0, 0, 1.0])))
+        frame = Frame(origin, np.stack([right, np.cross(forwards, right), forwards]))
         focal = 525 * width / 640 if focal is None else focal
         return cls(frame, width, height, focal, focal)
 
@@ -138,13 +138,13 @@ def cameras_around(
         >>> len(cameras_around(build_room(), 5))
         5
     """
-    rng = random_stream(seed, _CAMERA_STREAM)
-    cosines, sines = cos_sin(rng.random() * 2 * np.pi + _GOLDEN_ANGLE * np.arange(num_cameras))
+    rng = seeded_generator(seed, _CAMERAS)
+    headings = rng.random() * 2 * np.pi + _GOLDEN_ANGLE * np.arange(num_cameras)
     drops = rng.random(num_cameras) * _STEEPEST
     cameras = []
-    for number, (cosine, sine, drop) in enumerate(zip(cosines, sines, drops, strict=True)):
+    for number, (heading, drop) in enumerate(zip(headings, drops, strict=True)):
         position = model.viewpoints[number % len(model.viewpoints)]
-        target = position + np.array([cosine, sine, -drop])
+        target = position + np.array([np.cos(heading), np.sin(heading), -drop])
         cameras.append(Camera.looking(position, target, width=width, height=height))
     return cameras
 
@@ -154,7 +154,7 @@ Sensor = Literal["exact", "kinect"]
 _KINECT_BASELINE = 0.075  # metres
 _KINECT_RANGE = (0.4, 8.0)  # metres
 _DISPARITY_STEP = 1 / 8  # pixels
-_NOISE_STREAM = 200
+_SENSOR_NOISE = 200
 
 
 class DepthFrame(NamedTuple):
@@ -215,16 +215,16 @@ def render_depth(
         raise ConfigError(f"render_depth: expected sensor to be one of {options}, got {sensor!r}.")
     camera = cameras_around(model, 1, seed=seed)[0] if camera is None else camera
     rays = camera.rays()
-    steps = camera.frame.turned(rays.reshape(-1, 3))
+    steps = camera.frame.vectors_to_world(rays.reshape(-1, 3))
     exact, faces = cast_rays(model, camera.frame.origin, steps.reshape(rays.shape))
     normals = np.zeros_like(steps)
     for face, surface in enumerate(model.surfaces):
         rows = np.flatnonzero(faces == face)
         points = camera.frame.origin + exact.ravel()[rows, None] * steps[rows]
-        normals[rows] = camera.frame.turned_back(surface.normals_at(points))
+        normals[rows] = camera.frame.vectors_to_local(surface.normals_at(points))
     depth = np.where(faces == UNLABELED, 0, exact)
     if sensor == "kinect":
-        depth = _as_kinect(depth, camera.fx, random_stream(seed, _NOISE_STREAM))
+        depth = _as_kinect(depth, camera.fx, seeded_generator(seed, _SENSOR_NOISE))
     seen = depth > 0
     return DepthFrame(
         depth=torch.from_numpy(depth.astype(np.float32)),
@@ -261,14 +261,13 @@ KINECT_LAYOUT = RoomLayout(
 )
 """An office small enough for the range of a Kinect."""
 
-_FUSING_STREAM = 400
+_FUSION = 400
 
 
 def make_kinect_room(
     num_points: int = 968_520,
     seed: int = 0,
     *,
-    layout: RoomLayout | None = None,
     num_frames: int = 16,
     sensor: Sensor = "kinect",
 ) -> Scene:
@@ -279,8 +278,7 @@ def make_kinect_room(
 
     Args:
         num_points: Number of points, a random subset of the pixels with depth.
-        seed: Two calls with equal arguments give equal clouds, on every platform.
-        layout: What is in the room. Default: ``KINECT_LAYOUT``.
+        seed: Two calls with equal arguments give equal clouds.
         num_frames: Frames of 640 x 480 pixels, taken around the viewpoints of the room.
         sensor: See :func:`render_depth`.
 
@@ -294,7 +292,7 @@ def make_kinect_room(
         >>> make_kinect_room(1000, num_frames=1).points.shape
         torch.Size([1000, 3])
     """
-    model = build_room(seed, layout=layout or KINECT_LAYOUT)
+    model = build_room(seed, layout=KINECT_LAYOUT)
     frames = [
         render_depth(model, camera, sensor=sensor, seed=seed * num_frames + number)
         for number, camera in enumerate(cameras_around(model, num_frames, seed=seed))
@@ -332,7 +330,7 @@ def fuse_frames(
             f"fuse_frames: expected num_points in [1, {sum(counts)}], the pixels with depth, "
             f"got {num_points}; take fewer points or more frames."
         )
-    chosen = np.sort(random_stream(seed, _FUSING_STREAM).permutation(sum(counts))[:num_points])
+    chosen = np.sort(seeded_generator(seed, _FUSION).permutation(sum(counts))[:num_points])
     ends = np.cumsum([0, *counts])
     rows = [
         pixels[chosen[(chosen >= start) & (chosen < end)] - start]
@@ -342,13 +340,12 @@ def fuse_frames(
     points = np.concatenate([places for places, _, _ in fused])
     normals = np.concatenate([outwards for _, outwards, _ in fused])
     labels = np.concatenate([faces for _, _, faces in fused])
-    order = random_stream(seed, _FUSING_STREAM + 1).permutation(num_points)
+    order = seeded_generator(seed, _FUSION + 1).permutation(num_points)
     return label_points(
         model,
         points[order].astype(np.float32),
         labels[order],
         normals[order].astype(np.float32),
-        None,
     )
 
 
@@ -362,6 +359,6 @@ def _to_world(
     place = frame.camera.frame
     return (
         place.to_world(depth * rays),
-        place.turned(normals),
+        place.vectors_to_world(normals),
         frame.labels.numpy().ravel()[pixels],
     )
