@@ -16,9 +16,36 @@ from torchrg.scenes.geometry import Array, Frame, unit
 from torchrg.scenes.scene import label_points, seeded_generator
 from torchrg.structures import UNLABELED
 
-_CAMERAS = 300
+Sensor = Literal["exact", "kinect"]
+
+_SENSOR_NOISE, _CAMERAS, _FUSION = 200, 300, 400
+"""What random numbers are drawn for."""
+
 _GOLDEN_ANGLE = (3 - np.sqrt(5)) * np.pi
-_STEEPEST = 0.5  # tangent of the steepest look downwards
+_STEEPEST = 0.5
+"""Tangent of the steepest look downwards."""
+
+_KINECT_BASELINE = 0.075
+"""Metres."""
+_KINECT_RANGE = (0.4, 8.0)
+"""Metres."""
+_DISPARITY_STEP = 1 / 8
+"""Pixels."""
+_NOISE_FLOOR, _NOISE_GROWTH = 0.0012, 0.0019
+"""Standard deviation at the nearest depth, metres, and its growth with the square beyond it."""
+
+KINECT_LAYOUT = RoomLayout(
+    size=(5.4, 4.4, 2.6),
+    num_doors=1,
+    num_windows=1,
+    num_cabinets=1,
+    num_tables=2,
+    num_boxes=1,
+    num_small_boxes=2,
+    num_pillars=0,
+    num_viewpoints=2,
+)
+"""An office small enough for the range of a Kinect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +60,8 @@ class Camera:
         frame: Position and axes in the world.
         width: Pixels in a row.
         height: Pixels in a column.
-        fx: Focal length in pixels.
-        fy: Focal length in pixels.
-        cx: Column of the optical axis. Default: the middle.
-        cy: Row of the optical axis. Default: the middle.
+        fx: Focal length in pixels; ``fy``: the same for columns.
+        cx: Column of the optical axis, ``cy`` its row. Default: the middle.
 
     Example:
         >>> camera = Camera.looking((1, 1, 1.5), (4, 1, 1.5))
@@ -64,15 +89,7 @@ class Camera:
     ) -> "Camera":
         """Return an upright camera that looks at a place, not straight up or down.
 
-        Args:
-            position: Where it is, shape ``(3,)``.
-            target: What is in the middle of the picture, shape ``(3,)``.
-            width: Pixels in a row.
-            height: Pixels in a column.
-            focal: Focal length in pixels. Default: as wide a view as that of a Kinect.
-
-        Returns:
-            The camera.
+        ``focal`` is the focal length in pixels; by default the view is as wide as a Kinect's.
 
         Raises:
             ConfigError: If the view is vertical.
@@ -122,16 +139,8 @@ def cameras_around(
 ) -> list[Camera]:
     """Return cameras at the viewpoints of a scene, as of someone who turns around and looks down.
 
-    Args:
-        model: The scene.
-        num_cameras: How many; they take turns at the viewpoints, in directions apart by the golden
-            angle.
-        seed: Of the first direction and of how far down they look.
-        width: Pixels in a row.
-        height: Pixels in a column.
-
-    Returns:
-        The cameras.
+    They take turns at the viewpoints, in directions apart by the golden angle; the seed is that of
+    the first direction and of how far down they look.
 
     Example:
         >>> from torchrg.scenes import build_room
@@ -147,14 +156,6 @@ def cameras_around(
         target = position + np.array([np.cos(heading), np.sin(heading), -drop])
         cameras.append(Camera.looking(position, target, width=width, height=height))
     return cameras
-
-
-Sensor = Literal["exact", "kinect"]
-
-_KINECT_BASELINE = 0.075  # metres
-_KINECT_RANGE = (0.4, 8.0)  # metres
-_DISPARITY_STEP = 1 / 8  # pixels
-_SENSOR_NOISE = 200
 
 
 class DepthFrame(NamedTuple):
@@ -193,9 +194,6 @@ def render_depth(
         camera: Default: the first of :func:`cameras_around`.
         sensor: ``"exact"`` or ``"kinect"``.
         seed: Of the noise, and of the default camera.
-
-    Returns:
-        The frame.
 
     Raises:
         ConfigError: If there is no such sensor.
@@ -241,27 +239,13 @@ def _as_kinect(depth: Array, focal: float, rng: np.random.Generator) -> Array:
     """Return depth with the noise and the steps of a Kinect; 0 where out of its range."""
     nearest, furthest = _KINECT_RANGE
     beyond = depth - nearest
-    noisy = depth + (0.0012 + 0.0019 * beyond * beyond) * rng.standard_normal(depth.shape)
+    noisy = depth + (_NOISE_FLOOR + _NOISE_GROWTH * beyond * beyond) * rng.standard_normal(
+        depth.shape
+    )
     scale = focal * _KINECT_BASELINE / _DISPARITY_STEP
     valid = (depth > 0) & (noisy >= nearest) & (noisy <= furthest)
     steps = np.rint(scale / np.where(valid, noisy, 1))
     return np.where(valid, scale / steps, 0)
-
-
-KINECT_LAYOUT = RoomLayout(
-    size=(5.4, 4.4, 2.6),
-    num_doors=1,
-    num_windows=1,
-    num_cabinets=1,
-    num_tables=2,
-    num_boxes=1,
-    num_small_boxes=2,
-    num_pillars=0,
-    num_viewpoints=2,
-)
-"""An office small enough for the range of a Kinect."""
-
-_FUSION = 400
 
 
 def make_kinect_room(
@@ -273,17 +257,8 @@ def make_kinect_room(
 ) -> Scene:
     """Make a cloud of a room from simulated depth frames, placed by their true poses.
 
-    Convention:
-        As for :func:`make_room`; normals are those of the faces, towards free space.
-
-    Args:
-        num_points: Number of points, a random subset of the pixels with depth.
-        seed: Two calls with equal arguments give equal clouds.
-        num_frames: Frames of 640 x 480 pixels, taken around the viewpoints of the room.
-        sensor: See :func:`render_depth`.
-
-    Returns:
-        The cloud and its truth, in random order.
+    The points are a random subset of the pixels with depth, in random order; normals are those of
+    the faces, towards free space.
 
     Raises:
         ConfigError: If a setting is not allowed, or the frames have too few pixels with depth.
@@ -303,16 +278,7 @@ def make_kinect_room(
 def fuse_frames(
     model: SceneModel, frames: Sequence[DepthFrame], num_points: int, *, seed: int = 0
 ) -> Scene:
-    """Return depth frames of one scene as one cloud.
-
-    Args:
-        model: The scene.
-        frames: The frames.
-        num_points: Number of points, a random subset of the pixels with depth.
-        seed: Of the choice and the order.
-
-    Returns:
-        The cloud and its truth, in random order.
+    """Return a random subset of the pixels with depth of frames of one scene, in random order.
 
     Raises:
         ConfigError: If the frames have too few pixels with depth.
