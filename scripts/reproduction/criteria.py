@@ -55,14 +55,7 @@ class Case(NamedTuple):
 
 
 def reproduce(run: Run) -> Record:
-    """Make Figure 5.
-
-    Args:
-        run: The call.
-
-    Returns:
-        The section.
-    """
+    """Make Figure 5."""
     floor = _square(-_SIDE, 0)
     wall = _square(0, _SIDE)[:, [2, 1, 0]]
     raised = _square(0, _SIDE) + torch.tensor([0.0, 0.0, 1.5])

@@ -16,14 +16,7 @@ ANGLES_DEG = (2.0, 5.0, 8.0)
 
 
 def reproduce(run: Run) -> Record:
-    """Make Figure 9.
-
-    Args:
-        run: The call.
-
-    Returns:
-        The section.
-    """
+    """Make Figure 9."""
     words = (
         "The paper shows its method on these clouds at several angles, without numbers. Normals "
         "and sharp points are those of the preset, at 5 degrees, whatever the angle of growth."

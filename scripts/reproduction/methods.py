@@ -24,14 +24,7 @@ DRAWN = tuple(method for method in METHODS if "@" not in method)
 
 
 def settings_of(method: str) -> PipelineConfig:
-    """Return the settings of a method.
-
-    Args:
-        method: A key of :data:`METHODS`.
-
-    Returns:
-        Those of its preset, with its own connectivity if it has one.
-    """
+    """Return the settings of a method: its preset's, with its own connectivity if it has one."""
     preset, _, connectivity = method.partition("@")
     settings = load_config(preset)
     if not connectivity:

@@ -30,13 +30,7 @@ _WIDTH = 700
 
 
 def draw_errors(path: Path, records: list[Record], shapes: Sequence[str]) -> None:
-    """Draw MSAE against noise, a panel for each shape.
-
-    Args:
-        path: The picture to write.
-        records: What was measured, of one number of points.
-        shapes: What to draw.
-    """
+    """Draw MSAE against noise, of one number of points, a panel for each shape."""
     with settings():
         _draw_grid(path, records, shapes)
 

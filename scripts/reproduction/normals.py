@@ -86,14 +86,7 @@ neighbourhoods."""
 
 
 def reproduce(run: Run) -> Record:
-    """Make Table 1 and Figures 3 and 4.
-
-    Args:
-        run: The call.
-
-    Returns:
-        The section.
-    """
+    """Make Table 1 and Figures 3 and 4."""
     grids = QUICK if run.quick else FULL
     cells = dict.fromkeys(
         (noise, shape, grid.num_points, variant)

@@ -16,8 +16,11 @@ from torchrg.render import color_planes, render_cloud, tile_pictures, write_png
 from torchrg.structures import UNLABELED
 
 _GRAY = 190
+"""Of clouds without colours."""
 _WIDTH = 1000
-_LONG = 2.2  # width over height of a picture that takes the place of two
+"""Of a picture, in pixels."""
+_LONG = 2.2
+"""Width over height of a picture that takes the place of two."""
 
 OUTCOMES = {
     "right": ((214, 224, 214), "in the region of their face"),
@@ -63,17 +66,7 @@ def draw_side_by_side(
 def draw_outcomes(
     folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]
 ) -> str:
-    """Draw what became of every point of a cloud with truth, in the colours of :data:`OUTCOMES`.
-
-    Args:
-        folder: Where the picture goes.
-        name: Of the picture.
-        cloud: The cloud, with labels.
-        labelings: Labels by title.
-
-    Returns:
-        The name of the file.
-    """
+    """Draw what became of every point of a cloud with truth, in the colours of :data:`OUTCOMES`."""
     colors = torch.tensor([color for color, _ in OUTCOMES.values()], dtype=torch.uint8)
     paints = {
         title: colors[outcomes_of(labels, cloud.labels)] for title, labels in labelings.items()

@@ -37,14 +37,7 @@ PRINTED = {"classic": "[28]", "detmm": "[38]", "paper": "proposed"}
 
 
 def reproduce(run: Run) -> Record:
-    """Make Table 2 with Figures 7 and 8.
-
-    Args:
-        run: The call.
-
-    Returns:
-        The section.
-    """
+    """Make Table 2 with Figures 7 and 8."""
     blocks = [
         text(
             "Precision, recall and F1 are the paper's: means over the pairs of a region and a face "

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -11,11 +12,7 @@ from reproduction.cells import Record
 from reproduction.methods import settings_of
 from reproduction.runs import Run
 from torchrg import Cloud, read_cloud, segment_planes, write_cloud
-from torchrg.metrics import (
-    score_clusters,
-    score_labels,
-    score_normals,
-)
+from torchrg.metrics import score_clusters, score_labels, score_normals
 from torchrg.regions import grow_regions
 
 SAMPLE_SIZE = 4000
@@ -24,13 +21,7 @@ SAMPLE_SIZE = 4000
 
 @dataclass(frozen=True)
 class Segmented:
-    """What a segmentation gave, read back from its file.
-
-    Attributes:
-        labels: Shape ``(N,)``, int64.
-        normals: Shape ``(N, 3)``.
-        valid: Shape ``(N,)``, bool.
-    """
+    """Labels ``(N,)``, normals ``(N, 3)`` and validity ``(N,)``, read back from a file."""
 
     labels: Tensor
     normals: Tensor
@@ -38,35 +29,21 @@ class Segmented:
 
 
 def segment(run: Run, key: str, preset: str) -> Record:
-    """Segment a cloud, and return the seconds of each stage.
-
-    Args:
-        run: The call.
-        key: Of the cloud.
-        preset: A key of :data:`reproduction.methods.METHODS`.
-
-    Returns:
-        The record, with ``seconds`` by stage and their sum ``total``.
-    """
+    """Segment a cloud by a method, and return the seconds of each stage and their ``total``."""
     cloud = run.cloud(key).cloud
     target = _result_path(run, key, preset)
 
     def work() -> Record:
         run.warm_up(preset)
         print(f"{cloud.name}, {preset}:", end="", flush=True)
-        begins: dict[str, float] = {}
+        begins: list[tuple[str, float]] = []
 
         def note(stage: str) -> None:
-            begins[stage] = time.perf_counter()
+            begins.append((stage, time.perf_counter()))
             print(f" {stage}", end="", flush=True)
 
         seg = segment_planes(cloud.points, settings_of(preset), on_stage=note)
-        names, times = list(begins), list(begins.values())
-        seconds = {
-            name: end - begin
-            for name, begin, end in zip(names, times[:-1], times[1:], strict=False)
-        }
-        total = times[-1] - times[0]
+        total = begins[-1][1] - begins[0][1]
         print(f", {total:.1f} s", flush=True)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_cloud(target, Cloud(cloud.points.numpy()), seg)
@@ -74,7 +51,7 @@ def segment(run: Run, key: str, preset: str) -> Record:
             "cloud": key,
             "preset": preset,
             "points": len(cloud.points),
-            "seconds": seconds,
+            "seconds": {stage: end - begin for (stage, begin), (_, end) in pairwise(begins)},
             "total": total,
             "sharp_fraction": float(seg.sharp.double().mean()),
         }
@@ -130,18 +107,7 @@ def score(run: Run, key: str, preset: str, *, internal: bool) -> Record:
 def regrow(
     run: Run, key: str, preset: str, max_angle_deg: float, curvature_quantile: float
 ) -> Tensor:
-    """Return the labels that the normals of a preset give with other limits of growth.
-
-    Args:
-        run: The call.
-        key: Of the cloud.
-        preset: Normals and all other settings are those of this preset.
-        max_angle_deg: The limit of the angle.
-        curvature_quantile: The limit of the curvature.
-
-    Returns:
-        Labels, shape ``(N,)``, int64.
-    """
+    """Return the labels ``(N,)`` that a preset gives with other limits of growth."""
     growing = settings_of(preset).growing
     if (max_angle_deg, curvature_quantile) == (growing.max_angle_deg, growing.curvature_quantile):
         return read_segmented(run, key, preset).labels

@@ -28,14 +28,7 @@ _COLORS = {"classic": "#4878a8", "paper": "#c44e52", "consensus": "#2a7f3f"}
 
 
 def reproduce(run: Run) -> Record:
-    """Make the study of section II.B on the cloud of the tutorial.
-
-    Args:
-        run: The call.
-
-    Returns:
-        The section.
-    """
+    """Make the study of section II.B on the cloud of the tutorial."""
     cloud = run.cloud(KEY).cloud
     records = [_measure(run, preset, angle) for preset in PRESETS for angle in ANGLES_DEG]
     _draw(run.folder.place("figures/study.png"), records)

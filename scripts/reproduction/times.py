@@ -15,14 +15,7 @@ STAGES = ("neighbors", "normals", "regions", "planes")
 
 
 def reproduce(run: Run) -> Record:
-    """Make Table 3.
-
-    Args:
-        run: The call.
-
-    Returns:
-        The section.
-    """
+    """Make Table 3."""
     records = [segment(run, key, preset) for key in TITLES for preset in METHODS]
     blocks = [
         text(

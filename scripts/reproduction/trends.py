@@ -16,16 +16,7 @@ LARGE = 1000
 
 
 def face_recalls(run: Run, key: str, preset: str) -> Record:
-    """Return the recall of each true face that a region is paired with, and its points.
-
-    Args:
-        run: The call.
-        key: Of a cloud with truth.
-        preset: A key of :data:`METHODS`.
-
-    Returns:
-        Recall in percent and number of points by face, under ``faces``.
-    """
+    """Return recall in percent and number of points of each true face with a paired region."""
     cloud = run.cloud(key).cloud
 
     def work() -> Record:

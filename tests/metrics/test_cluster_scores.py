@@ -9,6 +9,7 @@ import torch
 from tests.metrics.sphere_clusters import indices_by_loops, scattered
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import METRICS, ClusterScore, score_clusters
+from torchrg.metrics.sphere import _rim
 
 INDICES = ("cp", "sp", "dbi", "dvi")
 
@@ -268,3 +269,9 @@ def test_normals_on_the_device_score_as_on_the_cpu(device, rng):
     directions, labels = scattered(rng, [30, 40, 50], 0.2)
     there = score_clusters(directions.to(device), labels.to(device))
     assert indices(there) == pytest.approx(indices(score_clusters(directions, labels)), rel=1e-9)
+
+
+def test_only_the_rim_of_an_arc_can_hold_its_diameter():
+    angles = torch.linspace(-0.1, 0.1, 101, dtype=torch.float64)
+    arc = torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], dim=1)
+    assert len(_rim(arc, arc[50])) == 2

@@ -16,20 +16,13 @@ from torchmetrics.clustering import (  # noqa: E402
 )
 
 from tests.metrics.sphere_clusters import scattered  # noqa: E402
+from torchrg.errors import ConfigError  # noqa: E402
 from torchrg.metrics import METRICS, modules, score_clusters, score_labels  # noqa: E402
 from torchrg.metrics import score_normals as score_errors  # noqa: E402
+from torchrg.metrics.modules import PlaneMetric  # noqa: E402
 
-FAMILIES = {
-    "labels": modules.LabelScores,
-    "clusters": modules.ClusterScores,
-    "normals": modules.NormalScores,
-}
-SINGLE = [
-    (part, metric)
-    for part, family in FAMILIES.items()
-    for metric in vars(modules).values()
-    if isinstance(metric, type) and issubclass(metric, family) and metric is not family
-]
+NO_NAMES = ("points", "invalid", "clusters")  # of several parts, or of a part itself
+INDICES = [(part, name) for part in METRICS for name in METRICS[part] if name not in NO_NAMES]
 
 
 def values_of(metric):
@@ -53,9 +46,9 @@ def scans(part):
         yield arguments, score(*arguments)._asdict()
 
 
-@pytest.mark.parametrize("part", FAMILIES)
+@pytest.mark.parametrize("part", METRICS)
 def test_compute_is_the_mean_of_the_scores_of_the_scans(part):
-    metric, scores = FAMILIES[part](), []
+    metric, scores = PlaneMetric(part), []
     for arguments, score in scans(part):
         metric.update(*arguments)
         scores.append(score)
@@ -63,9 +56,9 @@ def test_compute_is_the_mean_of_the_scores_of_the_scans(part):
     assert values_of(metric) == pytest.approx(means, rel=1e-12)
 
 
-@pytest.mark.parametrize("part", FAMILIES)
+@pytest.mark.parametrize("part", METRICS)
 def test_forward_gives_the_score_of_one_scan_and_keeps_the_mean(part):
-    metric, updated = FAMILIES[part](), FAMILIES[part]()
+    metric, updated = PlaneMetric(part), PlaneMetric(part)
     for arguments, score in scans(part):
         values = {name: float(value) for name, value in metric(*arguments).items()}
         assert values == pytest.approx({k: float(v) for k, v in score.items()}, rel=1e-12)
@@ -73,50 +66,67 @@ def test_forward_gives_the_score_of_one_scan_and_keeps_the_mean(part):
     assert values_of(metric) == pytest.approx(values_of(updated), rel=1e-12)
 
 
-@pytest.mark.parametrize(("part", "single"), SINGLE)
-def test_each_index_is_the_one_it_is_named_for(part, single):
-    metric, family = single(), FAMILIES[part]()
+@pytest.mark.parametrize("part", METRICS)
+def test_each_index_is_the_one_it_is_named_for(part):
+    singles = {name: PlaneMetric(name) for of, name in INDICES if of == part}
+    whole = PlaneMetric(part)
     for arguments, _ in scans(part):
-        metric.update(*arguments)
-        family.update(*arguments)
-    assert metric.compute() == family.compute()[metric.index]
-    assert metric.compute().shape == ()
+        for metric in (whole, *singles.values()):
+            metric.update(*arguments)
+    for name, single in singles.items():
+        assert torch.equal(single.compute(), whole.compute()[name])
+        assert single.compute().shape == ()
 
 
-@pytest.mark.parametrize(("part", "single"), SINGLE)
-def test_direction_is_that_of_the_catalog(part, single):
-    assert single.higher_is_better is METRICS[part][single.index].higher_is_better
-    assert single.higher_is_better is not None
-    assert single.full_state_update is False
-    assert single.is_differentiable is False
+@pytest.mark.parametrize(("part", "name"), INDICES)
+def test_unit_and_direction_are_those_of_the_catalog(part, name):
+    metric = PlaneMetric(name)
+    assert (metric.part, metric.index) == (part, name)
+    assert (metric.unit, metric.higher_is_better) == METRICS[part][name]
+    assert metric.full_state_update is False
+    assert metric.is_differentiable is False
+
+
+def test_all_indices_of_a_part_have_no_direction():
+    whole = PlaneMetric("labels")
+    assert (whole.index, whole.unit, whole.higher_is_better) == (None, None, None)
+
+
+def test_unknown_indices_and_those_of_several_parts_are_refused():
+    with pytest.raises(ConfigError, match=r"expected index to be one of labels, .*, got 'f2'"):
+        PlaneMetric("f2")
+    with pytest.raises(ConfigError, match=r"'invalid' of clusters and normals; take PlaneMetric"):
+        PlaneMetric("invalid")
+    with pytest.raises(ValueError, match="Unexpected keyword arguments: `min_points`"):
+        PlaneMetric("f1", min_points=3)
 
 
 def test_directions_say_which_of_two_results_is_better():
     truth = torch.repeat_interleave(torch.arange(4), 25)
     merged = torch.where(truth == 1, 0, truth)
-    assert modules.PlaneF1.higher_is_better
-    assert modules.UnderSegmented.higher_is_better is False
-    for single in (modules.PlaneF1, modules.PlaneARI, modules.UnderSegmented, modules.MissedFaces):
-        right, wrong = single(), single()
+    assert PlaneMetric("f1").higher_is_better
+    assert PlaneMetric("under_segmented").higher_is_better is False
+    for name in ("f1", "ari", "under_segmented", "missed"):
+        right, wrong = PlaneMetric(name), PlaneMetric(name)
         right.update(truth, truth)
-        wrong.update(merged if single is not modules.MissedFaces else merged * 0 - 1, truth)
-        assert (right.compute() > wrong.compute()) == single.higher_is_better
+        wrong.update(merged if name != "missed" else merged * 0 - 1, truth)
+        assert (right.compute() > wrong.compute()) == right.higher_is_better
 
 
 @pytest.mark.filterwarnings("ignore:Sparse invariant checks:UserWarning")
 def test_agreement_with_torchmetrics_on_one_scan():
     for (labels, truth), _ in scans("labels"):
-        ours, theirs = modules.PlaneARI(), AdjustedRandScore()
+        ours, theirs = PlaneMetric("ari"), AdjustedRandScore()
         assert float(ours(labels, truth)) == pytest.approx(float(theirs(labels, truth)), abs=1e-6)
-        shared, reference = modules.PlaneNMI(), NormalizedMutualInfoScore()
+        shared, reference = PlaneMetric("nmi"), NormalizedMutualInfoScore()
         assert float(shared(labels, truth)) == pytest.approx(
             float(reference(labels, truth)), abs=1e-6
         )
 
 
-@pytest.mark.parametrize("part", FAMILIES)
+@pytest.mark.parametrize("part", METRICS)
 def test_states_of_two_workers_add_up(part):
-    whole, workers = FAMILIES[part](), [FAMILIES[part](), FAMILIES[part]()]
+    whole, workers = PlaneMetric(part), [PlaneMetric(part), PlaneMetric(part)]
     for number, (arguments, _) in enumerate(scans(part)):
         whole.update(*arguments)
         workers[number % 2].update(*arguments)
@@ -143,7 +153,7 @@ def test_processes_of_a_group_agree(tmp_path):
     for process in processes:
         process.join()
         assert process.exitcode == 0
-    whole = modules.PlaneF1()
+    whole = PlaneMetric("f1")
     for labels_and_truth, _ in scans("labels"):
         whole.update(*labels_and_truth)
     assert results == pytest.approx([float(whole.compute())] * 2, rel=1e-12)
@@ -153,7 +163,7 @@ def score_a_share(rank, rendezvous, queue):
     torch.distributed.init_process_group(
         "gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=2
     )
-    metric = modules.PlaneF1()
+    metric = PlaneMetric("f1")
     for number, (arguments, _) in enumerate(scans("labels")):
         if number % 2 == rank:
             metric.update(*arguments)
@@ -162,7 +172,7 @@ def score_a_share(rank, rendezvous, queue):
 
 
 def test_scans_without_an_index_do_not_count_for_it():
-    metric = modules.ClusterScores()
+    metric = PlaneMetric("clusters")
     normals, clusters = scattered(torch.Generator().manual_seed(0), [9, 9], 0.1)
     metric.update(normals, clusters)
     metric.update(normals, torch.zeros_like(clusters))
@@ -172,7 +182,7 @@ def test_scans_without_an_index_do_not_count_for_it():
 
 
 def test_an_infinite_index_makes_the_mean_infinite():
-    metric = modules.SphereDaviesBouldin()
+    metric = PlaneMetric("dbi")
     metric.update(torch.eye(3)[[0, 0]], torch.tensor([0, 1]))
     metric.update(torch.eye(3)[[0, 1]], torch.tensor([0, 1]))
     assert metric.compute() == torch.inf
@@ -181,12 +191,23 @@ def test_an_infinite_index_makes_the_mean_infinite():
 def test_no_scan_gives_nan():
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The ``compute`` method", category=UserWarning)
-        assert modules.PlaneF1().compute().isnan()
+        assert PlaneMetric("f1").compute().isnan()
+
+
+def test_a_tracker_knows_the_best_of_several_results():
+    truth = torch.repeat_interleave(torch.arange(4), 25)
+    tracker = torchmetrics.wrappers.MetricTracker(
+        PlaneMetric("missed"), maximize=PlaneMetric("missed").higher_is_better
+    )
+    for labels in (torch.where(truth == 1, -1, truth), truth, torch.zeros_like(truth) - 1):
+        tracker.increment()
+        tracker.update(labels, truth)
+    assert tracker.best_metric(return_step=True) == (0.0, 1)
 
 
 def test_settings_reach_the_function():
     labels, truth = torch.tensor([0, 0, 0, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 7, 7])
-    metric = modules.LabelScores(min_size=2, ignore=7)
+    metric = PlaneMetric("labels", min_size=2, ignore=7)
     metric.update(labels, truth)
     expected = score_labels(labels, truth, min_size=2, ignore=7)
     assert values_of(metric) == expected._asdict()
@@ -194,7 +215,7 @@ def test_settings_reach_the_function():
         torch.Generator().manual_seed(0), [90, 90, 5], 0.1, axes=torch.eye(3)[[0, 0, 1]]
     )
     settings = {"min_size": 2, "distinct_directions": True, "sample_size": 30}
-    merged = modules.ClusterScores(**settings)
+    merged = PlaneMetric("clusters", **settings)
     merged.update(normals, clusters)
     assert float(merged.compute()["dbi"]) == score_clusters(normals, clusters, **settings).dbi
 
@@ -206,29 +227,22 @@ def test_a_collection_scores_each_scan_once(monkeypatch):
         calls.append(arguments)
         return score_labels(*arguments, **settings)
 
-    monkeypatch.setattr("torchrg.metrics.modules.score_labels", counted)
-    collection = torchmetrics.MetricCollection(
-        [modules.PlaneF1(), modules.PlaneARI(), modules.MeanBestIoU(), modules.MissedFaces()]
-    )
+    monkeypatch.setitem(modules._SCORES, "labels", counted)
+    names = ("f1", "ari", "mean_best_iou", "missed")
+    collection = torchmetrics.MetricCollection({name: PlaneMetric(name) for name in names})
     data = list(scans("labels"))
     for arguments, _ in data:
         collection.update(*arguments)
     # The first scan shows that the states are the same; after that one of the four is enough.
     assert len(calls) == 4 + len(data) - 1
     values = {name: float(value) for name, value in collection.compute().items()}
-    assert values == pytest.approx(
-        {
-            "PlaneF1": np.mean([score["f1"] for _, score in data]),
-            "PlaneARI": np.mean([score["ari"] for _, score in data]),
-            "MeanBestIoU": np.mean([score["mean_best_iou"] for _, score in data]),
-            "MissedFaces": np.mean([score["missed"] for _, score in data]),
-        }
-    )
+    means = {name: np.mean([score[name] for _, score in data]) for name in names}
+    assert values == pytest.approx(means)
 
 
 def test_reset_forgets_and_copies_remember():
     (arguments, score), *_ = scans("labels")
-    metric = modules.PlaneF1()
+    metric = PlaneMetric("f1")
     metric.update(*arguments)
     for twin in (copy.deepcopy(metric), pickle.loads(pickle.dumps(metric))):
         assert float(twin.compute()) == score["f1"]
@@ -237,7 +251,7 @@ def test_reset_forgets_and_copies_remember():
 
 
 def test_metrics_on_the_device_compute_as_on_the_cpu(device):
-    metric, there = modules.LabelScores(), modules.LabelScores().to(device)
+    metric, there = PlaneMetric("labels"), PlaneMetric("labels").to(device)
     for arguments, _ in scans("labels"):
         metric.update(*arguments)
         there.update(*(tensor.to(device) for tensor in arguments))

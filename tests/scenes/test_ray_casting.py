@@ -8,20 +8,22 @@ from reproduction.scenes import (
     Camera,
     build_storey,
     cameras_around,
+    cast_rays,
     make_kinect_room,
     render_depth,
+    scan_scene,
 )
 from reproduction.scenes.cameras import KINECT_LAYOUT, fuse_frames
 from reproduction.scenes.extrusions import Outline, extrude
+from reproduction.scenes.rays import intersect, solve_quadratic
 from reproduction.scenes.shapes import Bumpy
 from scipy.stats import kstest
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import RoomLayout, SceneModel, build_room, make_room, sample_scene
-from torchrg.scenes.geometry import Frame, solve_quadratic, unit
+from torchrg.scenes import RoomLayout, SceneModel, build_room, make_room
+from torchrg.scenes.geometry import Frame, unit
 from torchrg.scenes.round import Cone, Ring
-from torchrg.scenes.sampling import cast_rays
-from torchrg.scenes.scene import Part, plane_table
+from torchrg.scenes.scene import Part, is_occupied, plane_table
 from torchrg.scenes.surfaces import Flat
 from torchrg.structures import UNLABELED
 
@@ -35,7 +37,7 @@ CURVED = RoomLayout(
     num_bent_walls=1,
     heading_deg=20,
 )
-TURNED = Frame.spanned(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2, 3]), np.array([0.0, 1, -1]))
+TILTED = Frame.spanned(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2, 3]), np.array([0.0, 1, -1]))
 
 
 @pytest.fixture
@@ -52,7 +54,7 @@ def _meet_triangle(origin, direction, corner, edge, other):
 
 def _triangles(surface):
     """Corner and edges in the world of the triangles of a flat surface."""
-    for corner, edge, other in surface.pieces:
+    for corner, edge, other in surface.cells:
         place = surface.frame.origin + corner @ surface.frame.axes[:2]
         first, second = edge @ surface.frame.axes[:2], other @ surface.frame.axes[:2]
         yield place, first, second
@@ -80,7 +82,7 @@ def test_rays_meet_a_convex_body_between_its_planes():
     rng = np.random.default_rng(0)
     origin = np.array([[0.3, -2.0, 0.4]])
     steps = rng.uniform(-0.7, 0.7, (2000, 3)) - origin
-    found = np.min([surface.intersect(origin, steps) for surface in surfaces], axis=0)
+    found = np.min([intersect(surface, origin, steps) for surface in surfaces], axis=0)
     slopes = steps @ normals.T
     distances = (offsets - origin @ normals.T) / slopes
     entry = np.where(slopes < 0, distances, -np.inf).max(axis=1)
@@ -92,17 +94,17 @@ def test_rays_meet_a_convex_body_between_its_planes():
 @pytest.mark.parametrize(
     "surface",
     [
-        Cone("", TURNED, (0.5, -1), (0.5, 1)),
-        Cone("", TURNED, (0.9, -1), (0.2, 1)),
-        Cone("", TURNED, (0, -1), (0.7, 0.2), (0.3, 4.0)),
-        Cone("", TURNED, (0.2, 0.1), (0.9, 0.1), (-1.0, 2.0)),
-        Ring("", TURNED, 0, 0.8),
-        Ring("", TURNED, 0, 0.8, (0.2, 1.2), (0.5, 3.0)),
-        Ring("", TURNED, 0.6, 0.3, (-np.pi, np.pi)),
-        Ring("", TURNED, 0.6, 0.3, (-0.5, 2.0), (1.0, 5.0)),
+        Cone("", TILTED, (0.5, -1), (0.5, 1)),
+        Cone("", TILTED, (0.9, -1), (0.2, 1)),
+        Cone("", TILTED, (0, -1), (0.7, 0.2), (0.3, 4.0)),
+        Cone("", TILTED, (0.2, 0.1), (0.9, 0.1), (-1.0, 2.0)),
+        Ring("", TILTED, 0, 0.8),
+        Ring("", TILTED, 0, 0.8, (0.2, 1.2), (0.5, 3.0)),
+        Ring("", TILTED, 0.6, 0.3, (-np.pi, np.pi)),
+        Ring("", TILTED, 0.6, 0.3, (-0.5, 2.0), (1.0, 5.0)),
         extrude(
             "",
-            TURNED,
+            TILTED,
             Outline(
                 np.array([[-1.0, -1], [1, -1], [-0.2, -0.2], [-1, 1]]),
                 np.full(4, 0.1),
@@ -110,7 +112,7 @@ def test_rays_meet_a_convex_body_between_its_planes():
             ),
             0.5,
         )[1],
-        Bumpy("", TURNED, 0.7, np.eye(3), np.full(3, 0.06), 5),
+        Bumpy("", TILTED, 0.7, np.eye(3), np.full(3, 0.06), 5),
     ],
     ids=lambda surface: f"{type(surface).__name__}-{surface.plane is not None}",
 )
@@ -119,7 +121,7 @@ def test_rays_meet_curved_surfaces_where_their_points_are(surface):
     origin = np.array([[1.5, -1.0, 0.9]])
     # A ray to a point of the surface meets it there or before, at a point of the surface.
     targets = surface.sample(rng, 1000)
-    found = surface.intersect(origin, targets - origin)
+    found = intersect(surface, origin, targets - origin)
     met = found <= 1 + 1e-7
     # A body with bumps is followed in steps, and may be missed where it is only grazed.
     assert met.mean() > (0.995 if isinstance(surface, Bumpy) else 1 - 1e-9)
@@ -130,7 +132,7 @@ def test_rays_meet_curved_surfaces_where_their_points_are(surface):
     assert gaps.max() < 6 * (surface.area / 60_000) ** 0.5
     # And nowhere before that: places in between are off the surface, seen along the normals.
     assert np.isin(np.isclose(found, 1), [True]).any()
-    again = surface.intersect(first + 1e-6 * (targets - origin), targets - origin)
+    again = intersect(surface, first + 1e-6 * (targets - origin), targets - origin)
     assert (again[found < 1 - 1e-5] < np.inf).all()
 
 
@@ -141,14 +143,14 @@ def test_path_to_the_nearest_hit_is_free_and_what_is_behind_is_not(seed, directi
     hits = cast_rays(model, origin, directions)
     distances, faces = hits.distances.ravel(), hits.faces.ravel()
     for share in np.linspace(0.01, 0.9999, 60):
-        assert not model.occupied(origin + share * distances[:, None] * steps).any()
+        assert not is_occupied(model.parts, origin + share * distances[:, None] * steps).any()
     bodies = {
         row for row, surface in enumerate(model.surfaces) if model.parts[model.objects[row]].solids
     }
     of_body = np.isin(faces, list(bodies - set(range(6))))
     assert of_body.sum() > 100
     behind = origin + (distances[:, None] + 1e-6) * steps
-    assert model.occupied(behind[of_body]).all()
+    assert is_occupied(model.parts, behind[of_body]).all()
 
 
 @pytest.mark.parametrize(
@@ -203,7 +205,7 @@ def test_blocks_of_rays_miss_nothing():
 
 def test_scan_has_equal_steps_and_the_points_asked_for():
     model = build_room(0)
-    scan = sample_scene(model, 20_011, density="scan", order="scan")
+    scan = scan_scene(model, 20_011)
     assert len(scan.points) == 20_011
     lines = scan.points.double() - torch.from_numpy(model.viewpoints[0])
     elevations = torch.rad2deg(torch.asin(lines[:, 2] / lines.norm(dim=1)))
@@ -220,7 +222,7 @@ def test_scan_has_equal_steps_and_the_points_asked_for():
 
 def test_scan_sees_only_what_is_in_sight():
     model = build_room(3)
-    scan = sample_scene(model, 3000, density="scan")
+    scan = scan_scene(model, 3000)
     lines = scan.points.double().numpy() - model.viewpoints[0]
     hits = cast_rays(model, model.viewpoints[0], lines[None])
     assert np.abs(hits.distances - 1).max() < 1e-5
@@ -232,7 +234,7 @@ def test_scan_sees_only_what_is_in_sight():
 
 def test_scans_from_several_places_share_the_points():
     model = build_room(0, layout=RoomLayout(num_viewpoints=3))
-    scan = sample_scene(model, 10_000, density="scan", order="scan")
+    scan = scan_scene(model, 10_000)
     assert len(scan.points) == 10_000
     starts = [0, 3333, 6666]
     for start, viewpoint in zip(starts, model.viewpoints, strict=True):
@@ -243,7 +245,7 @@ def test_scans_from_several_places_share_the_points():
 def test_scan_of_nothing_is_refused():
     away = SceneModel((Part(build_room().surfaces[:1]),), np.array([[0.0, 0, 5000]]))
     with pytest.raises(ConfigError, match="expected a scene around its viewpoints, got no hit"):
-        sample_scene(away, 100, density="scan")
+        scan_scene(away, 100)
 
 
 # Cameras and depth frames.

@@ -81,9 +81,20 @@ def contingency_table(
         >>> table.region_sizes.tolist(), table.face_sizes.tolist()
         ([2, 1], [1, 3])
     """
-    labels, truth = check_labels("contingency_table", labels=labels, truth=truth)
+    return count_overlaps("contingency_table", labels, truth, min_size, ignore)
+
+
+def count_overlaps(
+    caller: str,
+    labels: Tensor | NDArray[Any],
+    truth: Tensor | NDArray[Any],
+    min_size: int,
+    ignore: int | None,
+) -> ContingencyTable:
+    """Return the table of :func:`contingency_table`; errors name the caller."""
+    labels, truth = check_labels(caller, labels=labels, truth=truth)
     if min_size < 1:
-        raise ConfigError(f"contingency_table: expected min_size >= 1, got {min_size!r}.")
+        raise ConfigError(f"{caller}: expected min_size >= 1, got {min_size!r}.")
     if min_size > 1:
         _, rows, sizes = torch.unique(labels, return_inverse=True, return_counts=True)
         labels = labels.masked_fill((sizes < min_size)[rows], UNLABELED)

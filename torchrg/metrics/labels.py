@@ -6,189 +6,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import ContingencyTable, check_labels, contingency_table
+from torchrg.metrics.contingency import ContingencyTable, count_overlaps
 from torchrg.metrics.protocols import count_segcomp, score_evops, share
-
-
-def match_regions(table: ContingencyTable) -> Tensor:
-    """Pair each region with the face that it overlaps most and that it is overlapped most by.
-
-    A region and a face correspond when each is the other's largest overlap, in points [1].
-
-    Convention:
-        Equal overlaps are decided by the larger intersection over union, that is the smaller
-        partner; then by the lower label. The order of the points plays no part.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        The rows of the table's overlaps that are pairs, shape ``(P,)``, int64; no region and no
-        face occurs twice. Empty if nothing overlaps.
-
-    References:
-        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
-        Normal Estimation, section III.B.
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([4, 4, 4, 5, 5]), torch.tensor([0, 0, 1, 1, 1]))
-        >>> pairs = match_regions(table)
-        >>> table.region_labels[table.regions[pairs]].tolist()
-        [4, 5]
-        >>> table.face_labels[table.faces[pairs]].tolist()
-        [0, 1]
-    """
-    face_sizes, region_sizes = table.face_sizes[table.faces], table.region_sizes[table.regions]
-    of_region = _first_of_each(table.regions, (-table.overlaps, face_sizes, table.faces))
-    of_face = _first_of_each(table.faces, (-table.overlaps, region_sizes, table.regions))
-    return (of_region & of_face).nonzero().squeeze(1)
-
-
-def best_iou(groups: Tensor, iou: Tensor, num_groups: int) -> Tensor:
-    """Return the largest IoU of each group, 0 for a group without overlaps, shape ``(G,)``."""
-    return iou.new_zeros(num_groups).scatter_reduce(0, groups, iou, "amax")
-
-
-def _first_of_each(groups: Tensor, keys: tuple[Tensor, ...]) -> Tensor:
-    """Mark the entry of each group that comes first by the keys, shape ``(E,)``, bool."""
-    order = torch.arange(len(groups), device=groups.device)
-    for key in (*reversed(keys), groups):
-        order = order[key[order].argsort(stable=True)]
-    ordered = groups[order]
-    first = torch.ones_like(ordered, dtype=torch.bool)
-    first[1:] = ordered[1:] != ordered[:-1]
-    return torch.zeros_like(first).index_put((order,), first)
-
-
-class Partitions(NamedTuple):
-    """Sizes of the cells, rows and columns of two partitions of all points.
-
-    Attributes:
-        cells: Points that a part of the one and a part of the other share, int64.
-        rows: Points of each part of the prediction, int64.
-        columns: Points of each part of the truth, int64.
-        num_points: Number of points.
-    """
-
-    cells: Tensor
-    rows: Tensor
-    columns: Tensor
-    num_points: int
-
-
-def adjusted_rand_index(table: ContingencyTable) -> float:
-    r"""Return the Rand index corrected for chance [1].
-
-    Convention:
-        The unlabelled points of a side are one more part of it: the value is that of
-        scikit-learn's ``adjusted_rand_score`` for the same labels, -1 included.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        At most 1 (equal partitions), about 0 for independent ones, negative for worse. 1 for two
-        partitions without any pair of points to judge, one point or no point included.
-
-    References:
-        [1] L. Hubert, P. Arabie. Comparing partitions. Journal of Classification, 1985, eq. 5.
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([5, 5, -1, 2]), torch.tensor([0, 0, 1, 3]))
-        >>> adjusted_rand_index(table)
-        1.0
-    """
-    parts = _with_unlabeled(table)
-    # Python's integers: products of two counts of pairs exceed 64 bits beyond 50,000 points.
-    together, predicted, true = (
-        int((sizes * (sizes - 1) // 2).sum()) for sizes in (parts.cells, parts.rows, parts.columns)
-    )
-    pairs = parts.num_points * (parts.num_points - 1) // 2
-    scale = pairs * (predicted + true) - 2 * predicted * true
-    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
-
-
-def normalized_mutual_information(table: ContingencyTable) -> float:
-    r"""Return ``2 I(C, G) / (H(C) + H(G))``, the information that two labellings share [1].
-
-    Convention:
-        The unlabelled points of a side are one more part of it: the value is that of
-        scikit-learn's ``normalized_mutual_info_score`` (arithmetic mean of the entropies).
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        In [0, 1]; 1 where both sides have one part only, or no point at all.
-
-    References:
-        [1] N. Vinh, J. Epps, J. Bailey. Information theoretic measures for clusterings comparison.
-        JMLR, 2010, table 2 (NMI_sum).
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]))
-        >>> normalized_mutual_information(table)
-        0.0
-    """
-    parts = _with_unlabeled(table)
-    n = max(parts.num_points, 1)
-    cells, rows, columns = (
-        -float(torch.special.xlogy(sizes / n, sizes / n).sum())
-        for sizes in (part.double() for part in (parts.cells, parts.rows, parts.columns))
-    )
-    if len(parts.rows) <= 1 and len(parts.columns) <= 1:
-        return 1.0
-    shared = rows + columns - cells
-    return min(max(2 * shared / (rows + columns), 0.0), 1.0)
-
-
-def segmentation_covering(table: ContingencyTable) -> float:
-    r"""Return the covering of the faces by the regions [1].
-
-    ``sum_j |G_j| max_i IoU(C_i, G_j) / sum_j |G_j|``: the mean best IoU weighted by size.
-
-    Convention:
-        Unlabelled points are no region and no face: truth without a face has no weight.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        In [0, 1]; 0 where there is no face.
-
-    References:
-        [1] P. Arbelaez et al. Contour detection and hierarchical image segmentation. TPAMI, 2011,
-        eq. 8.
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([0, 0, 1, -1]), torch.tensor([3, 3, 4, 4]))
-        >>> segmentation_covering(table)
-        0.75
-    """
-    best = best_iou(table.faces, table.iou, len(table.face_sizes))
-    return float((best * table.face_sizes).sum() / table.face_sizes.sum().clamp(min=1))
-
-
-def _with_unlabeled(table: ContingencyTable) -> Partitions:
-    """Return the partitions in which the unlabelled points of each side are one more part."""
-    in_faces = table.overlaps.new_zeros(len(table.region_sizes))
-    in_faces.index_add_(0, table.regions, table.overlaps)
-    in_regions = table.overlaps.new_zeros(len(table.face_sizes))
-    in_regions.index_add_(0, table.faces, table.overlaps)
-    bare_regions = table.region_sizes - in_faces
-    bare_faces = table.face_sizes - in_regions
-    no_region = table.num_points - table.region_sizes.sum()
-    no_face = table.num_points - table.face_sizes.sum()
-    neither = no_region - bare_faces.sum()
-    cells = torch.cat([table.overlaps, bare_regions, bare_faces, neither[None]])
-    rows = torch.cat([table.region_sizes, no_region[None]])
-    columns = torch.cat([table.face_sizes, no_face[None]])
-    return Partitions(cells[cells > 0], rows[rows > 0], columns[columns > 0], table.num_points)
 
 
 class LabelScore(NamedTuple):
@@ -209,22 +28,10 @@ class LabelScore(NamedTuple):
         mean_best_iou: Mean over all faces of the largest IoU with a region.
         precision_iou50: Regions with a face at IoU > 0.5, of all regions.
         recall_iou50: Faces with a region at IoU > 0.5, of all faces.
-        precision_iou80: The same at IoU > 0.8.
-        recall_iou80: The same at IoU > 0.8.
-        correct: Correctly found faces by SegComp at 80 %.
-        over_segmented: Faces split into several regions by SegComp at 80 %.
-        under_segmented: Regions that merge several faces by SegComp at 80 %.
-        missed: Faces in none of these three by SegComp at 80 %.
-        noise: Regions in none of these three by SegComp at 80 %.
-        evops_precision: Regions that match a face by EVOPS (IoU >= 0.75), of all regions.
-        evops_recall: Faces that match a region by EVOPS, of all faces.
-        evops_f1: Harmonic mean of the two.
-        evops_mean_iou: Mean IoU of EVOPS' matches.
-        evops_mean_dice: Mean Dice coefficient of EVOPS' matches.
-        evops_over_segmented: Faces with several regions at IoU >= 0.2, of all faces.
-        evops_under_segmented: Regions with several faces at IoU >= 0.2, of all regions.
-        evops_missed: Faces without a counterpart by EVOPS, of all faces.
-        evops_noise: Regions without a counterpart by EVOPS, of all regions.
+        precision_iou80: The same at IoU > 0.8; so is ``recall_iou80``.
+        correct: As in :class:`SegCompCounts` at 80 %; so are ``over_segmented``,
+            ``under_segmented``, ``missed`` and ``noise``.
+        evops_precision: As in :class:`EvopsScore`; so are the other ``evops_*``.
         share_labeled: Scored points that lie in a region.
         covering: Segmentation covering: mean best IoU weighted by the size of the face.
         ari: Adjusted Rand index.
@@ -311,21 +118,17 @@ def score_labels(
         :func:`segmentation_covering`.
 
     Example:
-        >>> import torch
         >>> score = score_labels(torch.tensor([8, 8, 8, 3, -1]), torch.tensor([0, 0, 1, 1, 1]))
         >>> score.pairs, round(score.precision, 1), round(score.recall, 1), round(score.f1, 1)
         (2, 83.3, 66.7, 74.1)
         >>> score.recall_iou50, score.share_labeled
         (0.5, 0.8)
     """
-    labels, truth = check_labels("score_labels", labels=labels, truth=truth)
-    if min_size < 1:
-        raise ConfigError(f"score_labels: expected min_size >= 1, got {min_size!r}.")
-    table = contingency_table(labels, truth, min_size=min_size, ignore=ignore)
+    table = count_overlaps("score_labels", labels, truth, min_size, ignore)
     num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
-    precision, recall, num_pairs = pair_precision_recall(table)
+    precision, recall, num_pairs = _pair_precision_recall(table)
     matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))
-    best = best_iou(table.faces, table.iou, num_faces)
+    best = _best_iou(table)
     segcomp, evops = count_segcomp(table), score_evops(table)
     return LabelScore(
         precision=precision,
@@ -349,17 +152,11 @@ def score_labels(
     )
 
 
-def pair_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
-    """Return the mean precision and recall of the pairs, in percent, and how many pairs there are.
+def _pair_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
+    """Return mean precision and recall of the pairs, in percent, and how many there are.
 
     Section III.B of the paper: ``P = 100 TP / (TP + FP)``, ``R = 100 TP / (TP + FN)`` with TP the
     points that region and face share. 0 where there is no pair.
-
-    Example:
-        >>> import torch
-        >>> table = contingency_table(torch.tensor([0, 0, 0, 0]), torch.tensor([5, 5, 5, -1]))
-        >>> pair_precision_recall(table)
-        (75.0, 100.0, 1)
     """
     pairs = match_regions(table)
     shared = 100 * table.overlaps[pairs].double()
@@ -367,3 +164,159 @@ def pair_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
     recall = shared / table.face_sizes[table.faces[pairs]]
     count = len(pairs)
     return share(float(precision.sum()), count), share(float(recall.sum()), count), count
+
+
+def match_regions(table: ContingencyTable) -> Tensor:
+    """Pair each region with the face that it overlaps most and that it is overlapped most by.
+
+    A region and a face correspond when each is the other's largest overlap, in points [1].
+
+    Convention:
+        Equal overlaps are decided by the larger intersection over union, that is the smaller
+        partner; then by the lower label. The order of the points plays no part.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        The rows of the table's overlaps that are pairs, shape ``(P,)``, int64; no region and no
+        face occurs twice. Empty if nothing overlaps.
+
+    References:
+        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
+        Normal Estimation, section III.B.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([4, 4, 4, 5, 5]), torch.tensor([0, 0, 1, 1, 1]))
+        >>> pairs = match_regions(table)
+        >>> table.region_labels[table.regions[pairs]].tolist()
+        [4, 5]
+        >>> table.face_labels[table.faces[pairs]].tolist()
+        [0, 1]
+    """
+    face_sizes, region_sizes = table.face_sizes[table.faces], table.region_sizes[table.regions]
+    of_region = _first_of_each(table.regions, (-table.overlaps, face_sizes, table.faces))
+    of_face = _first_of_each(table.faces, (-table.overlaps, region_sizes, table.regions))
+    return (of_region & of_face).nonzero().squeeze(1)
+
+
+def _first_of_each(groups: Tensor, keys: tuple[Tensor, ...]) -> Tensor:
+    """Mark the entry of each group that comes first by the keys, shape ``(E,)``, bool."""
+    order = torch.arange(len(groups), device=groups.device)
+    for key in (*reversed(keys), groups):
+        order = order[key[order].argsort(stable=True)]
+    ordered = groups[order]
+    first = torch.ones_like(ordered, dtype=torch.bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return torch.zeros_like(first).index_put((order,), first)
+
+
+def adjusted_rand_index(table: ContingencyTable) -> float:
+    r"""Return the Rand index corrected for chance [1].
+
+    Convention:
+        The unlabelled points of a side are one more part of it: the value is that of
+        scikit-learn's ``adjusted_rand_score`` for the same labels, -1 included.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        At most 1 (equal partitions), about 0 for independent ones, negative for worse. 1 for two
+        partitions without any pair of points to judge, one point or no point included.
+
+    References:
+        [1] L. Hubert, P. Arabie. Comparing partitions. Journal of Classification, 1985, eq. 5.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([5, 5, -1, 2]), torch.tensor([0, 0, 1, 3]))
+        >>> adjusted_rand_index(table)
+        1.0
+    """
+    # Python's integers: products of two counts of pairs exceed 64 bits beyond 50,000 points.
+    together, predicted, true = (
+        int((sizes * (sizes - 1) // 2).sum()) for sizes in _sizes_with_unlabeled(table)
+    )
+    pairs = table.num_points * (table.num_points - 1) // 2
+    scale = pairs * (predicted + true) - 2 * predicted * true
+    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
+
+
+def normalized_mutual_information(table: ContingencyTable) -> float:
+    r"""Return ``2 I(C, G) / (H(C) + H(G))``, the information that two labellings share [1].
+
+    Convention:
+        The unlabelled points of a side are one more part of it: the value is that of
+        scikit-learn's ``normalized_mutual_info_score`` (arithmetic mean of the entropies).
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        In [0, 1]; 1 where both sides have one part only, or no point at all.
+
+    References:
+        [1] N. Vinh, J. Epps, J. Bailey. Information theoretic measures for clusterings comparison.
+        JMLR, 2010, table 2 (NMI_sum).
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]))
+        >>> normalized_mutual_information(table)
+        0.0
+    """
+    sizes = _sizes_with_unlabeled(table)
+    if len(sizes[1]) <= 1 and len(sizes[2]) <= 1:
+        return 1.0
+    shares = [part.double() / table.num_points for part in sizes]
+    both, regions, faces = (-float(torch.special.xlogy(part, part).sum()) for part in shares)
+    return min(max(2 * (regions + faces - both) / (regions + faces), 0.0), 1.0)
+
+
+def segmentation_covering(table: ContingencyTable) -> float:
+    r"""Return the covering of the faces by the regions [1].
+
+    ``sum_j |G_j| max_i IoU(C_i, G_j) / sum_j |G_j|``: the mean best IoU weighted by size.
+
+    Convention:
+        Unlabelled points are no region and no face: truth without a face has no weight.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        In [0, 1]; 0 where there is no face.
+
+    References:
+        [1] P. Arbelaez et al. Contour detection and hierarchical image segmentation. TPAMI, 2011,
+        eq. 8.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([0, 0, 1, -1]), torch.tensor([3, 3, 4, 4]))
+        >>> segmentation_covering(table)
+        0.75
+    """
+    return float((_best_iou(table) * table.face_sizes).sum() / table.face_sizes.sum().clamp(min=1))
+
+
+def _best_iou(table: ContingencyTable) -> Tensor:
+    """Return the largest IoU of each face with a region, 0 where none overlaps, ``(F,)``."""
+    best = table.iou.new_zeros(len(table.face_sizes))
+    return best.scatter_reduce(0, table.faces, table.iou, "amax")
+
+
+def _sizes_with_unlabeled(table: ContingencyTable) -> tuple[Tensor, Tensor, Tensor]:
+    """Return sizes of overlaps, regions and faces; a side's unlabelled points are one more part."""
+    in_faces = torch.zeros_like(table.region_sizes).index_add(0, table.regions, table.overlaps)
+    in_regions = torch.zeros_like(table.face_sizes).index_add(0, table.faces, table.overlaps)
+    bare_regions, bare_faces = table.region_sizes - in_faces, table.face_sizes - in_regions
+    no_region = table.num_points - table.region_sizes.sum()
+    no_face = table.num_points - table.face_sizes.sum()
+    neither = no_region - bare_faces.sum()
+    overlaps = torch.cat([table.overlaps, bare_regions, bare_faces, neither[None]])
+    regions = torch.cat([table.region_sizes, no_region[None]])
+    faces = torch.cat([table.face_sizes, no_face[None]])
+    return overlaps[overlaps > 0], regions[regions > 0], faces[faces > 0]

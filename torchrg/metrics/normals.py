@@ -14,7 +14,9 @@ from torchrg.metrics.contingency import check_one_device
 from torchrg.metrics.sphere import unit_vectors
 
 _CHUNK = 2**20
+"""Points at a time: a bound of memory."""
 _LIMITS_DEG = (5, 10, 20)
+"""Bounds of the shares of small errors, in degrees."""
 
 
 class NormalScore(NamedTuple):
@@ -30,22 +32,9 @@ class NormalScore(NamedTuple):
         under_20_deg: The same below 20 degrees.
         points: Points that were scored.
         invalid: Points with a true normal and no estimated one; in none of the indices.
-        sharp_msae: As ``msae``, over sharp points; None if no split was asked for.
-        sharp_rms: As ``rms``, over sharp points.
-        sharp_mean: As ``mean``, over sharp points.
-        sharp_median: As ``median``, over sharp points.
-        sharp_under_5_deg: As ``under_5_deg``, over sharp points.
-        sharp_under_10_deg: As ``under_10_deg``, over sharp points.
-        sharp_under_20_deg: As ``under_20_deg``, over sharp points.
-        sharp_points: Sharp points that were scored.
-        regular_msae: As ``msae``, over the other points.
-        regular_rms: As ``rms``, over the other points.
-        regular_mean: As ``mean``, over the other points.
-        regular_median: As ``median``, over the other points.
-        regular_under_5_deg: As ``under_5_deg``, over the other points.
-        regular_under_10_deg: As ``under_10_deg``, over the other points.
-        regular_under_20_deg: As ``under_20_deg``, over the other points.
-        regular_points: Other points that were scored.
+        sharp_msae: As ``msae``, over sharp points; so are the other ``sharp_*``. None if no split
+            was asked for.
+        regular_msae: As ``msae``, over the other points; so are the other ``regular_*``.
     """
 
     msae: float
@@ -148,14 +137,14 @@ def _check_masks(normals: Tensor, truth: Tensor, masks: dict[str, Tensor | None]
 
 def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return errors in degrees, which points have both normals, and which a true one, ``(N,)``."""
-    blocks = []
-    for start in range(0, max(len(normals), 1), _CHUNK):
-        block = slice(start, start + _CHUNK)
-        estimated, has_estimate = unit_vectors(normals[block])
-        true, has_truth = unit_vectors(truth[block])
-        angles = unsigned_angle_deg(estimated, true)
-        blocks.append((angles, has_estimate & has_truth, has_truth))
-    errors, scored, has_truth = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    found = []
+    for estimates, truths in zip(
+        torch.split(normals, _CHUNK), torch.split(truth, _CHUNK), strict=True
+    ):
+        estimated, has_estimate = unit_vectors(estimates)
+        true, has_truth = unit_vectors(truths)
+        found.append((unsigned_angle_deg(estimated, true), has_estimate & has_truth, has_truth))
+    errors, scored, has_truth = (torch.cat(parts) for parts in zip(*found, strict=True))
     return errors, scored, has_truth
 
 

@@ -1,4 +1,4 @@
-"""Furniture: blocks, tables, boards, and round things."""
+"""Furniture of random sizes: doors and windows, cabinets, boards, tables, boxes, round things."""
 
 from collections.abc import Collection, Mapping
 
@@ -7,11 +7,14 @@ import numpy as np
 from torchrg.scenes.geometry import Frame, Triple
 from torchrg.scenes.round import Cone, Ring
 from torchrg.scenes.scene import Part
-from torchrg.scenes.shells import Hole, against
-from torchrg.scenes.surfaces import Ball, Block, Drum, rectangle
+from torchrg.scenes.shells import against
+from torchrg.scenes.surfaces import Ball, Block, Drum, Hole, rectangle
 
 SIDES = ("left", "right", "front", "back")
-FACES = (*SIDES, "bottom", "top")
+"""Left and right are across the first axis of a body, front and back across the second."""
+
+_TABLE_HEIGHT = (0.62, 0.92)
+"""Metres."""
 
 
 def block(
@@ -22,23 +25,15 @@ def block(
     without: Collection[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> Part:
-    """Return a rectangular body standing on the origin of a frame.
+    """Return a rectangular body standing on the origin of a frame, and its faces.
 
     Args:
         kind: What it is.
         frame: The third axis is up, the origin is the middle of the base.
         size: Lengths along the three axes.
-        without: Faces left out because something covers all of them, out of ``FACES``; left and
-            right are across the first axis, front and back across the second.
+        without: Faces left out because something covers all of them: of :data:`SIDES`, "bottom"
+            and "top".
         kinds: Names of faces that are not called ``kind``.
-
-    Returns:
-        The body and its faces.
-
-    Example:
-        >>> box = block("box", Frame.upright(np.zeros(3)), (1, 1, 1), without=["bottom"])
-        >>> len(box.surfaces)
-        5
     """
     x, y, z = size
     corners = {
@@ -55,107 +50,6 @@ def block(
         if name not in without
     )
     return Part(surfaces, (Block(frame, size),))
-
-
-def table(frame: Frame, size: Triple, *, thickness: float, post: float) -> Part:
-    """Return a table: a plate with all its faces on a square post.
-
-    Args:
-        frame: The third axis is up, the origin is on the floor under its middle.
-        size: Length, width, and height of the upper side.
-        thickness: Of the plate.
-        post: Width of the post.
-
-    Returns:
-        The table, of ten faces.
-
-    Example:
-        >>> desk = table(Frame.upright(np.zeros(3)), (1.6, 0.8, 0.75), thickness=0.04, post=0.3)
-        >>> len(desk.surfaces)
-        10
-    """
-    length, width, height = size
-    names = dict.fromkeys(SIDES, "table edge") | {"bottom": "table underside", "top": "table top"}
-    under = height - thickness
-    plate = block("table", frame.moved(0, 0, under), (length, width, thickness), kinds=names)
-    stand = block("table post", frame, (post, post, under), without=("bottom", "top"))
-    return Part(plate.surfaces + stand.surfaces, plate.solids + stand.solids)
-
-
-def board(kind: str, frame: Frame, size: Triple) -> Part:
-    """Return a plate fixed to a wall by its back: a shelf, or a panel.
-
-    Args:
-        kind: What it is; its narrow faces are called ``kind`` and "edge".
-        frame: The third axis is up; the origin is the middle of the base, the second axis points
-            into the wall; see :func:`against`.
-        size: Lengths along the three axes; the shortest is the thickness.
-
-    Returns:
-        The plate, of five faces.
-
-    Example:
-        >>> board("shelf", Frame.upright(np.zeros(3)), (1, 0.3, 0.04)).surfaces[0].kind
-        'shelf edge'
-    """
-    shortest = int(np.argmin(size))
-    pairs = (("left", "right"), ("front", "back"), ("bottom", "top"))
-    narrow = [face for axis, pair in enumerate(pairs) if axis != shortest for face in pair]
-    names = dict.fromkeys(narrow, f"{kind} edge")
-    return block(kind, frame, size, without=["back"], kinds=names)
-
-
-def round_table(frame: Frame, radius: float, height: float, *, thickness: float) -> Part:
-    """Return a round table: a disc with a curved edge on a round post.
-
-    Args:
-        frame: The third axis is up, the origin is on the floor under its middle.
-        radius: Of the plate.
-        height: Of the upper side.
-        thickness: Of the plate.
-
-    Returns:
-        The table: two discs, the edge and the post.
-
-    Example:
-        >>> desk = round_table(Frame.upright(np.zeros(3)), 0.5, 0.75, thickness=0.04)
-        >>> [surface.plane is None for surface in desk.surfaces]
-        [False, False, True, True]
-    """
-    under, post = height - thickness, radius / 5
-    surfaces = (
-        Cone("table underside", frame, (0, under), (radius, under)),
-        Cone("table top", frame, (radius, height), (0, height)),
-        Cone("table edge", frame, (radius, under), (radius, height)),
-        Cone("table post", frame, (post, 0), (post, under)),
-    )
-    plate = Drum(frame.moved(0, 0, under), radius, thickness)
-    return Part(surfaces, (plate, Drum(frame, post, under)))
-
-
-def column(frame: Frame, radius: float, height: float) -> Part:
-    """Return a round column from the floor to the ceiling."""
-    side = Cone("column", frame, (radius, 0), (radius, height))
-    return Part((side,), (Drum(frame, radius, height),))
-
-
-def ball(frame: Frame, radius: float) -> Part:
-    """Return a ball on the floor."""
-    middle = frame.moved(0, 0, radius)
-    return Part((Ring("ball", middle, 0, radius),), (Ball(middle.origin, radius),))
-
-
-def lamp(frame: Frame, radius: float, height: float) -> Part:
-    """Return a lamp: a ball on a round post of the given height."""
-    post, middle = radius / 5, frame.moved(0, 0, height + 0.9 * radius)
-    surfaces = (
-        Cone("lamp post", frame, (post, 0), (post, height)),
-        Ring("lamp", middle, 0, radius),
-    )
-    return Part(surfaces, (Drum(frame, post, height), Ball(middle.origin, radius)))
-
-
-_TABLE_HEIGHT = (0.62, 0.92)
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -184,28 +78,49 @@ def draw_cabinet(rng: np.random.Generator, wall: Frame, along: float) -> Part:
 def draw_shelf(rng: np.random.Generator, wall: Frame, along: float, thickness: float) -> Part:
     """Return a horizontal board on a wall."""
     size = (between(rng, 1, 1.5), between(rng, 0.38, 0.5), thickness)
-    return board("shelf", against(wall, along, between(rng, 1.1, 1.9), size[1]), size)
+    return _board("shelf", against(wall, along, between(rng, 1.1, 1.9), size[1]), size)
 
 
 def draw_panel(rng: np.random.Generator, wall: Frame, along: float, thickness: float) -> Part:
     """Return an upright board on a wall, up to twice as thick as asked for."""
     size = (between(rng, 1, 1.5), thickness * between(rng, 1, 2), between(rng, 0.8, 1.1))
-    return board("panel", against(wall, along, between(rng, 0.8, 1.1), size[1]), size)
+    return _board("panel", against(wall, along, between(rng, 0.8, 1.1), size[1]), size)
+
+
+def _board(kind: str, frame: Frame, size: Triple) -> Part:
+    """Return a plate fixed to a wall by its back; its narrow faces are called its edge."""
+    shortest = int(np.argmin(size))
+    pairs = (("left", "right"), ("front", "back"), ("bottom", "top"))
+    narrow = [face for axis, pair in enumerate(pairs) if axis != shortest for face in pair]
+    names = dict.fromkeys(narrow, f"{kind} edge")
+    return block(kind, frame, size, without=["back"], kinds=names)
 
 
 def draw_table(
     rng: np.random.Generator, frame: Frame, thickness: float, height: float | None
 ) -> Part:
-    """Return a table, of random height unless one is given."""
+    """Return a plate with all its faces on a square post, of random height unless one is given."""
     height = between(rng, *_TABLE_HEIGHT) if height is None else height
-    size = (between(rng, 1.25, 1.5), between(rng, 0.65, 0.8), height)
-    return table(frame, size, thickness=thickness, post=between(rng, 0.2, 0.35))
+    length, width, post = between(rng, 1.25, 1.5), between(rng, 0.65, 0.8), between(rng, 0.2, 0.35)
+    names = dict.fromkeys(SIDES, "table edge") | {"bottom": "table underside", "top": "table top"}
+    under = height - thickness
+    plate = block("table", frame.moved(0, 0, under), (length, width, thickness), kinds=names)
+    stand = block("table post", frame, (post, post, under), without=("bottom", "top"))
+    return Part(plate.surfaces + stand.surfaces, plate.solids + stand.solids)
 
 
 def draw_round_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part:
-    """Return a round table."""
+    """Return a disc with a curved edge on a round post."""
     radius, height = between(rng, 0.45, 0.6), between(rng, *_TABLE_HEIGHT)
-    return round_table(frame, radius, height, thickness=thickness)
+    under, post = height - thickness, radius / 5
+    surfaces = (
+        Cone("table underside", frame, (0, under), (radius, under)),
+        Cone("table top", frame, (radius, height), (0, height)),
+        Cone("table edge", frame, (radius, under), (radius, height)),
+        Cone("table post", frame, (post, 0), (post, under)),
+    )
+    plate = Drum(frame.moved(0, 0, under), radius, thickness)
+    return Part(surfaces, (plate, Drum(frame, post, under)))
 
 
 def draw_box(rng: np.random.Generator, frame: Frame) -> Part:
@@ -230,14 +145,25 @@ def draw_pillar(rng: np.random.Generator, frame: Frame, ceiling: float) -> Part:
 
 def draw_column(rng: np.random.Generator, frame: Frame, ceiling: float) -> Part:
     """Return a round pillar."""
-    return column(frame, between(rng, 0.15, 0.3), ceiling)
+    radius = between(rng, 0.15, 0.3)
+    side = Cone("column", frame, (radius, 0), (radius, ceiling))
+    return Part((side,), (Drum(frame, radius, ceiling),))
 
 
 def draw_ball(rng: np.random.Generator, frame: Frame) -> Part:
     """Return a ball on the floor."""
-    return ball(frame, between(rng, 0.2, 0.4))
+    radius = between(rng, 0.2, 0.4)
+    return _ball("ball", frame.moved(0, 0, radius), radius)
 
 
 def draw_lamp(rng: np.random.Generator, frame: Frame) -> Part:
-    """Return a lamp on the floor."""
-    return lamp(frame, between(rng, 0.15, 0.25), between(rng, 1.2, 1.6))
+    """Return a ball that sits on a round post, a little into it."""
+    radius, height = between(rng, 0.15, 0.25), between(rng, 1.2, 1.6)
+    post = Cone("lamp post", frame, (radius / 5, 0), (radius / 5, height))
+    shade = _ball("lamp", frame.moved(0, 0, height + 0.9 * radius), radius)
+    return Part((post, *shade.surfaces), (Drum(frame, radius / 5, height), *shade.solids))
+
+
+def _ball(kind: str, middle: Frame, radius: float) -> Part:
+    """Return a ball about the origin of a frame."""
+    return Part((Ring(kind, middle, 0, radius),), (Ball(middle.origin, radius),))

@@ -1,172 +1,27 @@
 """Clouds sampled from a scene: spread, noise, outliers, order."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import ConfigError
-from torchrg.scenes.geometry import Array, Floats, cos_sin, dot, unit
-from torchrg.scenes.scene import Scene, SceneModel, label_points, random_stream
+from torchrg.scenes.geometry import Array, Floats
+from torchrg.scenes.scene import Scene, SceneModel, label_points, seeded_generator
 from torchrg.structures import UNLABELED
 
-_TILE = 32  # rays on a side of the blocks that are tested against a face as one
-_MARGIN = 1e-3  # added to the angle of a block, radians
-
-
-class Hits(NamedTuple):
-    """Where rays first meet a scene.
-
-    Attributes:
-        distances: In lengths of the directions, shape ``(H, W)``; infinite where never.
-        faces: The faces met, shape ``(H, W)``; ``UNLABELED`` where none.
-    """
-
-    distances: Array
-    faces: NDArray[np.int64]
-
-
-def cast_rays(model: SceneModel, origin: Array, directions: Array) -> Hits:
-    """Return where rays from one place first meet a scene.
-
-    Args:
-        model: The scene.
-        origin: Where the rays start, shape ``(3,)``.
-        directions: A grid of rays, of any length, shape ``(H, W, 3)``. Neighbours should be
-            similar: whole blocks of rays skip the faces they cannot meet.
-
-    Returns:
-        Distance and face of each ray.
-
-    Example:
-        >>> from torchrg.scenes import build_room
-        >>> down = np.array([[[0.0, 0, -1]]])
-        >>> hits = cast_rays(build_room(), np.array([0.5, 0.5, 1.25]), down)
-        >>> hits.distances.tolist(), hits.faces.tolist()
-        ([[1.25]], [[0]])
-    """
-    height, width, _ = directions.shape
-    tile_of = _tiles(height, width)
-    order = np.argsort(tile_of, kind="stable")
-    tiles, steps = tile_of[order], directions.reshape(-1, 3)[order]
-    cones = _cones(tiles, steps)
-    distances, faces = np.full(len(steps), np.inf), np.full(len(steps), UNLABELED)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for face, surface in enumerate(model.surfaces):
-            rows = np.flatnonzero(_may_meet(cones, surface.bounds - origin)[tiles])
-            found = surface.intersect(origin[None], steps[rows])
-            nearer = found < distances[rows]
-            distances[rows[nearer]], faces[rows[nearer]] = found[nearer], face
-    back = np.argsort(order, kind="stable")
-    return Hits(distances[back].reshape(height, width), faces[back].reshape(height, width))
-
-
-def _tiles(height: int, width: int) -> NDArray[np.int64]:
-    """Return the block of each ray of a grid, shape ``(H * W,)``."""
-    rows, columns = np.arange(height) // _TILE, np.arange(width) // _TILE
-    tiles: NDArray[np.int64] = rows[:, None] * (columns[-1] + 1) + columns
-    return tiles.ravel()
-
-
-def _cones(tiles: NDArray[np.int64], steps: Array) -> tuple[Array, Array]:
-    """Return axis ``(T, 3)`` and half angle ``(T,)`` of a cone around each block of rays."""
-    starts = np.flatnonzero(np.diff(tiles, prepend=-1))
-    towards = unit(steps)
-    sums = np.add.reduceat(towards, starts)
-    # Opposite rays add up to nothing: then any axis will do, with a half angle as wide as it takes.
-    axes = unit(np.where(dot(sums, sums)[:, None] > 0, sums, towards[starts]))
-    cosines = np.minimum.reduceat(dot(towards, axes[tiles]), starts)
-    return axes, np.arccos(np.clip(cosines, -1, 1)) + _MARGIN
-
-
-def _may_meet(cones: tuple[Array, Array], bounds: Array) -> NDArray[np.bool_]:
-    """Return which cones touch the ball around a box, given relative to their tip."""
-    axes, half_angles = cones
-    middle, radius = bounds.mean(axis=0), np.sqrt(((bounds[1] - bounds[0]) ** 2).sum()) / 2
-    distance = np.sqrt(dot(middle, middle))
-    if distance <= radius:
-        return np.ones(len(axes), dtype=bool)
-    angles = np.arccos(np.clip(dot(axes, middle) / distance, -1, 1))
-    touched: NDArray[np.bool_] = angles <= half_angles + np.arcsin(radius / distance)
-    return touched
-
-
-_LOWEST, _HIGHEST = -65.0, 90.0  # elevations, degrees: a tripod hides what is below
-_MORE = 1.02
-
-
-def scan_places(
-    model: SceneModel, num_points: int, rng: np.random.Generator
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return what a scanner sees from the viewpoints of a scene, column by column.
-
-    Args:
-        model: The scene.
-        num_points: Number of points, the same for each viewpoint up to one; a few of the rays are
-            dropped at random to meet it.
-        rng: Source of the first azimuth and of what is dropped.
-
-    Returns:
-        Points ``(N, 3)``, normals ``(N, 3)`` towards free space and faces ``(N,)``, in the order
-        of viewpoint, azimuth, elevation.
-
-    Raises:
-        ConfigError: If nothing can be seen.
-    """
-    stations = len(model.viewpoints)
-    shares = np.diff(np.arange(stations + 1) * num_points // stations)
-    scans = [
-        _scan(model, viewpoint, int(share), rng)
-        for viewpoint, share in zip(model.viewpoints, shares, strict=True)
-    ]
-    points = np.concatenate([places for places, _ in scans])
-    faces = np.concatenate([labels for _, labels in scans])
-    normals = np.empty_like(points)
-    for face, surface in enumerate(model.surfaces):
-        rows = np.flatnonzero(faces == face)
-        normals[rows] = surface.normals_at(points[rows])
-    return points, normals, faces
-
-
-def _scan(
-    model: SceneModel, viewpoint: Array, num_points: int, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.int64]]:
-    """Return exactly ``num_points`` points and faces seen from one place."""
-    num_rays = num_points
-    while True:
-        directions = _angular_grid(num_rays, 2 * np.pi * rng.random())
-        hits = cast_rays(model, viewpoint, directions)
-        met = np.flatnonzero(hits.faces != UNLABELED)
-        if len(met) >= num_points:
-            break
-        if len(met) == 0 and num_rays > 10_000:
-            raise ConfigError("sample_scene: expected a scene around its viewpoints, got no hit.")
-        num_rays = int(num_rays * min(num_points / max(len(met), 1) * _MORE, 100)) + 1
-    kept = met[np.sort(rng.permutation(len(met))[:num_points])]
-    steps = directions.reshape(-1, 3)[kept]
-    return viewpoint + hits.distances.ravel()[kept, None] * steps, hits.faces.ravel()[kept]
-
-
-def _angular_grid(num_rays: int, first_azimuth: float) -> Array:
-    """Return at least ``num_rays`` directions in equal steps, shape ``(columns, rows, 3)``."""
-    span = _HIGHEST - _LOWEST
-    rows = int(np.ceil(np.sqrt(num_rays * span / 360)))
-    columns = int(np.ceil(num_rays / rows))
-    elevations = (_LOWEST + span * (np.arange(rows) + 0.5) / rows) * (np.pi / 180)
-    azimuths = first_azimuth + 2 * np.pi * np.arange(columns) / columns
-    (level, up), (east, north) = cos_sin(elevations), cos_sin(azimuths)
-    directions = np.empty((columns, rows, 3))
-    directions[..., 0] = east[:, None] * level
-    directions[..., 1] = north[:, None] * level
-    directions[..., 2] = up
-    return directions
-
-
 NoiseDirection = Literal["normal", "isotropic", "ray"]
-Density = Literal["uniform", "falloff", "scan"]
-Order = Literal["random", "face", "scan"]
+Density = Literal["uniform", "falloff"]
+Order = Literal["random", "face"]
 
-_NEAR = 1.0  # density stops growing nearer to the scanner than this, metres
+PLACES, NOISE, COLORS = range(3)
+"""What random numbers are drawn for: the same places whatever the noise, and so on."""
+
+_NEAR = 1.0
+"""Density stops growing nearer to the scanner than this, metres."""
+
+_SPARE = 1.02
+"""How many more points are tried than are expected to be needed: fewer repetitions."""
 
 
 def sample_scene(
@@ -185,7 +40,7 @@ def sample_scene(
 
     Each point is drawn independently and evenly from all of the surface that has free space in
     front of it, so the number of points of a face is proportional to its visible area. What other
-    objects hide from the scanner is sampled as well, but for ``density="scan"``.
+    objects hide from the scanner is sampled as well.
 
     Convention:
         The same seed gives the same places on the surface whatever the noise, so the noise of a
@@ -195,16 +50,15 @@ def sample_scene(
         model: The scene.
         num_points: Number of points.
         noise: Standard deviation of the noise, in metres.
-        seed: Two calls with equal arguments give equal clouds, on every platform.
+        seed: Two calls with equal arguments give equal clouds; on another processor sines of
+            slanted and curved parts may differ in the last bit.
         noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
             every direction. ``"ray"``: along the line to the nearest viewpoint of the scene.
         density: ``"uniform"``; ``"falloff"``: proportional to 1/r^2 with r the distance to the
-            nearest viewpoint of the scene, and even within a metre of it; ``"scan"``: what a laser
-            scanner at each viewpoint sees, in equal steps of azimuth and elevation.
+            nearest viewpoint of the scene, and even within a metre of it.
         outlier_fraction: Share of points spread over the box around the scene instead, which
             belong to no face.
-        order: ``"random"``; ``"face"``: one face after the other, outliers last; ``"scan"``: as
-            the scanner turns, outliers last, for ``density="scan"`` only.
+        order: ``"random"``; ``"face"``: one face after the other, outliers last.
         colors: Whether to colour the points by object.
 
     Returns:
@@ -226,30 +80,25 @@ def sample_scene(
         density=(density, Density),
         order=(order, Order),
     )
-    if order == "scan" and density != "scan":
-        raise ConfigError(
-            f"sample_scene: expected density='scan' for order='scan', got {density!r}."
-        )
-    places, shake, paint = (random_stream(seed, number) for number in range(3))
+    rng = seeded_generator(seed, PLACES)
     num_outliers = round(num_points * outlier_fraction)
-    num_on_faces = num_points - num_outliers
-    if density == "scan":
-        seen, outwards, labels = scan_places(model, num_on_faces, places)
-        points, normals = _float32(seen), _float32(outwards)
-    else:
-        points, normals, labels = _draw_places(model, num_on_faces, density, places)
+    points, normals, labels = _draw_places(model, num_points - num_outliers, density, rng)
     if noise > 0:
-        points += np.float32(noise) * _displacements(model, points, normals, noise_direction, shake)
+        shifts = _unit_noise(model, points, normals, noise_direction, seeded_generator(seed, NOISE))
+        points += np.float32(noise) * shifts
     if num_outliers:
         low, high = model.bounds
-        stray = low + places.random((num_outliers, 3)) * (high - low)
-        points = np.concatenate([points, stray.astype(np.float32)])
+        stray = low + rng.random((num_outliers, 3)) * (high - low)
+        points = np.concatenate([points, to_float32(stray)])
         normals = np.concatenate([normals, np.zeros((num_outliers, 3), dtype=np.float32)])
         labels = np.concatenate([labels, np.full(num_outliers, UNLABELED)])
-    if order != "scan":
-        rows = places.permutation(num_points) if order == "random" else _by_face(labels)
-        points, normals, labels = points[rows], normals[rows], labels[rows]
-    return label_points(model, points, labels, normals, paint if colors else None)
+    if order == "random":
+        rows = rng.permutation(num_points)
+    else:
+        rows = np.argsort(np.where(labels == UNLABELED, labels.max() + 1, labels), kind="stable")
+    points, normals, labels = points[rows], normals[rows], labels[rows]
+    shades = _colors(model, labels, seeded_generator(seed, COLORS)) if colors else None
+    return label_points(model, points, labels, normals, shades)
 
 
 def _draw_places(
@@ -257,38 +106,30 @@ def _draw_places(
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Return points, normals and faces of exactly ``num_points`` places, face after face."""
     areas = np.array([surface.area for surface in model.surfaces])
-    drawn: list[tuple[Floats, Floats]] = []
-    faces: list[NDArray[np.int64]] = []
+    drawn: list[tuple[Floats, Floats, NDArray[np.int64]]] = []
     missing, share_kept = num_points, 1.0
     while missing > 0:
-        num_tried = int(missing / share_kept * 1.02) + 16
+        num_tried = int(missing / share_kept * _SPARE) + 16
         num_kept = 0
         for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
             tried = model.surfaces[face].sample(rng, int(count))
             outwards = model.surfaces[face].normals_at(tried)
-            kept = model.visible(face, tried, outwards)
+            kept = model.is_visible(face, tried, outwards)
             if density == "falloff":
                 nearest = np.maximum(_to_viewpoint(model, tried)[1], _NEAR)
                 kept &= rng.random(len(tried)) * (nearest * nearest) < _NEAR * _NEAR
-            drawn.append((_float32(tried[kept]), _float32(outwards[kept])))
-            faces.append(np.full(len(drawn[-1][0]), face))
-            num_kept += len(drawn[-1][0])
+            points, normals = to_float32(tried[kept]), to_float32(outwards[kept])
+            drawn.append((points, normals, np.full(len(points), face)))
+            num_kept += len(points)
         missing -= num_kept
         share_kept = max(num_kept, 1) / num_tried
-    labels = np.concatenate(faces)
+    points, normals, labels = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
     # A random subset: to keep the first would leave the last faces short of points.
     chosen = np.sort(rng.permutation(len(labels))[:num_points])
-    points = np.concatenate([rows for rows, _ in drawn])[chosen]
-    normals = np.concatenate([rows for _, rows in drawn])[chosen]
-    return points, normals, labels[chosen]
+    return points[chosen], normals[chosen], labels[chosen]
 
 
-def _by_face(labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the order of points by face, outliers last."""
-    return np.argsort(np.where(labels == UNLABELED, labels.max() + 1, labels), kind="stable")
-
-
-def _displacements(
+def _unit_noise(
     model: SceneModel,
     points: Floats,
     normals: Floats,
@@ -299,23 +140,34 @@ def _displacements(
     if direction == "isotropic":
         return rng.standard_normal(points.shape, dtype=np.float32)
     lengths = rng.standard_normal((len(points), 1), dtype=np.float32)
-    along = normals if direction == "normal" else _float32(_to_viewpoint(model, points)[0])
-    return lengths * along
+    return lengths * (
+        normals if direction == "normal" else to_float32(_to_viewpoint(model, points)[0])
+    )
 
 
 def _to_viewpoint(model: SceneModel, points: Floats | Array) -> tuple[Array, Array]:
     """Return unit vectors to the nearest viewpoint, shape ``(N, 3)``, and its distances."""
-    lines = model.viewpoints[0] - points
-    distances = np.sqrt(dot(lines, lines))
-    for viewpoint in model.viewpoints[1:]:
+    lines = np.full(points.shape, np.inf)
+    distances = np.full(len(points), np.inf)
+    for viewpoint in model.viewpoints:
         others = viewpoint - points
-        lengths = np.sqrt(dot(others, others))
+        lengths = np.sqrt(np.vecdot(others, others))
         nearer = lengths < distances
         lines[nearer], distances[nearer] = others[nearer], lengths[nearer]
     return lines / distances[:, None], distances
 
 
-def _float32(values: Array) -> Floats:
+def _colors(
+    model: SceneModel, labels: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return a colour for each point: that of its object or of no object, a little uneven."""
+    palette = rng.integers(60, 230, size=(len(model.parts) + 1, 3))
+    objects = np.append(model.objects, len(model.parts))[labels]
+    shades: NDArray[np.int64] = palette[objects] + rng.integers(-12, 13, size=(len(labels), 1))
+    return shades.astype(np.uint8)
+
+
+def to_float32(values: Array) -> Floats:
     """Return values rounded to float32, in rows of their own."""
     return np.ascontiguousarray(values, dtype=np.float32)
 

@@ -14,7 +14,8 @@ from torchrg.errors import ConfigError
 from torchrg.scenes.geometry import Array, Floats
 from torchrg.scenes.surfaces import Solid, Surface
 
-_HAIR = 1e-7  # how far in front of a surface must be free for it to be seen, in scene sizes
+_CLEARANCE = 1e-7
+"""How far in front of a surface must be free for it to be seen, in sizes of the scene."""
 
 
 class Scene(NamedTuple):
@@ -50,12 +51,7 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """An object: its visible surfaces, and the bodies that hide what is inside them.
-
-    Args:
-        surfaces: Pieces of surface, each a face of its own.
-        solids: Bodies.
-    """
+    """An object: its visible surfaces, each a face, and the bodies that hide what is in them."""
 
     surfaces: tuple[Surface, ...]
     solids: tuple[Solid, ...] = ()
@@ -100,39 +96,41 @@ class SceneModel:
         boxes = np.stack([surface.bounds for surface in self.surfaces])
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
-    @cached_property
-    def hair(self) -> float:
-        """Length by which what is in front of a face is told from what touches it."""
-        return _HAIR * float((self.bounds[1] - self.bounds[0]).max())
+    def is_visible(self, face: int, points: Array, normals: Array) -> NDArray[np.bool_]:
+        """Return at which points of a face there is free space in front of it, shape ``(N,)``."""
+        free = np.ones(len(points), dtype=bool)
+        if self._touching[face]:
+            front = points + self._clearance * normals
+            for solid in self._touching[face]:
+                free &= ~solid.contains(front)
+        return free
 
     @cached_property
-    def touching(self) -> tuple[tuple[Solid, ...], ...]:
+    def _clearance(self) -> float:
+        """Length by which what is in front of a face is told from what touches it."""
+        return _CLEARANCE * float((self.bounds[1] - self.bounds[0]).max())
+
+    @cached_property
+    def _touching(self) -> tuple[tuple[Solid, ...], ...]:
         """For each face the bodies that may cover part of it."""
         return tuple(
             tuple(
                 solid
                 for solid in self.solids
-                if (solid.bounds[0] <= surface.bounds[1] + self.hair).all()
-                and (solid.bounds[1] >= surface.bounds[0] - self.hair).all()
+                if (solid.bounds[0] <= surface.bounds[1] + self._clearance).all()
+                and (solid.bounds[1] >= surface.bounds[0] - self._clearance).all()
             )
             for surface in self.surfaces
         )
 
-    def visible(self, face: int, points: Array, normals: Array) -> NDArray[np.bool_]:
-        """Return at which points of a face there is free space in front of it, shape ``(N,)``."""
-        free = np.ones(len(points), dtype=bool)
-        if self.touching[face]:
-            front = points + self.hair * normals
-            for solid in self.touching[face]:
-                free &= ~solid.contains(front)
-        return free
 
-    def occupied(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points of shape ``(N, 3)`` are inside a body."""
-        inside = np.zeros(len(points), dtype=bool)
-        for solid in self.solids:
+def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
+    """Return which points of shape ``(N, 3)`` are inside a body."""
+    inside = np.zeros(len(points), dtype=bool)
+    for part in parts:
+        for solid in part.solids:
             inside |= solid.contains(points)
-        return inside
+    return inside
 
 
 def plane_table(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
@@ -148,21 +146,9 @@ def label_points(
     points: Floats,
     labels: NDArray[np.int64],
     normals: Floats,
-    paint: np.random.Generator | None,
+    colors: NDArray[np.uint8] | None = None,
 ) -> Scene:
-    """Return points of known faces as a cloud with the tables of its scene.
-
-    Args:
-        model: The scene.
-        points: Shape ``(N, 3)``, float32.
-        labels: Faces, or ``UNLABELED``, shape ``(N,)``.
-        normals: Shape ``(N, 3)``, float32.
-        paint: Generator of the colours; None for none.
-
-    Returns:
-        The cloud and its truth.
-    """
-    colors = None if paint is None else torch.from_numpy(_colors(model, labels, paint))
+    """Return points ``(N, 3)`` of known faces ``(N,)`` as a cloud with the tables of its scene."""
     face_normals, face_offsets = model.planes
     return Scene(
         points=torch.from_numpy(points),
@@ -174,24 +160,16 @@ def label_points(
         face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),
         kinds=tuple(surface.kind for surface in model.surfaces),
         objects=torch.from_numpy(model.objects),
-        colors=colors,
+        colors=None if colors is None else torch.from_numpy(colors),
     )
 
 
-def _colors(
-    model: SceneModel, labels: NDArray[np.int64], rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Return a colour for each point: that of its object, grey for outliers, a little uneven."""
-    palette = rng.integers(60, 230, size=(len(model.parts) + 1, 3))
-    object_of = np.append(model.objects, len(model.parts))
-    shades: NDArray[np.int64] = palette[object_of[labels]] + rng.integers(
-        -12, 13, size=(len(labels), 1)
-    )
-    return shades.astype(np.uint8)
+def seeded_generator(seed: int, purpose: int) -> np.random.Generator:
+    """Return one of several independent generators that belong to a seed, one for each purpose.
 
-
-def random_stream(seed: int, number: int) -> np.random.Generator:
-    """Return one of several independent random generators that belong to a seed."""
+    Raises:
+        ConfigError: If the seed is negative.
+    """
     if seed < 0:
         raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
-    return np.random.Generator(np.random.PCG64([seed, number]))
+    return np.random.Generator(np.random.PCG64([seed, purpose]))

@@ -1,4 +1,4 @@
-"""Rooms without furniture: walls, straight or bent, and holes in them."""
+"""Rooms without furniture: floor, ceiling, walls straight or bent, and holes in walls."""
 
 from collections.abc import Sequence
 
@@ -7,9 +7,41 @@ import numpy as np
 from torchrg.scenes.geometry import Frame, Triple
 from torchrg.scenes.round import Cone
 from torchrg.scenes.scene import Part
-from torchrg.scenes.surfaces import Drum, Surface, rectangle
+from torchrg.scenes.surfaces import Drum, Hole, Surface, rectangle
 
-Hole = tuple[float, float, float, float]
+
+def shell(
+    room: Frame,
+    size: Triple,
+    holes: Sequence[Sequence[Hole]],
+    *,
+    bends: Sequence[float] = (0, 0, 0, 0),
+    with_floor: bool = True,
+) -> Part:
+    """Return floor, ceiling and four walls with holes in them.
+
+    Args:
+        room: Its origin is a corner of the floor.
+        size: Length, width and height.
+        holes: Of each wall of :func:`room_walls`, in its first two axes.
+        bends: How far the middle of each wall bulges into the room; 0 for a flat wall. Bent walls
+            have no holes.
+        with_floor: Whether there is a floor; it is the first face.
+    """
+    length, width, height = size
+    above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
+    surfaces: list[Surface] = [rectangle("floor", room, length, width)] if with_floor else []
+    surfaces.append(rectangle("ceiling", above, length, width))
+    solids: list[Drum] = []
+    walls = zip(room_walls(room, size), (length, width) * 2, holes, bends, strict=True)
+    for frame, along, openings, bend in walls:
+        if bend > 0:
+            surface, body = _bent_wall(frame, along, height, bend)
+            surfaces.append(surface)
+            solids.append(body)
+        else:
+            surfaces.append(rectangle("wall", frame, along, height, openings))
+    return Part(tuple(surfaces), tuple(solids))
 
 
 def room_walls(room: Frame, size: Triple) -> list[Frame]:
@@ -29,54 +61,12 @@ def room_walls(room: Frame, size: Triple) -> list[Frame]:
     ]
 
 
-def shell(
-    room: Frame,
-    size: Triple,
-    holes: Sequence[Sequence[Hole]],
-    *,
-    bends: Sequence[float] = (0, 0, 0, 0),
-    with_floor: bool = True,
-) -> Part:
-    """Return floor, ceiling and four walls with holes in them.
-
-    Args:
-        room: Its origin is a corner of the floor.
-        size: Length, width and height.
-        holes: For each wall its holes; see :func:`room_walls`.
-        bends: How far the middle of each wall bulges into the room; 0 for a flat wall. Bent walls
-            have no holes.
-        with_floor: Whether there is a floor.
-
-    Returns:
-        The faces, the floor first.
-
-    Example:
-        >>> walls = shell(Frame.upright(np.zeros(3)), (4, 3, 2.5), [[]] * 4).surfaces
-        >>> [wall.area for wall in walls]
-        [12.0, 12.0, 10.0, 7.5, 10.0, 7.5]
-    """
-    length, width, height = size
-    above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
-    surfaces: list[Surface] = [rectangle("floor", room, length, width)] if with_floor else []
-    surfaces.append(rectangle("ceiling", above, length, width))
-    solids: list[Drum] = []
-    walls = zip(room_walls(room, size), (length, width) * 2, holes, bends, strict=True)
-    for frame, along, openings, bend in walls:
-        if bend > 0:
-            surface, body = _bent_wall(frame, along, height, bend)
-            surfaces.append(surface)
-            solids.append(body)
-        else:
-            surfaces.append(rectangle("wall", frame, along, height, openings))
-    return Part(tuple(surfaces), tuple(solids))
-
-
 def _bent_wall(wall: Frame, length: float, height: float, bend: float) -> tuple[Cone, Drum]:
     """Return an arc of a large cylinder through both ends of a wall, and what is behind it."""
     radius = length * length / (8 * bend) + bend / 2
     axis = wall.placed((length / 2, 0, bend - radius), (0, 0, 1), (1, 0, 0))
-    half_turn = float(np.arcsin(length / 2 / radius))
-    surface = Cone("wall", axis, (radius, 0), (radius, height), (-half_turn, half_turn))
+    half = float(np.arcsin(length / 2 / radius))
+    surface = Cone("wall", axis, (radius, 0), (radius, height), (-half, half))
     return surface, Drum(axis, radius, height)
 
 
@@ -86,16 +76,8 @@ def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
     Args:
         kind: What the leaf is; the sides are called ``kind`` and "frame".
         wall: First axis along the wall, second up, third into the room.
-        hole: Left, right, low and high end of the hole along the first two axes.
+        hole: In the first two axes of the wall.
         depth: How far behind the wall the leaf is.
-
-    Returns:
-        Five faces.
-
-    Example:
-        >>> wall = Frame.spanned(np.zeros(3), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]))
-        >>> recess("door", wall, (1, 2, 0.02, 2), 0.1).surfaces[0].frame.origin.tolist()
-        [1.0, 0.1, 0.02]
     """
     left, right, low, high = hole
     leaf = rectangle(kind, wall.moved(left, low, -depth), right - left, high - low)
@@ -105,17 +87,7 @@ def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
 
 
 def passage(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
-    """Return the left, right and upper side of a hole through a wall.
-
-    Args:
-        kind: What they are.
-        wall: First axis along the wall, second up, third into the room.
-        hole: Left, right, low and high end of the hole along the first two axes.
-        depth: Thickness of the wall.
-
-    Returns:
-        Three faces.
-    """
+    """Return the left, right and upper side of a hole through a wall of a thickness ``depth``."""
     left, right, low, high = hole
     sides = (
         ((left, low, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), high - low),
@@ -128,21 +100,10 @@ def passage(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
 
 
 def against(wall: Frame, along: float, height: float, depth: float) -> Frame:
-    """Return the frame of an object with its back against a wall.
+    """Return the frame of an object of a depth with its back against a wall.
 
-    Args:
-        wall: See :func:`room_walls`.
-        along: Distance of the object's middle from the start of the wall.
-        height: Of the object's base.
-        depth: Of the object.
-
-    Returns:
-        First axis along the wall, second into it, third up; the origin is the middle of the base.
-
-    Example:
-        >>> wall = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))[0]
-        >>> against(wall, 1, 0.5, 0.4).origin.tolist()
-        [3.0, 0.2, 0.5]
+    Its first axis is along the wall, the second into it, the third up; its origin is the middle
+    of its base, ``along`` from the start of the wall and ``height`` above the floor.
     """
     along_axis, up, inwards = wall.axes
     return Frame(wall.moved(along, height, depth / 2).origin, np.stack([along_axis, -inwards, up]))

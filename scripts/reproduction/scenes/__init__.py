@@ -1,4 +1,12 @@
-"""Shapes, halls, storeys and depth cameras: the scenes that only the reproduction needs."""
+"""Shapes, halls, storeys, laser scans and depth cameras: scenes that only the reproduction needs.
+
+To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
+each a face, and solids that hide what is inside them; see ``torchrg.scenes.furniture`` and
+``shells``) and places where a scanner may stand. :func:`torchrg.scenes.sample_scene` turns it into
+a cloud with truth. A new kind of surface has the properties and methods of
+``torchrg.scenes.surfaces.Surface``, and ``intersect`` (as in ``rays``) if it is scanned. A part of
+the report takes it once it has a key in ``reproduction.clouds``, or in ``shapes.SHAPES``.
+"""
 
 from reproduction.scenes.cameras import (
     KINECT_LAYOUT,
@@ -9,12 +17,12 @@ from reproduction.scenes.cameras import (
     make_kinect_room,
     render_depth,
 )
+from reproduction.scenes.rays import cast_rays, scan_scene
 from reproduction.scenes.shapes import SHAPES, make_shape
 from reproduction.scenes.storeys import (
     HALL_LAYOUT,
     StoreyLayout,
     build_storey,
-    make_hall,
     make_storey,
 )
 
@@ -27,10 +35,11 @@ __all__ = [
     "StoreyLayout",
     "build_storey",
     "cameras_around",
+    "cast_rays",
     "fuse_frames",
-    "make_hall",
     "make_kinect_room",
     "make_shape",
     "make_storey",
     "render_depth",
+    "scan_scene",
 ]

@@ -1,4 +1,4 @@
-"""Pinhole cameras."""
+"""Depth cameras: pinhole geometry, the noise of a Kinect, and frames fused to a cloud."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,16 +9,43 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from reproduction.scenes.rays import cast_rays
 from torchrg.errors import ConfigError
-from torchrg.scenes.geometry import Array, Frame, cos_sin, cross, unit
-from torchrg.scenes.rooms import RoomLayout, build_room
-from torchrg.scenes.sampling import cast_rays
-from torchrg.scenes.scene import Scene, SceneModel, label_points, random_stream
+from torchrg.scenes import RoomLayout, Scene, SceneModel, build_room
+from torchrg.scenes.geometry import Array, Frame, unit
+from torchrg.scenes.scene import label_points, seeded_generator
 from torchrg.structures import UNLABELED
 
-_CAMERA_STREAM = 300
+Sensor = Literal["exact", "kinect"]
+
+_SENSOR_NOISE, _CAMERAS, _FUSION = 200, 300, 400
+"""What random numbers are drawn for."""
+
 _GOLDEN_ANGLE = (3 - np.sqrt(5)) * np.pi
-_STEEPEST = 0.5  # tangent of the steepest look downwards
+_STEEPEST = 0.5
+"""Tangent of the steepest look downwards."""
+
+_KINECT_BASELINE = 0.075
+"""Metres."""
+_KINECT_RANGE = (0.4, 8.0)
+"""Metres."""
+_DISPARITY_STEP = 1 / 8
+"""Pixels."""
+_NOISE_FLOOR, _NOISE_GROWTH = 0.0012, 0.0019
+"""Standard deviation at the nearest depth, metres, and its growth with the square beyond it."""
+
+KINECT_LAYOUT = RoomLayout(
+    size=(5.4, 4.4, 2.6),
+    num_doors=1,
+    num_windows=1,
+    num_cabinets=1,
+    num_tables=2,
+    num_boxes=1,
+    num_small_boxes=2,
+    num_pillars=0,
+    num_viewpoints=2,
+)
+"""An office small enough for the range of a Kinect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +60,8 @@ class Camera:
         frame: Position and axes in the world.
         width: Pixels in a row.
         height: Pixels in a column.
-        fx: Focal length in pixels.
-        fy: Focal length in pixels.
-        cx: Column of the optical axis. Default: the middle.
-        cy: Row of the optical axis. Default: the middle.
+        fx: Focal length in pixels; ``fy``: the same for columns.
+        cx: Column of the optical axis, ``cy`` its row. Default: the middle.
 
     Example:
         >>> camera = Camera.looking((1, 1, 1.5), (4, 1, 1.5))
@@ -64,15 +89,7 @@ class Camera:
     ) -> "Camera":
         """Return an upright camera that looks at a place, not straight up or down.
 
-        Args:
-            position: Where it is, shape ``(3,)``.
-            target: What is in the middle of the picture, shape ``(3,)``.
-            width: Pixels in a row.
-            height: Pixels in a column.
-            focal: Focal length in pixels. Default: as wide a view as that of a Kinect.
-
-        Returns:
-            The camera.
+        ``focal`` is the focal length in pixels; by default the view is as wide as a Kinect's.
 
         Raises:
             ConfigError: If the view is vertical.
@@ -82,8 +99,8 @@ class Camera:
         if not forwards[:2].any():
             raise ConfigError("Camera: expected a target not above or below the position.")
         forwards = unit(forwards)
-        right = unit(cross(forwards, np.array([0, 0, 1.0])))
-        frame = Frame(origin, np.stack([right, cross(forwards, right), forwards]))
+        right = unit(np.cross(forwards, np.array([0, 0, 1.0])))
+        frame = Frame(origin, np.stack([right, np.cross(forwards, right), forwards]))
         focal = 525 * width / 640 if focal is None else focal
         return cls(frame, width, height, focal, focal)
 
@@ -122,39 +139,23 @@ def cameras_around(
 ) -> list[Camera]:
     """Return cameras at the viewpoints of a scene, as of someone who turns around and looks down.
 
-    Args:
-        model: The scene.
-        num_cameras: How many; they take turns at the viewpoints, in directions apart by the golden
-            angle.
-        seed: Of the first direction and of how far down they look.
-        width: Pixels in a row.
-        height: Pixels in a column.
-
-    Returns:
-        The cameras.
+    They take turns at the viewpoints, in directions apart by the golden angle; the seed is that of
+    the first direction and of how far down they look.
 
     Example:
         >>> from torchrg.scenes import build_room
         >>> len(cameras_around(build_room(), 5))
         5
     """
-    rng = random_stream(seed, _CAMERA_STREAM)
-    cosines, sines = cos_sin(rng.random() * 2 * np.pi + _GOLDEN_ANGLE * np.arange(num_cameras))
+    rng = seeded_generator(seed, _CAMERAS)
+    headings = rng.random() * 2 * np.pi + _GOLDEN_ANGLE * np.arange(num_cameras)
     drops = rng.random(num_cameras) * _STEEPEST
     cameras = []
-    for number, (cosine, sine, drop) in enumerate(zip(cosines, sines, drops, strict=True)):
+    for number, (heading, drop) in enumerate(zip(headings, drops, strict=True)):
         position = model.viewpoints[number % len(model.viewpoints)]
-        target = position + np.array([cosine, sine, -drop])
+        target = position + np.array([np.cos(heading), np.sin(heading), -drop])
         cameras.append(Camera.looking(position, target, width=width, height=height))
     return cameras
-
-
-Sensor = Literal["exact", "kinect"]
-
-_KINECT_BASELINE = 0.075  # metres
-_KINECT_RANGE = (0.4, 8.0)  # metres
-_DISPARITY_STEP = 1 / 8  # pixels
-_NOISE_STREAM = 200
 
 
 class DepthFrame(NamedTuple):
@@ -194,9 +195,6 @@ def render_depth(
         sensor: ``"exact"`` or ``"kinect"``.
         seed: Of the noise, and of the default camera.
 
-    Returns:
-        The frame.
-
     Raises:
         ConfigError: If there is no such sensor.
 
@@ -215,16 +213,16 @@ def render_depth(
         raise ConfigError(f"render_depth: expected sensor to be one of {options}, got {sensor!r}.")
     camera = cameras_around(model, 1, seed=seed)[0] if camera is None else camera
     rays = camera.rays()
-    steps = camera.frame.turned(rays.reshape(-1, 3))
+    steps = camera.frame.vectors_to_world(rays.reshape(-1, 3))
     exact, faces = cast_rays(model, camera.frame.origin, steps.reshape(rays.shape))
     normals = np.zeros_like(steps)
     for face, surface in enumerate(model.surfaces):
         rows = np.flatnonzero(faces == face)
         points = camera.frame.origin + exact.ravel()[rows, None] * steps[rows]
-        normals[rows] = camera.frame.turned_back(surface.normals_at(points))
+        normals[rows] = camera.frame.vectors_to_local(surface.normals_at(points))
     depth = np.where(faces == UNLABELED, 0, exact)
     if sensor == "kinect":
-        depth = _as_kinect(depth, camera.fx, random_stream(seed, _NOISE_STREAM))
+        depth = _as_kinect(depth, camera.fx, seeded_generator(seed, _SENSOR_NOISE))
     seen = depth > 0
     return DepthFrame(
         depth=torch.from_numpy(depth.astype(np.float32)),
@@ -241,51 +239,26 @@ def _as_kinect(depth: Array, focal: float, rng: np.random.Generator) -> Array:
     """Return depth with the noise and the steps of a Kinect; 0 where out of its range."""
     nearest, furthest = _KINECT_RANGE
     beyond = depth - nearest
-    noisy = depth + (0.0012 + 0.0019 * beyond * beyond) * rng.standard_normal(depth.shape)
+    noisy = depth + (_NOISE_FLOOR + _NOISE_GROWTH * beyond * beyond) * rng.standard_normal(
+        depth.shape
+    )
     scale = focal * _KINECT_BASELINE / _DISPARITY_STEP
     valid = (depth > 0) & (noisy >= nearest) & (noisy <= furthest)
     steps = np.rint(scale / np.where(valid, noisy, 1))
     return np.where(valid, scale / steps, 0)
 
 
-KINECT_LAYOUT = RoomLayout(
-    size=(5.4, 4.4, 2.6),
-    num_doors=1,
-    num_windows=1,
-    num_cabinets=1,
-    num_tables=2,
-    num_boxes=1,
-    num_small_boxes=2,
-    num_pillars=0,
-    num_viewpoints=2,
-)
-"""An office small enough for the range of a Kinect."""
-
-_FUSING_STREAM = 400
-
-
 def make_kinect_room(
     num_points: int = 968_520,
     seed: int = 0,
     *,
-    layout: RoomLayout | None = None,
     num_frames: int = 16,
     sensor: Sensor = "kinect",
 ) -> Scene:
     """Make a cloud of a room from simulated depth frames, placed by their true poses.
 
-    Convention:
-        As for :func:`make_room`; normals are those of the faces, towards free space.
-
-    Args:
-        num_points: Number of points, a random subset of the pixels with depth.
-        seed: Two calls with equal arguments give equal clouds, on every platform.
-        layout: What is in the room. Default: ``KINECT_LAYOUT``.
-        num_frames: Frames of 640 x 480 pixels, taken around the viewpoints of the room.
-        sensor: See :func:`render_depth`.
-
-    Returns:
-        The cloud and its truth, in random order.
+    The points are a random subset of the pixels with depth, in random order; normals are those of
+    the faces, towards free space.
 
     Raises:
         ConfigError: If a setting is not allowed, or the frames have too few pixels with depth.
@@ -294,7 +267,7 @@ def make_kinect_room(
         >>> make_kinect_room(1000, num_frames=1).points.shape
         torch.Size([1000, 3])
     """
-    model = build_room(seed, layout=layout or KINECT_LAYOUT)
+    model = build_room(seed, layout=KINECT_LAYOUT)
     frames = [
         render_depth(model, camera, sensor=sensor, seed=seed * num_frames + number)
         for number, camera in enumerate(cameras_around(model, num_frames, seed=seed))
@@ -305,16 +278,7 @@ def make_kinect_room(
 def fuse_frames(
     model: SceneModel, frames: Sequence[DepthFrame], num_points: int, *, seed: int = 0
 ) -> Scene:
-    """Return depth frames of one scene as one cloud.
-
-    Args:
-        model: The scene.
-        frames: The frames.
-        num_points: Number of points, a random subset of the pixels with depth.
-        seed: Of the choice and the order.
-
-    Returns:
-        The cloud and its truth, in random order.
+    """Return a random subset of the pixels with depth of frames of one scene, in random order.
 
     Raises:
         ConfigError: If the frames have too few pixels with depth.
@@ -332,7 +296,7 @@ def fuse_frames(
             f"fuse_frames: expected num_points in [1, {sum(counts)}], the pixels with depth, "
             f"got {num_points}; take fewer points or more frames."
         )
-    chosen = np.sort(random_stream(seed, _FUSING_STREAM).permutation(sum(counts))[:num_points])
+    chosen = np.sort(seeded_generator(seed, _FUSION).permutation(sum(counts))[:num_points])
     ends = np.cumsum([0, *counts])
     rows = [
         pixels[chosen[(chosen >= start) & (chosen < end)] - start]
@@ -342,13 +306,12 @@ def fuse_frames(
     points = np.concatenate([places for places, _, _ in fused])
     normals = np.concatenate([outwards for _, outwards, _ in fused])
     labels = np.concatenate([faces for _, _, faces in fused])
-    order = random_stream(seed, _FUSING_STREAM + 1).permutation(num_points)
+    order = seeded_generator(seed, _FUSION + 1).permutation(num_points)
     return label_points(
         model,
         points[order].astype(np.float32),
         labels[order],
         normals[order].astype(np.float32),
-        None,
     )
 
 
@@ -362,6 +325,6 @@ def _to_world(
     place = frame.camera.frame
     return (
         place.to_world(depth * rays),
-        place.turned(normals),
+        place.vectors_to_world(normals),
         frame.labels.numpy().ravel()[pixels],
     )

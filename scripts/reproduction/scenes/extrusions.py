@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.scenes.geometry import Array, Frame
+from torchrg.scenes.geometry import Array, Frame, box_around
 from torchrg.scenes.round import Cone
 from torchrg.scenes.surfaces import Plane, Surface, plane_of, rectangle
 
@@ -40,7 +40,7 @@ class Outline:
         return into, out
 
     @cached_property
-    def turns(self) -> Array:
+    def corner_sines(self) -> Array:
         """Sine of the turn at each corner, positive to the left, shape ``(M,)``."""
         into, out = self.ways
         sines: Array = into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0]
@@ -51,7 +51,7 @@ class Outline:
         """Distance from each corner to where its rounding starts, shape ``(M,)``."""
         into, out = self.ways
         # tan(turn / 2) = sin / (1 + cos)
-        reach: Array = self.radii * np.abs(self.turns) / (1 + (into * out).sum(axis=1))
+        reach: Array = self.radii * np.abs(self.corner_sines) / (1 + (into * out).sum(axis=1))
         return reach
 
     @cached_property
@@ -59,7 +59,7 @@ class Outline:
         """Middle of each rounding, shape ``(M, 2)``."""
         into, _ = self.ways
         left = np.stack([-into[:, 1], into[:, 0]], axis=1)
-        shift = (np.sign(self.turns) * self.radii)[:, None] * left
+        shift = (np.sign(self.corner_sines) * self.radii)[:, None] * left
         middles: Array = self.corners - self.tangents[:, None] * into + shift
         return middles
 
@@ -67,7 +67,7 @@ class Outline:
     def angles(self) -> Array:
         """Unsigned turn at each corner in radians, shape ``(M,)``."""
         into, out = self.ways
-        angles: Array = np.arctan2(np.abs(self.turns), (into * out).sum(axis=1))
+        angles: Array = np.arctan2(np.abs(self.corner_sines), (into * out).sum(axis=1))
         return angles
 
     @cached_property
@@ -78,7 +78,7 @@ class Outline:
         # Between a corner and its arc: a kite less a sector.
         cut = self.radii * self.tangents - self.radii**2 * self.angles / 2
         holes = sum(np.pi * radius**2 for _, _, radius in self.holes)
-        return float(whole - (np.sign(self.turns) * cut).sum() - holes)
+        return float(whole - (np.sign(self.corner_sines) * cut).sum() - holes)
 
     def contains(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """Return which places, of shape ``(N,)``, are inside."""
@@ -92,7 +92,7 @@ class Outline:
             kite = np.stack([before, point, after, self.centers[corner]])
             dx, dy = x - self.centers[corner, 0], y - self.centers[corner, 1]
             between = _in_polygon(x, y, kite) & (dx * dx + dy * dy > radius * radius)
-            inside = np.where(between, self.turns[corner] < 0, inside)
+            inside = np.where(between, self.corner_sines[corner] < 0, inside)
         for middle_x, middle_y, radius in self.holes:
             dx, dy = x - middle_x, y - middle_y
             inside &= dx * dx + dy * dy >= radius * radius
@@ -141,8 +141,7 @@ class Sheet:
             self.outline.corners.max(axis=0),
         )
         box = np.array([(x, y, 0) for x in (left, right) for y in (low, high)])
-        world = self.frame.to_world(box)
-        return np.stack([world.min(axis=0), world.max(axis=0)])
+        return box_around(self.frame.to_world(box))
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return points spread evenly over it, shape ``(count, 3)``."""
@@ -160,7 +159,7 @@ class Sheet:
 
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Return how far along each ray it is first met, shape ``(N,)``; infinite where never."""
-        start, step = self.frame.to_local(origins), self.frame.turned_back(directions)
+        start, step = self.frame.to_local(origins), self.frame.vectors_to_local(directions)
         distance = -start[:, 2] / np.where(step[:, 2] == 0, np.nan, step[:, 2])
         x, y = start[:, 0] + distance * step[:, 0], start[:, 1] + distance * step[:, 1]
         return np.where(self.outline.contains(x, y) & (distance > 0), distance, np.inf)
@@ -199,7 +198,7 @@ def extrude(kind: str, frame: Frame, outline: Outline, height: float) -> tuple[S
         span = Frame.spanned(np.array([*start, 0]), np.array([*edge, 0]), np.array([0, 0, 1.0]))
         width = float(np.sqrt((edge * edge).sum()))
         sides.append(rectangle(kind, span.inside(frame), width, height))
-    rounded = (int(corner) for corner in np.flatnonzero(outline.radii * outline.turns))
+    rounded = (int(corner) for corner in np.flatnonzero(outline.radii * outline.corner_sines))
     roundings = (_rounding(kind, frame, outline, corner, height) for corner in rounded)
     holes = (
         Cone(kind, frame.moved(x, y, 0), (radius, height), (radius, 0))
@@ -210,7 +209,7 @@ def extrude(kind: str, frame: Frame, outline: Outline, height: float) -> tuple[S
 
 def _rounding(kind: str, frame: Frame, outline: Outline, corner: int, height: float) -> Cone:
     """Return the side along a rounded corner: part of a cylinder, inside out for a fillet."""
-    convex = outline.turns[corner] > 0
+    convex = outline.corner_sines[corner] > 0
     tangent = outline.corners[corner] - outline.tangents[corner] * outline.ways[0][corner]
     first = np.array([*(tangent - outline.centers[corner]), 0])
     # From the first point of the arc the turn is to the left, or for a fillet to the right.

@@ -10,16 +10,20 @@ from numpy.typing import NDArray
 
 from reproduction.scenes.extrusions import Outline, extrude
 from torchrg.errors import ConfigError
+from torchrg.scenes import Scene, SceneModel, sample_scene
 from torchrg.scenes.furniture import block
-from torchrg.scenes.geometry import Array, Frame, cos_sin, dot, unit
+from torchrg.scenes.geometry import Array, Frame, unit
 from torchrg.scenes.round import Cone, Ring
-from torchrg.scenes.sampling import NoiseDirection, Order, sample_scene
-from torchrg.scenes.scene import Part, Scene, SceneModel
-from torchrg.scenes.surfaces import Surface, polygon, rectangle
+from torchrg.scenes.sampling import NoiseDirection
+from torchrg.scenes.scene import Part
+from torchrg.scenes.surfaces import Flat, Surface, rectangle
 
-_NODES = 96  # of the quadrature for the area
-_STEPS = 512  # along a ray; a graze shorter than one of them is not seen
+_NODES = 96
+"""Of the quadrature for the area."""
+_STEPS = 512
+"""Along a ray; a graze shorter than one of them is not seen."""
 _HALVINGS = 48
+"""Of a step, to find where it crosses the surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +60,9 @@ class Bumpy:
     def area(self) -> float:
         """Its area, by quadrature."""
         z, weights = np.polynomial.legendre.leggauss(_NODES)
-        cosine, sine = cos_sin(np.arange(2 * _NODES) * (np.pi / _NODES))
-        flat = np.sqrt(1 - z * z)[:, None]
-        towards = np.stack(np.broadcast_arrays(flat * cosine, flat * sine, z[:, None]), axis=-1)
+        angle, flat = np.arange(2 * _NODES) * (np.pi / _NODES), np.sqrt(1 - z * z)[:, None]
+        sides = (flat * np.cos(angle), flat * np.sin(angle), z[:, None])
+        towards = np.stack(np.broadcast_arrays(*sides), axis=-1)
         elements = self._elements(towards.reshape(-1, 3)).reshape(_NODES, 2 * _NODES)
         return float((elements * weights[:, None]).sum() * np.pi / _NODES)
 
@@ -86,14 +90,14 @@ class Bumpy:
         """Return the outward unit normals at points on it, shape ``(N, 3)``."""
         towards = unit(self.frame.to_local(points))
         radius, slope = self._radius(towards)
-        return self.frame.turned(unit(radius[:, None] * towards - slope))
+        return self.frame.vectors_to_world(unit(radius[:, None] * towards - slope))
 
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Return how far along each ray it is first met, shape ``(N,)``; infinite where never.
 
         The ray is followed in small steps, so that it may miss what it only grazes.
         """
-        start, step = self.frame.to_local(origins), self.frame.turned_back(directions)
+        start, step = self.frame.to_local(origins), self.frame.vectors_to_local(directions)
         near, far = self._entry_and_exit(start, step)
         nearest = np.full(len(step), np.inf)
         rows = np.flatnonzero(far > near)
@@ -113,8 +117,8 @@ class Bumpy:
     def _entry_and_exit(self, start: Array, step: Array) -> tuple[Array, Array]:
         """Return where rays are inside the ball around the body; exit before entry if never."""
         reach = self.radius * (1 + np.abs(self.heights).sum())
-        a, b = dot(step, step), dot(start, step)
-        discriminant = b * b - a * (dot(start, start) - reach * reach)
+        a, b = np.vecdot(step, step), np.vecdot(start, step)
+        discriminant = b * b - a * (np.vecdot(start, start) - reach * reach)
         half = np.sqrt(np.maximum(discriminant, 0))
         far = np.where(discriminant > 0, (half - b) / a, -np.inf)
         return np.maximum((-half - b) / a, 0), far
@@ -122,7 +126,7 @@ class Bumpy:
     def _is_outside(self, start: Array, step: Array, distance: Array) -> NDArray[np.bool_]:
         """Return whether places along rays are outside of the body."""
         places = start + distance[:, None] * step
-        lengths = np.sqrt(dot(places, places))
+        lengths = np.sqrt(np.vecdot(places, places))
         outside: NDArray[np.bool_] = lengths > self._radius(places / lengths[:, None])[0]
         return outside
 
@@ -140,16 +144,16 @@ class Bumpy:
         """Return radius ``(N,)`` and its slope on the unit sphere ``(N, 3)`` in directions."""
         radius, slope = np.ones(len(towards)), np.zeros(towards.shape)
         for axis, height in zip(self.axes, self.heights, strict=True):
-            value, derivative = _chebyshev(dot(towards, axis), self.degree)
+            value, derivative = _chebyshev(np.vecdot(towards, axis), self.degree)
             radius += height * value
-            across = axis - dot(towards, axis)[:, None] * towards
+            across = axis - np.vecdot(towards, axis)[:, None] * towards
             slope += (height * derivative)[:, None] * across
         return self.radius * radius, self.radius * slope
 
     def _elements(self, towards: Array) -> Array:
         """Return the area of the surface by solid angle in directions, shape ``(N,)``."""
         radius, slope = self._radius(towards)
-        elements: Array = radius * np.sqrt(radius * radius + dot(slope, slope))
+        elements: Array = radius * np.sqrt(radius * radius + np.vecdot(slope, slope))
         return elements
 
 
@@ -176,7 +180,6 @@ def make_shape(
     seed: int = 0,
     *,
     noise_direction: NoiseDirection = "isotropic",
-    order: Order = "random",
 ) -> Scene:
     """Make a cloud of a closed shape of about unit size with exact outward normals.
 
@@ -185,10 +188,9 @@ def make_shape(
         num_points: Number of points, spread evenly.
         noise_fraction: Standard deviation of the noise, as a share of the diagonal of the box
             around the shape.
-        seed: Two calls with equal arguments give equal clouds, on every platform.
+        seed: Two calls with equal arguments give equal clouds.
         noise_direction: ``"isotropic"``: that deviation along each coordinate; ``"normal"``:
             along the normal only.
-        order: ``"random"`` or ``"face"``.
 
     Returns:
         The cloud and its truth.
@@ -212,7 +214,6 @@ def make_shape(
         noise=noise_fraction * diagonal,
         seed=seed,
         noise_direction=noise_direction,
-        order=order,
     )
 
 
@@ -230,8 +231,16 @@ def _convex(corners: Array, directions: Array) -> tuple[Surface, ...]:
         face = corners[heights > heights.max() - 1e-6]
         frame = Frame.spanned(face.mean(axis=0), face[0] - face.mean(axis=0), face[1] - face[0])
         x, y, z = (*frame.to_local(face).T[:2], frame.axes[2] @ normal)
-        faces.append(polygon("side", face[np.argsort(np.arctan2(y * np.sign(z), x))]))
+        faces.append(_polygon("side", face[np.argsort(np.arctan2(y * np.sign(z), x))]))
     return tuple(faces)
+
+
+def _polygon(kind: str, corners: Array) -> Flat:
+    """Return a convex polygon, given its corners counterclockwise seen from outside."""
+    frame = Frame.spanned(corners[0], corners[1] - corners[0], corners[2] - corners[0])
+    flat = frame.to_local(corners)[:, :2]
+    fan = [[(0.0, 0.0), tuple(left), tuple(right)] for left, right in pairwise(flat[1:])]
+    return Flat(kind, frame, np.array(fan), triangular=True)
 
 
 def _signs(*values: float) -> Array:
@@ -255,7 +264,8 @@ def _dodecahedron() -> tuple[Surface, ...]:
 
 
 def _hexagonal_prism() -> tuple[Surface, ...]:
-    corners = 0.5 * np.stack(cos_sin(np.arange(6) * (np.pi / 3)), axis=1)
+    angles = np.arange(6) * (np.pi / 3)
+    corners = 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return extrude("side", _HERE, Outline(corners, np.zeros(6)), 0.7)
 
 

@@ -1,17 +1,17 @@
-"""Storeys: a hallway and furnished rooms along it, joined by open doors."""
+"""Hallways, and storeys: a hallway and furnished rooms along it, joined by open doors."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from torchrg.errors import ConfigError
+from torchrg.scenes import RoomLayout, Scene, SceneModel, sample_scene
 from torchrg.scenes.furniture import SIDES, between, block
 from torchrg.scenes.geometry import Frame, Triple
-from torchrg.scenes.rooms import RoomLayout, free_places, furnish, make_room
-from torchrg.scenes.sampling import Density, NoiseDirection, Order, sample_scene
-from torchrg.scenes.scene import Part, Scene, SceneModel, random_stream
-from torchrg.scenes.shells import Hole, passage, room_walls
-from torchrg.scenes.surfaces import Flat
+from torchrg.scenes.rooms import free_places, furnish
+from torchrg.scenes.scene import Part, seeded_generator
+from torchrg.scenes.shells import passage, room_walls
+from torchrg.scenes.surfaces import Flat, Hole
 
 HALL_LAYOUT = RoomLayout(
     size=(24.0, 2.4, 2.7),
@@ -30,48 +30,16 @@ HALL_LAYOUT = RoomLayout(
 """A hallway with doors on both sides."""
 
 
-def make_hall(
-    num_points: int = 579_313,
-    noise: float = 0.003,
-    seed: int = 0,
-    *,
-    noise_direction: NoiseDirection = "normal",
-    density: Density = "uniform",
-    order: Order = "random",
-) -> Scene:
-    """Make a cloud of a hallway with doors: :func:`make_room` with ``HALL_LAYOUT``.
-
-    Args:
-        num_points: Number of points.
-        noise: Standard deviation of the noise, in metres.
-        seed: Two calls with equal arguments give equal clouds, on every platform.
-        noise_direction: See :func:`sample_scene`.
-        density: See :func:`sample_scene`.
-        order: See :func:`sample_scene`.
-
-    Returns:
-        The cloud and its truth.
-
-    Raises:
-        ConfigError: If a setting is not allowed.
-
-    Example:
-        >>> make_hall(1000).kinds.count("door")
-        14
-    """
-    return make_room(
-        num_points,
-        noise,
-        seed,
-        layout=HALL_LAYOUT,
-        noise_direction=noise_direction,
-        density=density,
-        order=order,
-    )
-
-
-HALL_WALLS = (0, 2)  # the long walls of the hallway
+HALL_WALLS = (0, 2)
+"""The long walls of the hallway."""
 _DOOR_HEIGHT = (1.98, 2.15)
+"""Metres."""
+_DOOR_LEAF = 0.04
+"""Thickness, metres."""
+_FIRST_WALL = 0
+"""Of a room: the one along the hallway."""
+_STOREY = 500
+"""What random numbers are drawn for: rooms and what is in them."""
 
 _HALL = replace(HALL_LAYOUT, size=(24.0, 2.4, 2.5), num_doors=2, num_cabinets=1, num_panels=2)
 _ROOM = RoomLayout(
@@ -190,54 +158,23 @@ def _spread(rng: np.random.Generator, count: int, ends: tuple[float, float]) -> 
     return [float(value) for value in low + (high - low) * steps / count]
 
 
-_STOREY_STREAM = 500
-_DOOR_LEAF = 0.04  # thickness, metres
-_FIRST_WALL = 0  # of a room: the one along the hallway
-
-
 def make_storey(
     num_points: int = 1_097_901,
     noise: float = 0.003,
     seed: int = 0,
     *,
     layout: StoreyLayout | None = None,
-    noise_direction: NoiseDirection = "normal",
-    density: Density = "uniform",
-    order: Order = "random",
 ) -> Scene:
-    """Make a cloud of a hallway and the furnished rooms along it.
+    """Make a cloud of a hallway and the furnished rooms along it; see :func:`build_storey`.
 
     The floor runs through the open doors and is one face; every ceiling is at a height of its own.
     Within each room no face lies in the plane of another.
-
-    Args:
-        num_points: Number of points.
-        noise: Standard deviation of the noise, in metres.
-        seed: Two calls with equal arguments give equal clouds, on every platform.
-        layout: Number and sizes of the rooms, and what is in them. Default: ``StoreyLayout()``.
-        noise_direction: See :func:`sample_scene`.
-        density: See :func:`sample_scene`.
-        order: See :func:`sample_scene`.
-
-    Returns:
-        The cloud and its truth.
-
-    Raises:
-        ConfigError: If a setting is not allowed, or a room too small for its furniture.
 
     Example:
         >>> make_storey(1000).kinds.count("ceiling")
         9
     """
-    return sample_scene(
-        build_storey(seed, layout=layout),
-        num_points,
-        noise=noise,
-        seed=seed,
-        noise_direction=noise_direction,
-        density=density,
-        order=order,
-    )
+    return sample_scene(build_storey(seed, layout=layout), num_points, noise=noise, seed=seed)
 
 
 def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneModel:
@@ -257,7 +194,7 @@ def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneM
         >>> build_storey().surfaces[0].kind
         'floor'
     """
-    layout, rng = layout or StoreyLayout(), random_stream(seed, _STOREY_STREAM)
+    layout, rng = layout or StoreyLayout(), seeded_generator(seed, _STOREY)
     width = layout.hall.size[1]
     rooms = draw_rooms(layout, width, rng)
     length = max(room.left + room.size[0] for room in rooms) + between(rng, 0.2, 0.5)
@@ -281,15 +218,15 @@ def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneM
 
 def _floor(rooms: list[StoreyRoom], length: float, width: float) -> Flat:
     """Return the floor of the hallway, the rooms and the doorways between them."""
-    pieces = [[(0.0, 0.0), (length, 0.0), (0.0, width)]]
+    cells = [[(0.0, 0.0), (length, 0.0), (0.0, width)]]
     for room in rooms:
         corners = np.array([(0, 0, 0), (room.size[0], room.size[1], 0)])
         (left, low), (right, high) = np.sort(room.frame.to_world(corners)[:, :2], axis=0)
-        pieces.append([(left, low), (right - left, 0), (0, high - low)])
+        cells.append([(left, low), (right - left, 0), (0, high - low)])
         start, end = room.span()
         below = -room.thickness if room.hall_wall == HALL_WALLS[0] else width
-        pieces.append([(start, below), (end - start, 0), (0, room.thickness)])
-    return Flat("floor", Frame.upright(np.zeros(3)), np.array(pieces))
+        cells.append([(start, below), (end - start, 0), (0, room.thickness)])
+    return Flat("floor", Frame.upright(np.zeros(3)), np.array(cells))
 
 
 def _open_door(room: StoreyRoom, rng: np.random.Generator) -> Part:
@@ -297,7 +234,7 @@ def _open_door(room: StoreyRoom, rng: np.random.Generator) -> Part:
     left, right, top = room.door
     hinge = left - 0.1 if left < room.size[0] / 2 else right + 0.1
     frame = room.frame.moved(hinge, 0.05 + (right - left) / 2, between(rng, 0.01, 0.03))
-    turned = Frame.upright(np.zeros(3), between(rng, -6, 6)).inside(frame)
+    ajar = Frame.upright(np.zeros(3), between(rng, -6, 6)).inside(frame)
     size = (_DOOR_LEAF, right - left, top - 0.04)
     names = dict.fromkeys((*SIDES[2:], "bottom", "top"), "door edge")
-    return block("door", turned, size, kinds=names)
+    return block("door", ajar, size, kinds=names)
