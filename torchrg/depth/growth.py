@@ -83,11 +83,11 @@ def grow_pixels(
     image = cloud.seen.view(pixels.flat.shape)
     beside = torch.stack([image & moved(image, step, fill=False) for step in AROUND], dim=-1)
     touching = Neighbors(rows, _with_self(beside))
-    labels, fit, curved = refine_pixels(cloud, labels, touching, config)
+    labels, fit = refine_pixels(cloud, labels, touching, config)
     distance = (fit.normal * fit.center).sum(dim=1)
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
     away = torch.where(fit.normal[:, 2:] < 0, -away, away)
-    return PixelRegions(labels, -away / away.norm(dim=1, keepdim=True), curved)
+    return PixelRegions(labels, -away / away.norm(dim=1, keepdim=True), fit.curved)
 
 
 def _joins(

@@ -1,4 +1,9 @@
-"""Which neighbours may join a region: tests of single edges, each a function of tensors."""
+"""Which neighbours may join a region: one criterion a function.
+
+Each tests the edges from a block of points, ``rows``, to their neighbours, ``indices`` of shape
+``(n, K)``, and returns which of them pass, shape ``(n, K)``, bool. A new criterion is a setting, a
+function here, and the line of :func:`torchrg.regions.edges.accept_edges` that calls it.
+"""
 
 import math
 from collections.abc import Sequence
@@ -61,6 +66,78 @@ def sq_chords(
     result += second.mul_(second)
     result += third.mul_(third)
     return result
+
+
+def are_valid(valid: Tensor, rows: slice, indices: Tensor) -> Tensor:
+    """Tell which edges lead from one valid point to another one."""
+    own = torch.arange(len(valid), device=indices.device)[rows, None]
+    return _of_neighbors(valid, indices) & valid[rows, None] & (indices != own)
+
+
+def within_angle(
+    normals: Tensor, rows: slice, indices: Tensor, *, max_angle_deg: float, signed: bool
+) -> Tensor:
+    """Tell which neighbours' normals are within an angle of the point's, eq. (8)."""
+    if max_angle_deg >= 90 and not signed:
+        return torch.ones_like(indices, dtype=torch.bool)
+    columns = normals.unbind(dim=1)
+    own = [column[rows, None] for column in columns]
+    theirs = [_of_neighbors(column, indices) for column in columns]
+    return sq_chords(own, theirs, signed=signed) <= sq_chord_limit(max_angle_deg)
+
+
+def within_distance(values: Tensor, rows: slice, indices: Tensor, limit: float) -> Tensor:
+    """Tell which neighbours' values, places or colours ``(N, C)``, are within a distance."""
+    total = torch.zeros(indices.shape, dtype=values.dtype, device=values.device)
+    for column in values.unbind(dim=1):
+        difference = _of_neighbors(column, indices) - column[rows, None]
+        total += difference.mul_(difference)
+    return total <= limit**2
+
+
+def on_planes(
+    points: Tensor, normals: Tensor, reach: Tensor, rows: slice, indices: Tensor
+) -> Tensor:
+    """Tell which neighbours are within reach of the point's plane, and it of theirs."""
+    own = torch.zeros(indices.shape, dtype=points.dtype, device=indices.device)
+    theirs = torch.zeros_like(own)
+    for place, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
+        away = _of_neighbors(place, indices) - place[rows, None]
+        own += away * normal[rows, None]
+        theirs += away.mul_(_of_neighbors(normal, indices))
+    on_own = own.abs_() <= reach[rows, None]
+    return on_own & (theirs.abs_() <= _of_neighbors(reach, indices))
+
+
+def are_coplanar(
+    points: Tensor,
+    normals: Tensor,
+    neighbors: Neighbors,
+    rows: slice,
+    *,
+    asked: Tensor,
+    compared: Tensor | None,
+    floor_fraction: float,
+) -> Tensor:
+    """Tell which neighbours are on the point's plane by eq. (11), False where not asked.
+
+    The limit is taken over the neighbours ``compared``, shape ``(n, K)``, default all; its floor is
+    a fraction of the distance to the farthest neighbour.
+    """
+    needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
+    patches = gather_patches(points, neighbors.indices[rows][needed])
+    counted = None if neighbors.valid is None else neighbors.valid[rows][needed]
+    residuals = plane_residuals(patches, normals[rows][needed])
+    floor = floor_fraction * patch_radii(patches, counted)
+    limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[needed])
+    result = torch.zeros_like(asked)
+    result[needed] = residuals <= limits[:, None]
+    return result
+
+
+def _of_neighbors(values: Tensor, indices: Tensor) -> Tensor:
+    """Return the values ``(N,)`` of neighbours, shape ``(n, K)``."""
+    return values.index_select(0, indices.reshape(-1)).view(indices.shape)
 
 
 def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:
@@ -140,21 +217,10 @@ def patch_radii(patches: Tensor, mask: Tensor | None = None) -> Tensor:
         >>> patch_radii(torch.tensor([[[0.0, 0, 0], [0, 3, 4]]])).tolist()
         [5.0]
     """
-    sq_distances = patch_sq_distances(patches)
+    x, y, z = patches.unbind(dim=-1)
+    sq_distances = x * x
+    sq_distances += y * y
+    sq_distances += z * z
     if mask is not None:
         sq_distances = torch.where(mask, sq_distances, 0.0)
     return sq_distances.amax(dim=-1).sqrt()
-
-
-def patch_sq_distances(patches: Tensor) -> Tensor:
-    """Return the squared distance from each point to its neighbours, shape ``(n, K)``.
-
-    Example:
-        >>> patch_sq_distances(torch.tensor([[[0.0, 0, 0], [0, 3, 4]]])).tolist()
-        [[0.0, 25.0]]
-    """
-    x, y, z = patches.unbind(dim=-1)
-    result = x * x
-    result += y * y
-    result += z * z
-    return result

@@ -1,4 +1,4 @@
-"""The plane table: one plane fitted to each region."""
+"""The plane table: one plane fitted to each region, measured and classified."""
 
 import json
 import math
@@ -22,14 +22,30 @@ from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 _BISQUARE_CUT = 4.685
 """Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
 
-_NUM_ROUNDS = 4
+_NUM_FITS = 4
+"""So many reweighted fits settle the plane."""
+
 _FLAT_RATIO = 4.0
 """Where one variance is not this many times the next smaller one, rounding and noise decide between
 their directions."""
 
-
 _SAME_MAGNITUDE = 1e-6
 """Components of a normal that differ by less than this share are equal but for rounding."""
+
+_CURVED_SPREAD_DEG = 8.0
+"""A smooth bend by three to four times this angle has this spread."""
+
+_MAX_TILT_DEG = 15.0
+"""A floor or ceiling is within this angle of horizontal, a wall of vertical."""
+
+_END_SHARE = 0.15
+"""A floor lies in this lowest share of the cloud's height, a ceiling in the highest."""
+
+_LEAST_AREA_SHARE = 0.1
+"""A floor or ceiling has at least this share of the largest horizontal plane's area."""
+
+_LEAST_WALL_SHARE = 0.5
+"""A wall reaches over at least this share of the cloud's height."""
 
 
 class FittedPlanes(NamedTuple):
@@ -42,6 +58,8 @@ class FittedPlanes(NamedTuple):
         covariance: Weighted covariance, shape ``(M, 3, 3)``.
         thickness: Robust standard deviation of the points from the plane, shape ``(M,)``.
         residuals: Signed distance of each point, in the order of :meth:`Segments.take`.
+        num_points: Number of points, shape ``(M,)``, int64.
+        curved: Whether the points' normals are spread too much for a plane, shape ``(M,)``, bool.
     """
 
     normal: Tensor
@@ -50,6 +68,116 @@ class FittedPlanes(NamedTuple):
     covariance: Tensor
     thickness: Tensor
     residuals: Tensor
+    num_points: Tensor
+    curved: Tensor
+
+
+def summarize_planes(
+    points: Tensor | NDArray[np.floating],
+    normals: Tensor | NDArray[np.floating],
+    labels: Tensor | NDArray[np.integer],
+    *,
+    neighbors: Neighbors | None = None,
+    up: Sequence[float] | None = None,
+    outline: bool = False,
+) -> Planes:
+    """Fit a plane to each region and measure it.
+
+    Args:
+        points: Points, shape ``(N, 3)``; those without a label may hold anything.
+        normals: Unit normals of any sign, shape ``(N, 3)``. They tell curved regions from flat
+            ones, and decide where points do not: in regions of one or two points, or along a line.
+        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
+        neighbors: Neighbours of each point, to tell which planes meet.
+        up: The upward direction, to tell floors, ceilings and walls.
+        outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
+
+    Returns:
+        The table, M rows.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+        ConfigError: If ``up`` is not a direction.
+        MissingDependencyError: If outlines are asked for and shapely is not installed.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]])
+        >>> normals, labels = torch.eye(3)[[2] * 4], torch.zeros(4, dtype=torch.int64)
+        >>> planes = summarize_planes(points, normals, labels)
+        >>> planes.normal.tolist(), planes.offset.tolist(), planes.count.tolist()
+        ([[0.0, 0.0, 1.0]], [2.0], [4])
+    """
+    points = as_tensor("summarize_planes", "points", points).detach()
+    normals = as_tensor("summarize_planes", "normals", normals).detach()
+    labels = as_tensor("summarize_planes", "labels", labels)
+    check_shapes(
+        "summarize_planes", points=(points, "N 3"), normals=(normals, "N 3"), labels=(labels, "N")
+    )
+    check_floating("summarize_planes", points=points, normals=normals)
+    segments = Segments(labels)
+    fit = fit_planes(segments, points, normals)
+    first, second = _plane_axes(fit)
+    places, centers = segments.take_columns(points), segments.spread_columns(fit.center)
+    centered = [place - center for place, center in zip(places, centers, strict=True)]
+    u, v = (sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
+    boxes = fit_rectangles(segments, u, v)
+    area, width = covered_areas(segments, u, v, boxes)
+    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
+    axes = boxes.directions @ torch.stack([first, second], dim=1)
+
+    def own(values: Tensor) -> Tensor:
+        return values.to(points.dtype)
+
+    planes = Planes(
+        normal=own(fit.normal),
+        offset=own((fit.center * fit.normal).sum(dim=1)),
+        centroid=own(fit.center + mean),
+        area=own(area),
+        count=fit.num_points,
+        rms=own(segments.mean(fit.residuals * fit.residuals).sqrt()),
+        extent=own(boxes.sides),
+        axes=own(axes),
+        center=own(fit.center + (boxes.center[:, None] @ axes).squeeze(1)),
+        curved=fit.curved,
+    )
+    if up is not None:
+        planes = planes._replace(kind=_classify(planes, _direction(up, points)))
+    if outline:
+        frame = (fit.center, first, second)
+        planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
+    if neighbors is not None:
+        found = find_adjacency(
+            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
+        )
+        lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
+        planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
+    return planes
+
+
+def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
+    """Return two unit directions that span each plane, the first along the region."""
+    first = _without(fit.along, fit.normal)
+    # The points of one place have no direction of their own: any in the plane will do.
+    least = fit.normal.abs().argmin(dim=1)
+    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
+    first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
+    first = first / first.norm(dim=1, keepdim=True)
+    return first, torch.linalg.cross(fit.normal, first)
+
+
+def _without(vectors: Tensor, normals: Tensor) -> Tensor:
+    """Return vectors less their component along the normals."""
+    return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
+
+
+def _direction(up: Sequence[float], points: Tensor) -> Tensor:
+    """Return a direction beside the points, or say what is wrong with it."""
+    direction = torch.tensor(list(up), dtype=points.dtype, device=points.device)
+    if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
+        raise ConfigError(
+            f"summarize_planes: expected up to be three numbers, not all zero, got {up!r}."
+        )
+    return direction
 
 
 def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPlanes:
@@ -77,13 +205,14 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         >>> fit_planes(segments, points, torch.eye(3)[[2] * 5]).normal.tolist()
         [[0.0, 0.0, 1.0]]
     """
-    usual = shared_moments(segments, normals)[1][:, :, 2]
+    shares, directions = shared_moments(segments, normals)
+    usual, curved = directions[:, :, 2], _spread_deg(shares[:, 2]) > _CURVED_SPREAD_DEG
     origin = segments.first(points).double()
     starts = segments.spread_columns(origin)
     local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
     resolution = origin.abs().amax(dim=1) * (4 * torch.finfo(points.dtype).eps)
     weights = torch.ones_like(local[0])
-    for last in range(_NUM_ROUNDS):
+    for last in range(_NUM_FITS):
         mean = _means(segments, local, weights)
         middle = segments.spread_columns(mean)
         centered = [x - m for x, m in zip(local, middle, strict=True)]
@@ -92,14 +221,24 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         normal = _with_sign(_plane_normals(variances, axes, usual))
         residuals = sum_of_products(centered, segments.spread_columns(normal))
         thickness = MAD_FACTOR * segments.median(residuals.abs())
-        if last == _NUM_ROUNDS - 1:
+        if last == _NUM_FITS - 1:
             break
         cut = _BISQUARE_CUT * torch.maximum(thickness, resolution)
         # A region of one place at the origin has cut 0: its residuals are 0 too.
         ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
     along = axes[:, :, 2]
-    return FittedPlanes(normal, origin + mean, along, covariance, thickness, residuals)
+    center, sizes = origin + mean, segments.counts
+    return FittedPlanes(normal, center, along, covariance, thickness, residuals, sizes, curved)
+
+
+def _spread_deg(share: Tensor) -> Tensor:
+    """Return the root mean square angle of normals to the direction they share, signs aside.
+
+    From the largest eigenvalue of their second moments, shape ``(M,)``: of an arc of 30 degrees
+    8.7, of a full column 45.
+    """
+    return (1 - share).clamp(min=0, max=1).sqrt().asin().rad2deg()
 
 
 def sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
@@ -157,40 +296,13 @@ def _with_sign(normals: Tensor) -> Tensor:
     return torch.where(normals.gather(1, last) < 0, -normals, normals)
 
 
-_MAX_TILT_DEG = 15.0
-_END_SHARE = 0.15
-"""A floor lies in this lowest share of the cloud's height, a ceiling in the highest."""
-
-_LEAST_AREA_SHARE = 0.1
-"""A floor or ceiling has at least this share of the largest horizontal plane's area."""
-
-_LEAST_WALL_SHARE = 0.5
-"""A wall reaches over at least this share of the cloud's height."""
-
-
-def classify_planes(planes: Planes, up: Tensor) -> Tensor:
-    """Return a simple class for each plane.
+def _classify(planes: Planes, up: Tensor) -> Tensor:
+    """Return a simple class for each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
 
     A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
     planes take up, a ceiling in the highest, if it is not small beside the largest horizontal one.
     A plane within 15 degrees of vertical is a wall if it takes up half of that height. What is
     left, and what is curved, is "other". A single horizontal plane is a floor.
-
-    Args:
-        planes: The plane table.
-        up: The upward direction, shape ``(3,)``.
-
-    Returns:
-        Places in :data:`torchrg.structures.PLANE_KINDS`, shape ``(M,)``, int64.
-
-    Example:
-        >>> from torchrg.regions.planes import summarize_planes
-        >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
-        >>> cloud = torch.cat([grid, grid[:, [2, 1, 0]], grid + torch.tensor([0.0, 0, 19])])
-        >>> normals = torch.eye(3)[[2, 0, 2]].repeat_interleave(400, dim=0)
-        >>> planes = summarize_planes(cloud, normals, torch.arange(3).repeat_interleave(400))
-        >>> [PLANE_KINDS[kind] for kind in classify_planes(planes, torch.tensor([0.0, 0, 1]))]
-        ['floor', 'wall', 'ceiling']
     """
     other, floor, ceiling, wall = (
         PLANE_KINDS.index(name) for name in ("other", "floor", "ceiling", "wall")
@@ -213,138 +325,6 @@ def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     return kind
 
 
-_CURVED_SPREAD_DEG = 8.0
-"""A smooth bend by three to four times this angle has this spread."""
-
-
-def summarize_planes(
-    points: Tensor | NDArray[np.floating],
-    normals: Tensor | NDArray[np.floating],
-    labels: Tensor | NDArray[np.integer],
-    *,
-    neighbors: Neighbors | None = None,
-    up: Sequence[float] | None = None,
-    outline: bool = False,
-) -> Planes:
-    """Fit a plane to each region and measure it.
-
-    Args:
-        points: Points, shape ``(N, 3)``; those without a label may hold anything.
-        normals: Unit normals of any sign, shape ``(N, 3)``. They tell curved regions from flat
-            ones, and decide where points do not: in regions of one or two points, or along a line.
-        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
-        neighbors: Neighbours of each point, to tell which planes meet.
-        up: The upward direction, to tell floors, ceilings and walls.
-        outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
-
-    Returns:
-        The table, M rows.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If ``up`` is not a direction.
-        MissingDependencyError: If outlines are asked for and shapely is not installed.
-
-    Example:
-        >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]])
-        >>> normals, labels = torch.eye(3)[[2] * 4], torch.zeros(4, dtype=torch.int64)
-        >>> planes = summarize_planes(points, normals, labels)
-        >>> planes.normal.tolist(), planes.offset.tolist(), planes.count.tolist()
-        ([[0.0, 0.0, 1.0]], [2.0], [4])
-    """
-    points = as_tensor("summarize_planes", "points", points).detach()
-    normals = as_tensor("summarize_planes", "normals", normals).detach()
-    labels = as_tensor("summarize_planes", "labels", labels)
-    check_shapes(
-        "summarize_planes", points=(points, "N 3"), normals=(normals, "N 3"), labels=(labels, "N")
-    )
-    check_floating("summarize_planes", points=points, normals=normals)
-    segments = Segments(labels)
-    fit = fit_planes(segments, points, normals)
-    first, second = _plane_axes(fit)
-    places, centers = segments.take_columns(points), segments.spread_columns(fit.center)
-    centered = [place - center for place, center in zip(places, centers, strict=True)]
-    u, v = (sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
-    boxes = fit_rectangles(segments, u, v)
-    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
-    axes = boxes.directions @ torch.stack([first, second], dim=1)
-
-    area, width = covered_areas(segments, u, v, boxes)
-
-    def own(values: Tensor) -> Tensor:
-        return values.to(points.dtype)
-
-    planes = Planes(
-        normal=own(fit.normal),
-        offset=own((fit.center * fit.normal).sum(dim=1)),
-        centroid=own(fit.center + mean),
-        area=own(area),
-        count=segments.counts,
-        rms=own(segments.mean(fit.residuals * fit.residuals).sqrt()),
-        extent=own(boxes.sides),
-        axes=own(axes),
-        center=own(fit.center + (boxes.center[:, None] @ axes).squeeze(1)),
-        curved=are_curved(segments, normals),
-    )
-    if up is not None:
-        planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
-    if outline:
-        frame = (fit.center, first, second)
-        planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
-    if neighbors is not None:
-        found = find_adjacency(
-            points, labels, neighbors, fit.normal, fit.thickness, curved=planes.curved
-        )
-        lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
-        planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
-    return planes
-
-
-def are_curved(segments: Segments, normals: Tensor) -> Tensor:
-    """Tell regions whose normals turn from flat ones.
-
-    Args:
-        segments: The regions.
-        normals: Unit normals, shape ``(N, 3)``.
-
-    Returns:
-        Shape ``(M,)``, bool.
-
-    Example:
-        >>> are_curved(Segments(torch.tensor([0, 0, 1])), torch.eye(3))
-        tensor([ True, False])
-    """
-    return normal_spread_deg(segments, normals) > _CURVED_SPREAD_DEG
-
-
-def normal_spread_deg(segments: Segments, normals: Tensor) -> Tensor:
-    """Return the root mean square angle of normals to the direction they share, signs aside.
-
-    Args:
-        segments: The regions.
-        normals: Unit normals, shape ``(N, 3)``.
-
-    Returns:
-        Degrees, shape ``(M,)``: of an arc of 30 degrees 8.7, of a full column 45.
-
-    Example:
-        >>> normal_spread_deg(Segments(torch.zeros(2, dtype=torch.int64)), torch.eye(3)[:2])
-        tensor([45.0000], dtype=torch.float64)
-    """
-    shared = shared_moments(segments, normals)[0][:, 2]
-    return (1 - shared).clamp(min=0, max=1).sqrt().asin().rad2deg()
-
-
-def _direction(up: Sequence[float], points: Tensor) -> Tensor:
-    """Return a direction beside the points, or say what is wrong with it."""
-    direction = torch.tensor(list(up), dtype=points.dtype, device=points.device)
-    if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
-        raise ConfigError(
-            f"summarize_planes: expected up to be three numbers, not all zero, got {up!r}."
-        )
-    return direction
-
-
 def _outlines(
     segments: Segments,
     u: Tensor,
@@ -364,22 +344,6 @@ def _outlines(
         lifted = (center + ring[:, :1] * first + ring[:, 1:] * second for ring in rings)
         outlines.append(tuple(ring.to(dtype) for ring in lifted))
     return tuple(outlines)
-
-
-def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
-    """Return two unit directions that span each plane, the first along the region."""
-    first = _without(fit.along, fit.normal)
-    # The points of one place have no direction of their own: any in the plane will do.
-    least = fit.normal.abs().argmin(dim=1)
-    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
-    first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
-    first = first / first.norm(dim=1, keepdim=True)
-    return first, torch.linalg.cross(fit.normal, first)
-
-
-def _without(vectors: Tensor, normals: Tensor) -> Tensor:
-    """Return vectors less their component along the normals."""
-    return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
 
 
 _COLUMNS = (
