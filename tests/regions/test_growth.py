@@ -76,7 +76,7 @@ def test_regions_smaller_than_min_size_are_not_labelled():
 
 
 def test_labels_descend_by_size_then_by_first_point():
-    labels = number_by_size(np.array([7, 7, 2, 2, 5, 5, 5, -1]), 2, torch.device("cpu"))
+    labels = number_by_size(torch.tensor([7, 7, 2, 2, 5, 5, 5, -1]), 2)
     assert labels.tolist() == [1, 1, 2, 2, 0, 0, 0, -1]
 
 

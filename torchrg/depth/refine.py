@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchrg.depth.config import DepthConfig
 from torchrg.linalg.moments import Segments
+from torchrg.regions.adjacency import contact_neighbors
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.planes import FittedPlanes, fit_planes
 from torchrg.regions.refine import absorb_points, merge_coplanar, reach_of_planes
@@ -75,17 +76,13 @@ def refine_pixels(
             max_angle_deg=90.0,
         )
         fit, noise = _fit(cloud, labels)
-        labels = merge_coplanar(labels, touching, fit, noise, tolerance=config.merge_tolerance)
-        labels = _numbered(labels, config)
+        merged = merge_coplanar(labels, touching, fit, noise, tolerance=config.merge_tolerance)
+        labels = number_by_size(merged, config.min_size)
     fit, noise = _fit(cloud, labels)
     reach = reach_of_planes(fit, noise, config.absorb_reach)
-    labels = _numbered(move_to_creases(cloud.points, labels, touching, fit, reach), config)
+    moved = move_to_creases(cloud.points, labels, touching, fit, reach)
+    labels = number_by_size(moved, config.min_size)
     return labels, _fit(cloud, labels)[0]
-
-
-def _numbered(labels: Tensor, config: DepthConfig) -> Tensor:
-    """Return labels numbered by size; regions that are too small have none."""
-    return number_by_size(labels.cpu().numpy(), config.min_size, labels.device)
 
 
 def _fit(cloud: InverseCloud, labels: Tensor) -> tuple[FittedPlanes, Tensor]:
@@ -109,32 +106,17 @@ def move_to_creases(
 
     ``points`` are an image as a cloud, ``touching`` the pixels around each pixel, itself first, and
     ``reach`` the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
-
-    Example:
-        >>> x = torch.arange(-4.0, 5).double()
-        >>> points = torch.stack([x, torch.zeros(9).double(), x.abs()], dim=1)
-        >>> rows = torch.arange(9)[:, None]
-        >>> touching = Neighbors(torch.cat([rows, rows - 1, rows + 1], dim=1).clamp(0, 8))
-        >>> normal = torch.tensor([[1.0, 0, 1], [-1, 0, 1]]).double()
-        >>> center = torch.tensor([[-2.0, 0, 2], [2, 0, 2]]).double()
-        >>> fit = FittedPlanes(normal, center, *[normal] * 6)
-        >>> labels = torch.tensor([0, 0, 0, 0, 0, 0, 0, 1, 1])
-        >>> move_to_creases(points, labels, touching, fit, torch.ones(2)).tolist()
-        [0, 0, 0, 0, 0, 1, 1, 1, 1]
     """
     offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
     planes = torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
     middles = torch.cat([fit.center[:, :2], torch.ones_like(offset)], dim=1)
-    around = touching.indices[:, 1:].long()
-    counted = None if touching.valid is None else touching.valid[:, 1:]
+    around, counted = contact_neighbors(touching)
     rays = torch.cat([points[:, :2], torch.ones_like(points[:, :1])], dim=1)
     labels = labels.clone()
     rows = (labels >= 0).nonzero().squeeze(1)
     for _ in range(_MOST_MOVES):
         near = labels[around[rows]]
-        other = (near >= 0) & (near != labels[rows][:, None])
-        if counted is not None:
-            other &= counted[rows]
+        other = counted[rows] & (near >= 0) & (near != labels[rows][:, None])
         at_border = other.any(dim=1)
         rows, near, other = rows[at_border], near[at_border].clamp(min=0), other[at_border]
         own = labels[rows][:, None]

@@ -1,12 +1,13 @@
 """Which neighbours may join a region: one criterion a function.
 
-Each tests the edges from a block of points, ``rows``, to their neighbours, ``indices`` of shape
-``(n, K)``, and returns which of them pass, shape ``(n, K)``, bool. A new criterion is a setting, a
-function here, and the line of :func:`torchrg.regions.edges.accept_edges` that calls it.
+Each tests the edges from a block of points, ``rows``, to their K neighbours, and returns which of
+them pass, shape ``(n, K)``, bool. A new criterion is a setting, a function here, and the line of
+:func:`torchrg.regions.edges.accept_edges` that calls it.
 """
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +16,31 @@ from torchrg.linalg import signs
 from torchrg.neighbors import gather_patches
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors
+
+
+class GrowingCloud(NamedTuple):
+    """What growth reads: a cloud in canonical order with everything known about its points.
+
+    Coordinates and normals are fast to gather when each column is contiguous.
+
+    Attributes:
+        points: Shape ``(N, 3)``.
+        normals: Unit normals, shape ``(N, 3)``.
+        curvature: Shape ``(N,)``.
+        neighbors: Neighbours of each point.
+        valid: Points that may belong to a region, shape ``(N,)``, bool.
+        colors: Shape ``(N, C)``, floating point, or None.
+        reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
+            where that is not known, or None.
+    """
+
+    points: Tensor
+    normals: Tensor
+    curvature: Tensor
+    neighbors: Neighbors
+    valid: Tensor
+    colors: Tensor | None = None
+    reach: Tensor | None = None
 
 
 def sq_chord_limit(max_angle_deg: float) -> float:
@@ -68,53 +94,49 @@ def sq_chords(
     return result
 
 
-def are_valid(valid: Tensor, rows: slice, indices: Tensor) -> Tensor:
-    """Tell which edges lead from one valid point to another one."""
-    own = torch.arange(len(valid), device=indices.device)[rows, None]
-    return _of_neighbors(valid, indices) & valid[rows, None] & (indices != own)
+def are_valid(cloud: GrowingCloud, rows: slice) -> Tensor:
+    """Tell which edges lead from one valid point to another one that is its neighbour."""
+    indices, counted = cloud.neighbors
+    own = torch.arange(len(cloud.valid), device=indices.device)[rows, None]
+    passed = _of_neighbors(cloud, rows, cloud.valid) & cloud.valid[rows, None]
+    passed &= indices[rows] != own
+    return passed if counted is None else passed & counted[rows]
 
 
-def within_angle(
-    normals: Tensor, rows: slice, indices: Tensor, *, max_angle_deg: float, signed: bool
-) -> Tensor:
+def within_angle(cloud: GrowingCloud, rows: slice, max_angle_deg: float, *, signed: bool) -> Tensor:
     """Tell which neighbours' normals are within an angle of the point's, eq. (8)."""
     if max_angle_deg >= 90 and not signed:
-        return torch.ones_like(indices, dtype=torch.bool)
-    columns = normals.unbind(dim=1)
+        return torch.ones_like(cloud.neighbors.indices[rows], dtype=torch.bool)
+    columns = cloud.normals.unbind(dim=1)
     own = [column[rows, None] for column in columns]
-    theirs = [_of_neighbors(column, indices) for column in columns]
+    theirs = [_of_neighbors(cloud, rows, column) for column in columns]
     return sq_chords(own, theirs, signed=signed) <= sq_chord_limit(max_angle_deg)
 
 
-def within_distance(values: Tensor, rows: slice, indices: Tensor, limit: float) -> Tensor:
-    """Tell which neighbours' values, places or colours ``(N, C)``, are within a distance."""
-    total = torch.zeros(indices.shape, dtype=values.dtype, device=values.device)
+def within_distance(cloud: GrowingCloud, rows: slice, values: Tensor, limit: float) -> Tensor:
+    """Tell which neighbours' values ``(N, C)``, places or colours, are within a distance."""
+    total = values.new_zeros(())
     for column in values.unbind(dim=1):
-        difference = _of_neighbors(column, indices) - column[rows, None]
-        total += difference.mul_(difference)
+        difference = _of_neighbors(cloud, rows, column) - column[rows, None]
+        total = difference.mul_(difference).add_(total)
     return total <= limit**2
 
 
-def on_planes(
-    points: Tensor, normals: Tensor, reach: Tensor, rows: slice, indices: Tensor
-) -> Tensor:
-    """Tell which neighbours are within reach of the point's plane, and it of theirs."""
-    own = torch.zeros(indices.shape, dtype=points.dtype, device=indices.device)
-    theirs = torch.zeros_like(own)
-    for place, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
-        away = _of_neighbors(place, indices) - place[rows, None]
-        own += away * normal[rows, None]
-        theirs += away.mul_(_of_neighbors(normal, indices))
+def on_planes(cloud: GrowingCloud, rows: slice, reach: Tensor) -> Tensor:
+    """Tell which neighbours are within reach ``(N,)`` of the point's plane, and it of theirs."""
+    own = theirs = cloud.points.new_zeros(())
+    columns = zip(cloud.points.unbind(dim=1), cloud.normals.unbind(dim=1), strict=True)
+    for place, normal in columns:
+        away = _of_neighbors(cloud, rows, place) - place[rows, None]
+        own = (away * normal[rows, None]).add_(own)
+        theirs = away.mul_(_of_neighbors(cloud, rows, normal)).add_(theirs)
     on_own = own.abs_() <= reach[rows, None]
-    return on_own & (theirs.abs_() <= _of_neighbors(reach, indices))
+    return on_own & (theirs.abs_() <= _of_neighbors(cloud, rows, reach))
 
 
 def are_coplanar(
-    points: Tensor,
-    normals: Tensor,
-    neighbors: Neighbors,
+    cloud: GrowingCloud,
     rows: slice,
-    *,
     asked: Tensor,
     compared: Tensor | None,
     floor_fraction: float,
@@ -125,9 +147,10 @@ def are_coplanar(
     a fraction of the distance to the farthest neighbour.
     """
     needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
-    patches = gather_patches(points, neighbors.indices[rows][needed])
-    counted = None if neighbors.valid is None else neighbors.valid[rows][needed]
-    residuals = plane_residuals(patches, normals[rows][needed])
+    indices, mask = cloud.neighbors
+    patches = gather_patches(cloud.points, indices[rows][needed])
+    counted = None if mask is None else mask[rows][needed]
+    residuals = plane_residuals(patches, cloud.normals[rows][needed])
     floor = floor_fraction * patch_radii(patches, counted)
     limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[needed])
     result = torch.zeros_like(asked)
@@ -135,8 +158,9 @@ def are_coplanar(
     return result
 
 
-def _of_neighbors(values: Tensor, indices: Tensor) -> Tensor:
-    """Return the values ``(N,)`` of neighbours, shape ``(n, K)``."""
+def _of_neighbors(cloud: GrowingCloud, rows: slice, values: Tensor) -> Tensor:
+    """Return the values ``(N,)`` of the points' neighbours, shape ``(n, K)``."""
+    indices = cloud.neighbors.indices[rows]
     return values.index_select(0, indices.reshape(-1)).view(indices.shape)
 
 

@@ -13,6 +13,7 @@ from torchrg._parallel import chunks_of, map_chunks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.regions.criteria import (
+    GrowingCloud,
     are_coplanar,
     are_valid,
     neighborhood_radii,
@@ -25,31 +26,6 @@ from torchrg.structures import Neighbors
 
 _CHUNKS_A_THREAD = 4
 """Chunks tested before any is stored: threads wait for each other only so often."""
-
-
-class GrowingCloud(NamedTuple):
-    """What growth reads: a cloud in canonical order with everything known about its points.
-
-    Coordinates and normals are fast to gather when each column is contiguous.
-
-    Attributes:
-        points: Shape ``(N, 3)``.
-        normals: Unit normals, shape ``(N, 3)``.
-        curvature: Shape ``(N,)``.
-        neighbors: Neighbours of each point.
-        valid: Points that may belong to a region, shape ``(N,)``, bool.
-        colors: Shape ``(N, C)``, floating point, or None.
-        reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
-            where that is not known, or None.
-    """
-
-    points: Tensor
-    normals: Tensor
-    curvature: Tensor
-    neighbors: Neighbors
-    valid: Tensor
-    colors: Tensor | None = None
-    reach: Tensor | None = None
 
 
 class EdgeLists(NamedTuple):
@@ -80,39 +56,22 @@ def accept_edges(
         Whether the neighbour joins the region of the point, shape ``(n, K)``, bool; and whether the
         two are connected, None where connectivity is off: only settled where it joins.
     """
-    indices = cloud.neighbors.indices[rows]
-    counted = None if cloud.neighbors.valid is None else cloud.neighbors.valid[rows]
-    joins = are_valid(cloud.valid, rows, indices)
-    if counted is not None:
-        joins &= counted
-    joins &= within_angle(
-        cloud.normals,
-        rows,
-        indices,
-        max_angle_deg=config.max_angle_deg,
-        signed=config.signed_normals,
-    )
+    joins = are_valid(cloud, rows)
+    joins &= within_angle(cloud, rows, config.max_angle_deg, signed=config.signed_normals)
     if config.max_distance is not None:
-        joins &= within_distance(cloud.points, rows, indices, config.max_distance)
+        joins &= within_distance(cloud, rows, cloud.points, config.max_distance)
     if config.max_color_distance is not None and cloud.colors is not None:
-        joins &= within_distance(cloud.colors, rows, indices, config.max_color_distance)
+        joins &= within_distance(cloud, rows, cloud.colors, config.max_color_distance)
     if cloud.reach is not None:
-        joins &= on_planes(cloud.points, cloud.normals, cloud.reach, rows, indices)
+        joins &= on_planes(cloud, rows, cloud.reach)
     connected: Tensor | None = None
     if config.coplanarity:
         if shared is not None and config.coplanarity_scope == "connected":
-            everyone = torch.ones_like(joins) if counted is None else counted
+            counted = cloud.neighbors.valid
+            everyone = torch.ones_like(joins) if counted is None else counted[rows]
             connected = shared.connected(rows, everyone)
         asked = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
-        joins &= ~asked | are_coplanar(
-            cloud.points,
-            cloud.normals,
-            cloud.neighbors,
-            rows,
-            asked=asked,
-            compared=connected,
-            floor_fraction=config.coplanarity_floor,
-        )
+        joins &= ~asked | are_coplanar(cloud, rows, asked, connected, config.coplanarity_floor)
     if shared is not None:
         if connected is None:
             connected = shared.connected(rows, joins)
@@ -152,7 +111,7 @@ def find_coded_edges(
 
 def find_edges(
     cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, spare: int, chunk_size: int
-) -> tuple[EdgeLists, NDArray[np.int32], NDArray[np.int32]]:
+) -> tuple[EdgeLists, EdgeLists]:
     """Return the edges from points of at most the curvature limit, which spread, and the others'.
 
     Args:
@@ -163,23 +122,22 @@ def find_edges(
         chunk_size: Points tested at a time; the result is the same for all.
 
     Returns:
-        The edges of points that spread; sources and targets of the others' edges, in order.
+        Edges between points that spread, and edges of those that do not, coded as above.
     """
     shared = _shared_neighbors(cloud, config)
     spreads = cloud.curvature <= limit
-    others: dict[int, tuple[NDArray[np.int32], NDArray[np.int32]]] = {}
+    others: dict[int, _Edges] = {}
 
     def find(rows: slice) -> _Edges:
         joins, _ = accept_edges(cloud, config, rows, shared)
         targets = cloud.neighbors.indices[rows]
-        other = _pick(targets, joins & ~spreads[rows, None])
-        sources = np.arange(rows.start, rows.stop, dtype=np.int32)
-        others[rows.start] = np.repeat(sources, other.counts), other.targets
+        others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
         return _pick(targets, joins & spreads[rows, None])
 
     edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
-    sources, targets = zip(*(others[start] for start in sorted(others)), strict=True)
-    return edges, np.concatenate(sources), np.concatenate(targets)
+    targets, counts = zip(*(others[start] for start in sorted(others)), strict=True)
+    starts = np.concatenate([[0], *counts]).cumsum()
+    return edges, EdgeLists(starts, np.concatenate(targets))
 
 
 def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeighbors | None:
@@ -230,7 +188,6 @@ def checked_cloud(
     normals: Tensor | NDArray[np.floating],
     curvature: Tensor | NDArray[np.floating],
     neighbors: Neighbors,
-    *,
     valid: Tensor | None,
     colors: Tensor | NDArray[np.generic] | None,
     residual_rms: Tensor | NDArray[np.floating] | None,
@@ -273,39 +230,25 @@ def checked_cloud(
             f"{caller}: expected colors, which max_color_distance needs, got None; pass them or "
             "set max_color_distance to None."
         )
+    reach = None
+    if config.plane_reach is not None:
+        if residual_rms is None:
+            raise ConfigError(
+                f"{caller}: expected residual_rms, which plane_reach needs, got None; pass that of "
+                "the normals or set plane_reach to None."
+            )
+        residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
+        check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
+        check_floating(caller, points=points, residual_rms=residual_rms)
+        # Where the fit is exact nothing is known of the noise.
+        floor = config.coplanarity_floor * neighborhood_radii(points, neighbors)
+        reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
     colors = None if colors is None else _by_column(colors.to(points.dtype))
-    reach = None
-    if config.plane_reach is not None:
-        reach = _plane_reach(config, config.plane_reach, points, neighbors, residual_rms)
     return GrowingCloud(
         _by_column(points), _by_column(normals), curvature, neighbors, valid, colors, reach
     )
-
-
-def _plane_reach(
-    config: GrowingConfig,
-    factor: float,
-    points: Tensor,
-    neighbors: Neighbors,
-    residual_rms: Tensor | NDArray[np.floating] | None,
-) -> Tensor:
-    """Return how far from each point's plane a neighbour may be.
-
-    Infinite where the fit is exact, which is to say that nothing is known of the noise.
-    """
-    caller = "grow_regions"
-    if residual_rms is None:
-        raise ConfigError(
-            f"{caller}: expected residual_rms, which plane_reach needs, got None; pass that of "
-            "the normals or set plane_reach to None."
-        )
-    residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
-    check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
-    check_floating(caller, points=points, residual_rms=residual_rms)
-    floor = config.coplanarity_floor * neighborhood_radii(points, neighbors)
-    return torch.where(residual_rms > floor, factor * residual_rms, torch.inf)
 
 
 def reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import canonical_order
+from torchrg.regions.criteria import GrowingCloud
 from torchrg.regions.edges import (
     EdgeLists,
-    GrowingCloud,
     checked_cloud,
     find_coded_edges,
     find_edges,
@@ -86,43 +86,36 @@ def grow_regions(
     """
     config = GrowingConfig() if config is None else config
     cloud = checked_cloud(
-        config,
-        points,
-        normals,
-        curvature,
-        neighbors,
-        valid=valid,
-        colors=colors,
-        residual_rms=residual_rms,
+        config, points, normals, curvature, neighbors, valid, colors, residual_rms
     )
-    device = cloud.points.device
     if len(cloud.points) == 0:
-        return torch.empty(0, dtype=torch.int64, device=device)
+        return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = reordered(cloud, order)
-    labels = number_by_size(_grow(cloud, config, chunk_size), config.min_size, device)
+    heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
+    labels = number_by_size(heads, config.min_size)
     if config.is_refined:
-        refined = refine_regions(cloud, labels, config)
-        labels = number_by_size(refined.cpu().numpy(), config.min_size, device)
+        labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 
-def number_by_size(heads: NDArray[np.integer], min_size: int, device: torch.device) -> Tensor:
+def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, those of equal size by their first point.
 
     Args:
-        heads: Any number that is the same in a region and another elsewhere, below N; -1 for none.
+        regions: Any number below N that is the same in a region and another elsewhere, -1 for
+            none, shape ``(N,)``.
         min_size: Smaller regions get :data:`torchrg.UNLABELED`.
-        device: Where the labels shall be.
 
     Returns:
         Labels, shape ``(N,)``, int64.
 
     Example:
-        >>> number_by_size(np.array([3, 1, 1, 3, -1, 2, 1]), 2, torch.device("cpu"))
+        >>> number_by_size(torch.tensor([3, 1, 1, 3, -1, 2, 1]), 2)
         tensor([ 1,  0,  0,  1, -1, -1,  0])
     """
+    heads = regions.cpu().numpy()
     placed = np.flatnonzero(heads >= 0)
     sizes = np.bincount(heads[placed], minlength=len(heads))
     firsts = np.full(len(heads), len(heads))
@@ -132,7 +125,7 @@ def number_by_size(heads: NDArray[np.integer], min_size: int, device: torch.devi
     # The last entry is what a head of -1 finds.
     numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int64)
     numbers[kept] = np.arange(len(kept))
-    return torch.from_numpy(numbers[heads]).to(device)
+    return torch.from_numpy(numbers[heads]).to(regions.device)
 
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
@@ -145,13 +138,13 @@ def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArra
         edges = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
         return _grow_first_in_first_out(edges, order, valid)
     seeds = order[curvature[order] <= limit.cpu().numpy()]
-    edges, sources, targets = find_edges(
-        cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size
-    )
+    edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
     heads = _first_to_reach(edges, seeds, len(valid))
-    # A point that does not spread claims at most its k - 1 neighbours.
+    # What no seed reaches are points that claim at most their k - 1 neighbours.
     if config.min_size <= cloud.neighbors.indices.shape[1]:
-        _claim_leftovers(sources, targets, heads, order)
+        free = heads < 0
+        left = _grow_first_in_first_out(others, order[free[order]], free)
+        heads = np.where(free, left, heads)
     return heads
 
 
@@ -196,33 +189,6 @@ def _first_to_reach(
     is_head = parents[visited] >= num_points
     heads[visited] = visited[is_head][np.cumsum(is_head) - 1]
     return heads
-
-
-def _claim_leftovers(
-    sources: NDArray[np.int32],
-    targets: NDArray[np.int32],
-    heads: NDArray[np.int32],
-    order: NDArray[np.int32],
-) -> None:
-    """Let the points that no seed reaches claim their free neighbours, one hop, in order.
-
-    The edges, ascending by source, are those of points that do not spread; ``heads`` is written.
-    """
-    free = heads < 0
-    rank = np.empty(len(heads), dtype=np.int32)
-    rank[order] = np.arange(len(order), dtype=np.int32)
-    # A free point that came before has started a region of its own.
-    open_edges = free[sources] & free[targets] & (rank[sources] < rank[targets])
-    sources, targets = sources[open_edges], targets[open_edges]
-    starts = np.searchsorted(sources, np.arange(len(heads) + 1))
-    claiming = order[free[order] & (np.diff(starts)[order] > 0)]
-    for point in claiming.tolist():
-        if heads[point] < 0:
-            reached = targets[starts[point] : starts[point + 1]]
-            heads[reached[heads[reached] < 0]] = point
-            heads[point] = point
-    alone = order[heads[order] < 0]
-    heads[alone] = alone
 
 
 def _grow_first_in_first_out(

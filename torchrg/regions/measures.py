@@ -256,6 +256,7 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
         >>> float(hole.min()), float(hole.max())
         (9.0, 20.0)
     """
+    from scipy.ndimage import binary_erosion
     from scipy.spatial import Delaunay, QhullError
 
     shapely = require("shapely", extra="outline", purpose="trace outlines")
@@ -264,7 +265,8 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
     occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
     occupied[tuple(cells.T)] = True
-    corners = places[~_is_inside(occupied)[tuple(cells.T)]]
+    inside = binary_erosion(occupied, np.ones((3, 3), dtype=bool))
+    corners = places[~inside[tuple(cells.T)]]
     try:
         triangles = corners[Delaunay(corners).simplices]
     except (QhullError, ValueError):
@@ -275,18 +277,6 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
     shape = shapely.union_all(shapely.polygons(triangles[covered]))
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
-
-
-def _is_inside(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which cells have eight occupied neighbours; the border has none."""
-    inside = np.zeros_like(occupied)
-    inner = np.ones_like(occupied[1:-1, 1:-1])
-    height, length = occupied.shape
-    for i in range(3):
-        for j in range(3):
-            inner &= occupied[i : height - 2 + i, j : length - 2 + j]
-    inside[1:-1, 1:-1] = inner
-    return inside
 
 
 def _rings(shapely: Any, shape: Any, min_area: float) -> list[Ring]:  # noqa: ANN401

@@ -346,20 +346,6 @@ def _outlines(
     return tuple(outlines)
 
 
-_COLUMNS = (
-    "normal",
-    "offset",
-    "centroid",
-    "area",
-    "count",
-    "rms",
-    "extent",
-    "axes",
-    "center",
-    "curved",
-)
-
-
 def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
     """Return the plane table as one mapping for each plane, for ``pandas.DataFrame(rows)``.
 
@@ -380,8 +366,9 @@ def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
         >>> rows[0]["label"], rows[0]["count"], rows[0]["curved"]
         (0, 3, True)
     """
-    columns = {name: getattr(planes, name).tolist() for name in _COLUMNS}
-    rows = [
+    names = [name for name in planes._fields if name not in planes._field_defaults]
+    columns = {name: getattr(planes, name).tolist() for name in names}
+    rows: list[dict[str, Any]] = [
         {"label": label, **{name: values[label] for name, values in columns.items()}}
         for label in range(len(planes.offset))
     ]
@@ -393,7 +380,7 @@ def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
         if planes.adjacency is not None:
             row["neighbors"] = []
     if planes.adjacency is not None:
-        for (a, b), *values in zip(*(_as_list(part) for part in planes.adjacency), strict=True):
+        for (a, b), *values in zip(*(part.tolist() for part in planes.adjacency), strict=True):
             found = dict(zip(("boundary_length", "dihedral_deg"), values, strict=True))
             rows[a]["neighbors"].append({"plane": b, **found})
             rows[b]["neighbors"].append({"plane": a, **found})
@@ -417,8 +404,3 @@ def planes_to_json(planes: Planes) -> str:
         3
     """
     return json.dumps({"planes": planes_to_rows(planes)})
-
-
-def _as_list(values: Tensor) -> list[Any]:
-    listed: list[Any] = values.tolist()
-    return listed

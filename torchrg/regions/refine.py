@@ -10,8 +10,7 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
-from torchrg.regions.criteria import neighborhood_radii, sq_chord_limit, sq_chords
-from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.criteria import GrowingCloud, neighborhood_radii, sq_chord_limit, sq_chords
 from torchrg.regions.planes import FittedPlanes, fit_planes
 from torchrg.structures import UNLABELED, Neighbors
 
