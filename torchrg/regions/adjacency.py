@@ -59,19 +59,6 @@ def find_adjacency(
 
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
-
-    Example:
-        >>> from torchrg.neighbors import search_knn
-        >>> floor = torch.cartesian_prod(torch.arange(9.0), torch.arange(30.0), torch.zeros(1))
-        >>> cloud = torch.cat([floor, floor[:, [2, 1, 0]] + torch.tensor([0.0, 0.1, 0.5])])
-        >>> labels = torch.arange(2).repeat_interleave(270)
-        >>> normal, curved = torch.eye(3)[[2, 0]].double(), torch.zeros(2, dtype=torch.bool)
-        >>> neighbors, thickness = search_knn(cloud, 12), torch.zeros(2).double()
-        >>> found = find_adjacency(cloud, labels, neighbors, normal, thickness, curved=curved)
-        >>> found.pairs.tolist(), found.dihedral_deg.round().tolist()
-        ([[0, 1]], [90.0])
-        >>> bool((found.boundary_length - 29).abs() < 2)
-        True
     """
     pairs, contacts = _find_contacts(labels, neighbors.indices, neighbors.valid)
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]

@@ -2,7 +2,7 @@
 
 Each tests the edges from a block of points, ``rows``, to their K neighbours, and returns which of
 them pass, shape ``(n, K)``, bool. A new criterion is a setting, a function here, and the line of
-:func:`torchrg.regions.edges.accept_edges` that calls it.
+:mod:`torchrg.regions.edges` that calls it.
 """
 
 import math

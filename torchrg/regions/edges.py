@@ -41,20 +41,62 @@ class EdgeLists(NamedTuple):
     targets: NDArray[np.int32]
 
 
-def accept_edges(
+def find_coded_edges(
+    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
+) -> EdgeLists:
+    """Return all edges with targets as ``2 * row + (whether the target becomes a seed)``.
+
+    ``limit`` is that of the curvature, a scalar. Chunks of every size give the same edges.
+    """
+    shared = _shared_neighbors(cloud, config)
+
+    def find(rows: slice) -> _Edges:
+        joins, connected = _accept_edges(cloud, config, rows, shared)
+        indices = cloud.neighbors.indices[rows]
+        target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
+        if config.seed_rule == "increment":
+            becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
+        else:
+            becomes_seed = target <= limit
+        if connected is not None and config.connectivity_scope == "seed":
+            becomes_seed &= connected
+        codes = (indices.to(torch.int32) * 2).add_(becomes_seed.to(torch.int32))
+        return _pick(codes, joins)
+
+    return _pack(find, cloud, spare=0, chunk_size=chunk_size)
+
+
+def find_edges(
+    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, spare: int, chunk_size: int
+) -> tuple[EdgeLists, EdgeLists]:
+    """Return the edges between points of at most the curvature limit, which spread; all others'.
+
+    The first have room for some spare edges, the second are coded as :func:`find_coded_edges` does.
+    Chunks of every size give the same edges.
+    """
+    shared = _shared_neighbors(cloud, config)
+    spreads = cloud.curvature <= limit
+    others: dict[int, _Edges] = {}
+
+    def find(rows: slice) -> _Edges:
+        joins, _ = _accept_edges(cloud, config, rows, shared)
+        targets = cloud.neighbors.indices[rows]
+        others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
+        return _pick(targets, joins & spreads[rows, None])
+
+    edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
+    targets, counts = zip(*(others[start] for start in sorted(others)), strict=True)
+    starts = np.concatenate([[0], *counts]).cumsum()
+    return edges, EdgeLists(starts, np.concatenate(targets))
+
+
+def _accept_edges(
     cloud: GrowingCloud, config: GrowingConfig, rows: slice, shared: SharedNeighbors | None
 ) -> tuple[Tensor, Tensor | None]:
     """Tell which neighbours of a block of points pass all criteria that are on, cheap ones first.
 
-    Args:
-        cloud: The cloud, in canonical order.
-        config: Settings.
-        rows: The block.
-        shared: The test of connectivity, None where it is off.
-
-    Returns:
-        Whether the neighbour joins the region of the point, shape ``(n, K)``, bool; and whether the
-        two are connected, None where connectivity is off: only settled where it joins.
+    Returns whether the neighbour joins the region of the point, shape ``(n, K)``, bool; and whether
+    the two are connected, only settled where it joins, None where connectivity is off.
     """
     joins = are_valid(cloud, rows)
     joins &= within_angle(cloud, rows, config.max_angle_deg, signed=config.signed_normals)
@@ -78,66 +120,6 @@ def accept_edges(
         if config.connectivity_scope == "region":
             joins &= connected
     return joins, connected
-
-
-def find_coded_edges(
-    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
-) -> EdgeLists:
-    """Return all edges with targets as ``2 * row + (whether the target becomes a seed)``.
-
-    Args:
-        cloud: The cloud, in canonical order.
-        config: Settings.
-        limit: Curvature limit, a scalar.
-        chunk_size: Points tested at a time; the result is the same for all.
-    """
-    shared = _shared_neighbors(cloud, config)
-
-    def find(rows: slice) -> _Edges:
-        joins, connected = accept_edges(cloud, config, rows, shared)
-        indices = cloud.neighbors.indices[rows]
-        target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
-        if config.seed_rule == "increment":
-            becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
-        else:
-            becomes_seed = target <= limit
-        if connected is not None and config.connectivity_scope == "seed":
-            becomes_seed &= connected
-        codes = (indices.to(torch.int32) * 2).add_(becomes_seed.to(torch.int32))
-        return _pick(codes, joins)
-
-    return _pack(find, cloud, spare=0, chunk_size=chunk_size)
-
-
-def find_edges(
-    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, spare: int, chunk_size: int
-) -> tuple[EdgeLists, EdgeLists]:
-    """Return the edges from points of at most the curvature limit, which spread, and the others'.
-
-    Args:
-        cloud: The cloud, in canonical order.
-        config: Settings.
-        limit: Curvature limit, a scalar.
-        spare: Room for so many more edges.
-        chunk_size: Points tested at a time; the result is the same for all.
-
-    Returns:
-        Edges between points that spread, and edges of those that do not, coded as above.
-    """
-    shared = _shared_neighbors(cloud, config)
-    spreads = cloud.curvature <= limit
-    others: dict[int, _Edges] = {}
-
-    def find(rows: slice) -> _Edges:
-        joins, _ = accept_edges(cloud, config, rows, shared)
-        targets = cloud.neighbors.indices[rows]
-        others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
-        return _pick(targets, joins & spreads[rows, None])
-
-    edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
-    targets, counts = zip(*(others[start] for start in sorted(others)), strict=True)
-    starts = np.concatenate([[0], *counts]).cumsum()
-    return edges, EdgeLists(starts, np.concatenate(targets))
 
 
 def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeighbors | None:
@@ -192,13 +174,10 @@ def checked_cloud(
     colors: Tensor | NDArray[np.generic] | None,
     residual_rms: Tensor | NDArray[np.floating] | None,
 ) -> GrowingCloud:
-    """Check what the user passed to ``grow_regions``, and settle which points are valid.
-
-    Returns:
-        The cloud, in the order it came in.
+    """Check what the user passed to :func:`torchrg.grow_regions`, in the order it came in.
 
     Raises:
-        ShapeError: If a shape, dtype or device is not as :func:`torchrg.grow_regions` says.
+        ShapeError: If a shape, dtype or device is not as that function says.
         ConfigError: If the settings ask for colours or residuals, and there are none.
     """
     caller = "grow_regions"
@@ -252,12 +231,7 @@ def checked_cloud(
 
 
 def reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
-    """Return the cloud with its points, and the rows its neighbours name, in another order.
-
-    Args:
-        cloud: The cloud.
-        order: Old row of each new one, shape ``(N,)``.
-    """
+    """Return the cloud, and the rows its neighbours name, in an order ``(N,)`` of old rows."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
     indices = cloud.neighbors.indices[order]

@@ -47,12 +47,6 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     References:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
         closed curve. Communications of the ACM 18(7), 1975.
-
-    Example:
-        >>> corners = torch.tensor([[0.0, 0], [2, 2], [3, 1], [1, -1]])
-        >>> segments = Segments(torch.zeros(4, dtype=torch.int64))
-        >>> fit_rectangles(segments, *corners.unbind(1)).sides
-        tensor([[2.8284, 1.4142]])
     """
     regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
     angles = [_least_area_angle(places.numpy().astype(np.float64)) for places in regions]
@@ -148,14 +142,6 @@ def covered_areas(
     Returns:
         Areas, shape ``(M,)``, 0 where the points are on one line; and the width of cells that
         leaves no holes between points, shape ``(M,)``.
-
-    Example:
-        >>> from torchrg.regions.measures import fit_rectangles
-        >>> u, v = torch.cartesian_prod(torch.arange(60.0), torch.arange(60.0)).unbind(1)
-        >>> segments = Segments(torch.zeros(3600, dtype=torch.int64))
-        >>> area, width = covered_areas(segments, u, v, fit_rectangles(segments, u, v))
-        >>> bool((area - 60 * 60).abs() < 150)
-        True
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()
@@ -246,15 +232,6 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
 
     Raises:
         MissingDependencyError: If shapely is not installed.
-
-    Example:
-        >>> grid = np.stack(np.mgrid[:30, :30], axis=-1).reshape(-1, 2).astype(float)
-        >>> frame = grid[((grid < 10) | (grid >= 20)).any(axis=1)]
-        >>> outer, hole = trace_outline(frame, 3.0)
-        >>> sorted(map(tuple, outer.tolist()))
-        [(0.0, 0.0), (0.0, 29.0), (29.0, 0.0), (29.0, 29.0)]
-        >>> float(hole.min()), float(hole.max())
-        (9.0, 20.0)
     """
     from scipy.ndimage import binary_erosion
     from scipy.spatial import Delaunay, QhullError
