@@ -14,6 +14,10 @@ from torchrg.linalg.moments import Segments
 _TIE = 1e-9
 """Rectangles whose areas differ by less than this share are equal but for rounding."""
 
+_TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
+"""From an edge to the edges across its direction in front, to the opposite one, and to those behind
+it: 0.5, 1 and 1.5 times pi, and another pi that the range of angles begins below 0."""
+
 
 class Rectangles(NamedTuple):
     """Rectangles about M regions.
@@ -71,21 +75,14 @@ def _least_area_angle(places: NDArray[np.float64]) -> float:
     A corner of the hull is the farthest in a direction if the edges before and after it are on
     either side of the edge that would be across it: a search among the angles of the edges.
     """
-    corners = places[_hull_corners(places)]
-    x, y = (np.roll(corners, -1, axis=0) - corners).T
-    angles = np.arctan2(y, x)
+    corners = places[_hull_corners(places)] @ [1, 1j]
+    angles = np.angle(np.roll(corners, -1) - corners)
     order = np.argsort(angles)
     corners, angles = corners[order], angles[order]
-
-    def farthest(angle_to_edge: float) -> NDArray[np.float64]:
-        across = (angles + angle_to_edge + 1.5 * np.pi) % (2 * np.pi) - np.pi
-        found: NDArray[np.float64] = corners[np.searchsorted(angles, across) % len(corners)]
-        return found
-
-    along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    normal = along[:, ::-1] * [-1, 1]
-    length = ((farthest(0.0) - farthest(np.pi)) * along).sum(axis=1)
-    height = ((farthest(np.pi / 2) - corners) * normal).sum(axis=1)
+    across = (angles + np.pi * _TO_OTHER_SIDES) % (2 * np.pi) - np.pi
+    front, top, back = corners[np.searchsorted(angles, across) % len(corners)]
+    to_edge = np.exp(-1j * angles)
+    length, height = ((front - back) * to_edge).real, ((top - corners) * to_edge).imag
     area = (length * height).clip(min=0)
     smallest = angles[area <= area.min() * (1 + _TIE)] % (np.pi / 2)
     return float(np.where(smallest < np.pi / 2 - _TIE, smallest, smallest - np.pi / 2).min())
