@@ -126,6 +126,11 @@ class GrowingConfig:
         by_edge = self.connectivity is not None and self.connectivity_scope == "seed"
         return self.seed_rule == "curvature" and not by_edge
 
+    @property
+    def is_refined(self) -> bool:
+        """Whether any step follows growth: release, absorption or merging."""
+        return self.max_plane_residual is not None or self.absorb or self.merge_coplanar
+
 
 @dataclass(frozen=True)
 class PlanesConfig:

@@ -14,8 +14,7 @@ from reproduction.sections import figure, section, text
 from torchrg import estimate_normals, load_config, search_knn
 from torchrg.neighbors import gather_patches
 from torchrg.regions.criteria import coplanarity_limits, patch_radii, plane_residuals
-from torchrg.regions.edges import min_shared_neighbors
-from torchrg.regions.shared_neighbors import SharedNeighbors
+from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.structures import Neighbors
 
 _SIDE = 15
@@ -117,9 +116,8 @@ def _test(title: str, cloud: Tensor, axes: tuple[int, int]) -> Case:
     floor = settings_.growing.coplanarity_floor * patch_radii(patches)
     limit = coplanarity_limits(residuals, floor)
     asked = torch.ones_like(residuals, dtype=torch.bool)
-    shared = SharedNeighbors(Neighbors(neighbors.indices))
     least = min_shared_neighbors(settings_.growing.connectivity, settings_.normals.k)
-    connective = shared.at_least(least, one, asked)
+    connective = SharedNeighbors(Neighbors(neighbors.indices), least).connected(one, asked)
     return Case(
         title,
         axes,

@@ -12,7 +12,6 @@ from tests.regions import algorithm2, growing_clouds
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.growth import grow_in_turn
 
 RULES = [
     {
@@ -74,7 +73,7 @@ def test_labels_equal_the_literal_algorithm(kind, variant):
 
 @pytest.mark.parametrize("kind", ["room", "quantized", "sphere", "graded", "plates"])
 def test_whole_levels_of_the_queue_give_the_labels_of_single_steps(kind, monkeypatch):
-    monkeypatch.setitem(grow_in_turn.__globals__, "_LONG_QUEUE", 2)
+    monkeypatch.setattr("torchrg.regions.growth._LONG_QUEUE", 2)
     rng = np.random.default_rng(7)
     settings = {"k": 8, "max_angle_deg": 20.0, "curvature_quantile": 0.6, "min_size": 2}
     check_all_rules(growing_clouds.KINDS[kind](rng), **settings)
@@ -95,7 +94,7 @@ def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, m
             curvature_quantile=float(rng.choice([0.0, 0.3, 0.6, 0.95, 1.0])),
             min_size=int(rng.choice([1, 2, k + 1])),
         )
-        monkeypatch.setitem(grow_in_turn.__globals__, "_LONG_QUEUE", int(rng.choice([2, 32])))
+        monkeypatch.setattr("torchrg.regions.growth._LONG_QUEUE", int(rng.choice([2, 32])))
         valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.9)
         labels = grow_regions(*cloud, config, valid=valid, canonical=True)
         assert labels.tolist() == expected_labels(*cloud, config, valid), config

@@ -10,7 +10,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.edges import EdgeLists
-from torchrg.regions.growth import curvature_limit, first_to_reach, number_by_size
+from torchrg.regions.growth import _curvature_limit, _first_to_reach, number_by_size
 from torchrg.structures import Neighbors
 
 CLASSIC = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -64,7 +64,7 @@ def test_curvature_limit_is_the_lower_quantile():
         values = torch.rand(num_values, generator=torch.Generator().manual_seed(0))
         for share in (0.0, 0.5, 0.95, 0.98, 1.0):
             expected = np.quantile(values.numpy(), share, method="lower")
-            assert curvature_limit(values, share).item() == expected
+            assert _curvature_limit(values, share).item() == expected
 
 
 def test_regions_smaller_than_min_size_are_not_labelled():
@@ -76,16 +76,8 @@ def test_regions_smaller_than_min_size_are_not_labelled():
 
 
 def test_labels_descend_by_size_then_by_first_point():
-    assert number_by_size(np.array([7, 7, 2, 2, 5, 5, 5, -1]), 2).tolist() == [
-        1,
-        1,
-        2,
-        2,
-        0,
-        0,
-        0,
-        -1,
-    ]
+    labels = number_by_size(torch.tensor([7, 7, 2, 2, 5, 5, 5, -1]), 2)
+    assert labels.tolist() == [1, 1, 2, 2, 0, 0, 0, -1]
 
 
 def test_points_without_finite_normal_or_curvature_do_not_join():
@@ -146,7 +138,7 @@ def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
         np.concatenate([np.arange(1, num_points), np.zeros(2 * num_points + 1)]).astype(np.int32),
     )
     seeds = np.arange(num_points, dtype=np.int32)
-    assert not first_to_reach(edges, seeds, num_points).any()
+    assert not _first_to_reach(edges, seeds, num_points).any()
 
 
 def test_neighbours_across_a_gap_join_only_within_the_distance():

@@ -177,6 +177,14 @@ def test_a_column_is_curved_and_a_wall_is_not():
     assert summarize_planes(column, gentle, one_region(column)).curved.tolist() == [False]
 
 
+@pytest.mark.parametrize(("bend_deg", "curved"), [(26.0, False), (30.0, True)])
+def test_a_bend_is_curved_from_three_to_four_times_the_spread_on(bend_deg, curved):
+    angle = torch.deg2rad(torch.linspace(0, bend_deg, 500))
+    normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=1)
+    normals[::3] *= -1
+    assert summarize_planes(normals, normals, one_region(normals)).curved.tolist() == [curved]
+
+
 def box_of_points(rng, size=(4.0, 3.0, 2.5), n=3000, noise=0.002):
     """The six faces of a room, seen from inside: floor and ceiling first."""
     points, labels = [], []

@@ -14,7 +14,7 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.regions import grow_regions
 from torchrg.structures import Neighbors
 
-AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+_AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Steps in rows and columns to the pixels around one, the nearest first."""
 
 
@@ -58,15 +58,14 @@ def grow_pixels(
     Returns:
         The regions.
     """
-    rows = _rows_around(pixels.flat)
-    joined = torch.stack([_joins(pixels, normals, u, v, step, config) for step in AROUND], dim=-1)
+    joined = [_joins(pixels, normals, u, v, step, config) for step in _AROUND]
     size = pixels.radius.clamp(min=1).double()
     roughness = (pixels.planes.deviation / pixels.noise) / (size * size)
     labels = grow_regions(
         cloud.points,
         cloud.normals,
         torch.where(pixels.flat, roughness, 0.0).flatten(),
-        Neighbors(rows, _with_self(joined)),
+        _neighbors(joined),
         GrowingConfig(
             max_angle_deg=90.0,
             curvature_quantile=1.0,
@@ -81,13 +80,12 @@ def grow_pixels(
     if not bool((labels >= 0).any()):
         return PixelRegions(labels, normals.new_empty(0, 3), pixels.flat.new_empty(0))
     image = cloud.seen.view(pixels.flat.shape)
-    beside = torch.stack([image & moved(image, step, fill=False) for step in AROUND], dim=-1)
-    touching = Neighbors(rows, _with_self(beside))
-    labels, fit, curved = refine_pixels(cloud, labels, touching, config)
+    touching = _neighbors([image & moved(image, step, fill=False) for step in _AROUND])
+    labels, fit = refine_pixels(cloud, labels, touching, config)
     distance = (fit.normal * fit.center).sum(dim=1)
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
     away = torch.where(fit.normal[:, 2:] < 0, -away, away)
-    return PixelRegions(labels, -away / away.norm(dim=1, keepdim=True), curved)
+    return PixelRegions(labels, -away / away.norm(dim=1, keepdim=True), fit.curved)
 
 
 def _joins(
@@ -110,13 +108,10 @@ def _joins(
     return both & here & there & (angle <= config.max_angle_deg)
 
 
-def _rows_around(image: Tensor) -> Tensor:
-    """Return the rows of each pixel and of those around it, shape ``(H * W, 9)``, int32."""
-    rows = torch.arange(image.numel(), dtype=torch.int32, device=image.device).view(image.shape)
-    return torch.stack([rows, *(moved(rows, step, fill=0) for step in AROUND)], dim=-1).view(-1, 9)
-
-
-def _with_self(around: Tensor) -> Tensor:
-    """Return a mask ``(H, W, 8)`` of the pixels around as one of neighbours, ``(H * W, 9)``."""
-    itself = torch.ones_like(around[..., :1])
-    return torch.cat([itself, around], dim=-1).view(-1, 9)
+def _neighbors(joined: list[Tensor]) -> Neighbors:
+    """Return the pixels around each pixel, itself first, from which of them count, ``(H, W)``."""
+    first = joined[0]
+    rows = torch.arange(first.numel(), dtype=torch.int32, device=first.device).view(first.shape)
+    indices = torch.stack([rows, *(moved(rows, step, fill=0) for step in _AROUND)], dim=-1)
+    counted = torch.stack([torch.ones_like(first), *joined], dim=-1)
+    return Neighbors(indices.view(-1, 9), counted.view(-1, 9))

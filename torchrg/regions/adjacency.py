@@ -10,73 +10,22 @@ from torchrg._parallel import places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency
 
-NUM_CONTACTS = 8
+_NUM_CONTACTS = 8
 """So many neighbours surround a point of a surface; more reach across gaps."""
 
-
-def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the nearest neighbours of each point, and which of these entries count.
-
-    Args:
-        neighbors: Neighbours, by distance, the point itself first.
-
-    Returns:
-        Rows ``(N, n)``, int64, and mask ``(N, n)``, with n = 8 or what there is.
-
-    Example:
-        >>> contact_neighbors(Neighbors(torch.tensor([[0, 1], [1, 0]])))[0].tolist()
-        [[1], [0]]
-    """
-    nearest = neighbors.indices[:, 1 : NUM_CONTACTS + 1].long()
-    if neighbors.valid is None:
-        return nearest, torch.ones_like(nearest, dtype=torch.bool)
-    return nearest, neighbors.valid[:, 1 : NUM_CONTACTS + 1]
-
-
-def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the pairs of regions that touch, and the number of contacts of each pair.
-
-    Args:
-        labels: Region of each point, shape ``(N,)``, negative for none.
-        neighbors: Neighbours of each point.
-
-    Returns:
-        Pairs ``(E, 2)``, the smaller label first, ascending, and counts ``(E,)``.
-
-    Example:
-        >>> neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
-        >>> count_contacts(torch.tensor([0, 1, 1]), neighbors)
-        (tensor([[0, 1]]), tensor([2]))
-    """
-    nearest, counted = contact_neighbors(neighbors)
-    other = labels[nearest]
-    touches = counted & (other != labels[:, None]) & (other >= 0) & (labels[:, None] >= 0)
-    places = places_of(touches)
-    own, other = labels[places // touches.shape[1]], other.reshape(-1)[places]
-    num_regions = int(labels.max()) + 1 if len(labels) else 0
-    keys = torch.minimum(own, other) * num_regions + torch.maximum(own, other)
-    found, counts = torch.unique(keys, return_counts=True)
-    width = max(num_regions, 1)
-    return torch.stack([found // width, found % width], dim=1), counts
-
-
 _LEAST_CONTACTS = 3
+"""Regions that touch in fewer edges do not meet: one may be an outlier's."""
+
 _PARALLEL_DEG = 15.0
-_MAX_STEEPNESS = 0.25
+"""At a smaller angle the line in which two planes cross may be far from where they meet."""
+
 _REACH = 4.0
+_MAX_STEEPNESS = 0.25
 """An edge that leads farther across the planes than this many times their thickness, and than a
 quarter of the way to the 8th neighbour, leads to a parallel surface."""
 
 _CHUNK_SIZE = 65536
-
-
-class _Contacts(NamedTuple):
-    """Edges between regions: numbers of their pairs, ends of the edges, places in the lists."""
-
-    pair: Tensor
-    source: Tensor
-    target: Tensor
-    rank: Tensor
+"""Points handled at a time; bounds the memory."""
 
 
 def find_adjacency(
@@ -110,27 +59,14 @@ def find_adjacency(
 
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
-
-    Example:
-        >>> from torchrg.neighbors import search_knn
-        >>> floor = torch.cartesian_prod(torch.arange(9.0), torch.arange(30.0), torch.zeros(1))
-        >>> cloud = torch.cat([floor, floor[:, [2, 1, 0]] + torch.tensor([0.0, 0.1, 0.5])])
-        >>> labels = torch.arange(2).repeat_interleave(270)
-        >>> normal, curved = torch.eye(3)[[2, 0]].double(), torch.zeros(2, dtype=torch.bool)
-        >>> neighbors, thickness = search_knn(cloud, 12), torch.zeros(2).double()
-        >>> found = find_adjacency(cloud, labels, neighbors, normal, thickness, curved=curved)
-        >>> found.pairs.tolist(), found.dihedral_deg.round().tolist()
-        ([[0, 1]], [90.0])
-        >>> bool((found.boundary_length - 29).abs() < 2)
-        True
     """
-    pairs, contacts = _find_contacts(labels, neighbors)
+    pairs, contacts = _find_contacts(labels, neighbors.indices, neighbors.valid)
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
     angle = unsigned_angle_deg(first, second)
     crossing = (angle > _PARALLEL_DEG) & ~curved[pairs].any(dim=1)
     is_crossing = crossing[contacts.pair]
     on_lines = _select(contacts, is_crossing)
-    on_curves = _select(contacts, ~is_crossing & (contacts.rank < NUM_CONTACTS))
+    on_curves = _select(contacts, ~is_crossing & (contacts.column <= _NUM_CONTACTS))
     edge = points[on_curves.target].double() - points[on_curves.source].double()
     across = torch.stack([(edge * side[on_curves.pair]).sum(dim=1) for side in (first, second)])
     spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
@@ -150,35 +86,83 @@ def find_adjacency(
     return PlaneAdjacency(pairs[kept], length[kept], angle[kept])
 
 
+def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
+    """Return the nearest neighbours of each point, and which of these entries count.
+
+    Args:
+        neighbors: Neighbours, by distance, the point itself first.
+
+    Returns:
+        Rows ``(N, n)``, int64, and mask ``(N, n)``, with n = 8 or what there is.
+
+    Example:
+        >>> contact_neighbors(Neighbors(torch.tensor([[0, 1], [1, 0]])))[0].tolist()
+        [[1], [0]]
+    """
+    nearest = neighbors.indices[:, 1 : _NUM_CONTACTS + 1].long()
+    if neighbors.valid is None:
+        return nearest, torch.ones_like(nearest, dtype=torch.bool)
+    return nearest, neighbors.valid[:, 1 : _NUM_CONTACTS + 1]
+
+
+def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
+    """Return the pairs of regions that touch, and the number of contacts of each pair.
+
+    Args:
+        labels: Region of each point, shape ``(N,)``, negative for none.
+        neighbors: Neighbours of each point.
+
+    Returns:
+        Pairs ``(E, 2)``, the smaller label first, ascending, and counts ``(E,)``.
+
+    Example:
+        >>> neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
+        >>> count_contacts(torch.tensor([0, 1, 1]), neighbors)
+        (tensor([[0, 1]]), tensor([2]))
+    """
+    pairs, contacts = _find_contacts(labels, *contact_neighbors(neighbors))
+    return pairs, torch.bincount(contacts.pair, minlength=len(pairs))
+
+
+class _Contacts(NamedTuple):
+    """Edges between regions: numbers of their pairs, ends of the edges, columns in the lists."""
+
+    pair: Tensor
+    source: Tensor
+    target: Tensor
+    column: Tensor
+
+
+def _find_contacts(
+    labels: Tensor, targets: Tensor, counted: Tensor | None
+) -> tuple[Tensor, _Contacts]:
+    """Return the pairs of regions with an edge between them, ascending, and these edges."""
+    num_regions = int(labels.max()) + 1 if len(labels) else 0
+    narrow = labels.to(torch.int32)
+    found = []
+    for start in range(0, max(len(labels), 1), _CHUNK_SIZE):
+        rows = slice(start, start + _CHUNK_SIZE)
+        target, own = targets[rows].reshape(-1), narrow[rows]
+        other = narrow.index_select(0, target).view(targets[rows].shape)
+        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
+        if counted is not None:
+            touches &= counted[rows]
+        places = places_of(touches)
+        source, column = places // touches.shape[1], places % touches.shape[1]
+        first, second = own[source].long(), other.reshape(-1)[places].long()
+        key = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
+        found.append((key, source + start, target[places].long(), column))
+    keys, sources, targets, columns = (torch.cat(parts) for parts in zip(*found, strict=True))
+    numbers, pair = torch.unique(keys, return_inverse=True)
+    width = max(num_regions, 1)
+    pairs = torch.stack([numbers // width, numbers % width], dim=1)
+    return pairs, _Contacts(pair, sources, targets, columns)
+
+
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
     """Return the chosen ones of the edges."""
     rows = chosen.nonzero().squeeze(1)
     return _Contacts(*(values.index_select(0, rows) for values in contacts))
-
-
-def _find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, _Contacts]:
-    """Return the pairs of regions with an edge between them, ascending, and these edges."""
-    num_regions = int(labels.max()) + 1 if len(labels) else 0
-    narrow = labels.to(torch.int32)
-    keys, sources, targets, ranks = [], [], [], []
-    for start in range(0, max(len(labels), 1), _CHUNK_SIZE):
-        rows = slice(start, start + _CHUNK_SIZE)
-        indices = neighbors.indices[rows]
-        own = narrow[rows]
-        other = narrow.index_select(0, indices.reshape(-1)).view(indices.shape)
-        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
-        if neighbors.valid is not None:
-            touches &= neighbors.valid[rows]
-        places = places_of(touches)
-        source, column = places // touches.shape[1], places % touches.shape[1]
-        first, second = own[source].long(), other.reshape(-1)[places].long()
-        keys.append(torch.minimum(first, second) * num_regions + torch.maximum(first, second))
-        sources.append(source + start)
-        targets.append(indices.reshape(-1)[places].long())
-        ranks.append(column - 1)
-    found, pair = torch.unique(torch.cat(keys), return_inverse=True)
-    pairs = torch.stack([found // max(num_regions, 1), found % max(num_regions, 1)], dim=1)
-    return pairs, _Contacts(pair, torch.cat(sources), torch.cat(targets), torch.cat(ranks))
 
 
 def _length_on_line(points: Tensor, contacts: _Contacts, along: Tensor, num_pairs: int) -> Tensor:

@@ -8,15 +8,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.config import GrowingConfig
-from torchrg.errors import ConfigError
 from torchrg.neighbors import canonical_order
+from torchrg.regions.criteria import GrowingCloud
 from torchrg.regions.edges import (
-    EdgeFinder,
     EdgeLists,
-    GrowingCloud,
     checked_cloud,
-    pack_edges,
-    plane_reach_of,
+    find_coded_edges,
+    find_edges,
     reordered,
 )
 from torchrg.regions.refine import refine_regions
@@ -24,181 +22,6 @@ from torchrg.structures import UNLABELED, Neighbors
 
 _LONG_QUEUE = 32
 """From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
-
-
-def grow_in_turn(
-    edges: EdgeLists, order: NDArray[np.int32], valid: NDArray[np.bool_]
-) -> NDArray[np.int32]:
-    """Grow one region after the other, each from a first-in first-out queue of seeds (Algorithm 2).
-
-    A point belongs to the first seed in the queue that has an edge to it, and whether it becomes a
-    seed itself is a property of that edge. Long queues are taken a level at a time: all edges of
-    the waiting seeds in their order, of which the first to a point claims it. This is the order of
-    the queue, exactly.
-
-    Args:
-        edges: Targets as ``2 * row + spreads``: whether the target, claimed by this edge, becomes
-            a seed.
-        order: All points that may start a region, in the order in which they do.
-        valid: Points that may belong to a region, shape ``(N,)``.
-
-    Returns:
-        Head of each point's region, shape ``(N,)``; -1 where not valid.
-
-    Example:
-        >>> edges = EdgeLists(np.array([0, 1, 2, 2]), np.array([2, 5], dtype=np.int32))
-        >>> grow_in_turn(edges, np.arange(3, dtype=np.int32), np.ones(3, dtype=bool)).tolist()
-        [0, 0, 2]
-    """
-    codes = edges.targets
-    starts = memoryview(edges.starts.data)
-    free = bytearray(valid.tobytes())
-    heads = array("i", bytes(4 * len(valid)))
-    open_points = np.frombuffer(free, dtype=np.bool_)
-    heads_view = np.frombuffer(heads, dtype=np.int32)
-    heads_view[:] = -1
-    slots = np.empty(len(valid), dtype=np.int32)
-    for head in order.tolist():
-        if not free[head]:
-            continue
-        free[head] = 0
-        heads[head] = head
-        queue = [head]
-        done = 0
-        while done < len(queue):
-            if len(queue) - done >= _LONG_QUEUE:
-                level = np.array(queue[done:], dtype=np.int32)
-                while len(level) >= _LONG_QUEUE:
-                    level = _claim_level(edges, level, head, open_points, heads_view, slots)
-                queue, done = level.tolist(), 0
-                continue
-            seed = queue[done]
-            done += 1
-            for code in codes[starts[seed] : starts[seed + 1]].tolist():
-                target = code >> 1
-                if free[target]:
-                    free[target] = 0
-                    heads[target] = head
-                    if code & 1:
-                        queue.append(target)
-    return heads_view
-
-
-def _claim_level(
-    edges: EdgeLists,
-    level: NDArray[np.int32],
-    head: int,
-    open_points: NDArray[np.bool_],
-    heads: NDArray[np.int32],
-    slots: NDArray[np.int32],
-) -> NDArray[np.int32]:
-    """Let a level of seeds claim points, and return the seeds among them in queue order."""
-    starts = edges.starts[level]
-    counts = edges.starts[level + 1] - starts
-    ends = np.cumsum(counts)
-    places = np.repeat(starts - ends + counts, counts)
-    places += np.arange(len(places), dtype=places.dtype)
-    codes = edges.targets[places]
-    codes = codes[open_points[codes >> 1]]
-    targets = codes >> 1
-    turn = np.arange(len(targets), dtype=np.int32)
-    # Of several writes to one place the last one stays: in reverse, the first edge to a point.
-    slots[targets[::-1]] = turn[::-1]
-    first = slots[targets] == turn
-    codes, targets = codes[first], targets[first]
-    open_points[targets] = False
-    heads[targets] = head
-    seeds: NDArray[np.int32] = targets[(codes & 1).astype(bool)]
-    return seeds
-
-
-def first_to_reach(
-    edges: EdgeLists, seeds: NDArray[np.int32], num_points: int
-) -> NDArray[np.int32]:
-    """Return for each point the first of the seeds that reaches it along edges.
-
-    This is what growing one region after the other, from each seed that is still free, comes to,
-    if every point spreads alike whoever claimed it: the first seed that reaches a point finds all
-    of its way free. One depth-first search does it, through a chain of extra nodes that each lead
-    to one seed and then to the next node.
-
-    Args:
-        edges: Edges of points that spread; those that do not have none. Room for two more edges
-            for each seed; it is written.
-        seeds: Rows, in the order in which regions start.
-        num_points: Number of points.
-
-    Returns:
-        The row of that seed, shape ``(N,)``; -1 where none does.
-
-    Example:
-        >>> starts, targets = np.array([0, 1, 1, 2]), np.array([1, 1] + [0] * 4)
-        >>> edges = EdgeLists(starts.astype(np.int32), targets.astype(np.int32))
-        >>> first_to_reach(edges, np.array([2, 0], dtype=np.int32), 3).tolist()
-        [0, 2, 2]
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import depth_first_order
-
-    heads = np.full(num_points, -1, dtype=np.int32)
-    if len(seeds) == 0:
-        return heads
-    num_nodes = num_points + len(seeds)
-    num_edges = int(edges.starts[-1])
-    total = num_edges + 2 * len(seeds) - 1
-    edges.targets[num_edges:total:2] = seeds
-    edges.targets[num_edges + 1 : total : 2] = np.arange(num_points + 1, num_nodes)
-    ends = num_edges + 2 * np.arange(1, len(seeds) + 1, dtype=edges.starts.dtype)
-    ends[-1] = total
-    # The search reads no weights; an array of one repeated value takes no memory.
-    weights = np.broadcast_to(np.float64(1), total)
-    graph = csr_array(
-        (weights, edges.targets[:total], np.concatenate([edges.starts, ends])),
-        shape=(num_nodes, num_nodes),
-    )
-    visited, parents = depth_first_order(graph, num_points, directed=True)
-    visited = visited[visited < num_points]
-    is_head = parents[visited] >= num_points
-    heads[visited] = visited[is_head][np.cumsum(is_head) - 1]
-    return heads
-
-
-def claim_leftovers(
-    sources: NDArray[np.int32],
-    targets: NDArray[np.int32],
-    heads: NDArray[np.int32],
-    order: NDArray[np.int32],
-) -> None:
-    """Let points that no seed reaches claim their free neighbours, one hop, in order.
-
-    Args:
-        sources: Points that the edges lead from, ascending, shape ``(E,)``: points that do not
-            spread beyond their own neighbours.
-        targets: Points that they lead to, shape ``(E,)``.
-        heads: Head of each point's region, or -1; written.
-        order: All points that may start a region, in the order in which they do.
-
-    Example:
-        >>> heads = np.full(4, -1, dtype=np.int32)
-        >>> claim_leftovers(np.array([0, 1, 3]), np.array([1, 2, 2]), heads, np.arange(4))
-        >>> heads.tolist()
-        [0, 0, 2, 3]
-    """
-    free = heads < 0
-    turn = np.empty(len(heads), dtype=np.int32)
-    turn[order] = np.arange(len(order), dtype=np.int32)
-    # A free point whose turn was before has started a region of its own.
-    open_edges = free[sources] & free[targets] & (turn[sources] < turn[targets])
-    sources, targets = sources[open_edges], targets[open_edges]
-    starts = np.searchsorted(sources, np.arange(len(heads) + 1))
-    claiming = order[free[order] & (np.diff(starts)[order] > 0)]
-    for point in claiming.tolist():
-        if heads[point] < 0:
-            reached = targets[starts[point] : starts[point + 1]]
-            heads[reached[heads[reached] < 0]] = point
-            heads[point] = point
-    alone = order[heads[order] < 0]
-    heads[alone] = alone
 
 
 def grow_regions(
@@ -261,66 +84,38 @@ def grow_regions(
         >>> grow_regions(points, normals, curvature, neighbors, GrowingConfig(min_size=9)).unique()
         tensor([0])
     """
-    cloud = checked_cloud(points, normals, curvature, neighbors, valid, colors)
     config = GrowingConfig() if config is None else config
-    if config.max_color_distance is not None and colors is None:
-        raise ConfigError(
-            "grow_regions: expected colors, which max_color_distance needs, got None; pass them or "
-            "set max_color_distance to None."
-        )
-    if config.plane_reach is not None:
-        cloud = cloud._replace(reach=plane_reach_of(cloud, residual_rms, config))
-    device = cloud.points.device
+    cloud = checked_cloud(
+        config, points, normals, curvature, neighbors, valid, colors, residual_rms
+    )
     if len(cloud.points) == 0:
-        return torch.empty(0, dtype=torch.int64, device=device)
+        return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = reordered(cloud, order)
-    labels = _labels(_grow(cloud, config, chunk_size), config.min_size, device)
-    refined = refine_regions(cloud, labels, config)
-    if refined is not labels:
-        labels = _labels(refined.cpu().numpy(), config.min_size, device)
+    heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
+    labels = number_by_size(heads, config.min_size)
+    if config.is_refined:
+        labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 
-def _labels(heads: NDArray[np.integer], min_size: int, device: torch.device) -> Tensor:
-    """Return the numbers of regions as a tensor."""
-    return torch.from_numpy(number_by_size(heads, min_size)).to(device)
-
-
-def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
-    """Return the lower quantile of curvatures: one of the values, as PCL's users take it.
-
-    Args:
-        curvature: Curvatures of the valid points, shape ``(n,)``.
-        quantile: Share in [0, 1].
-
-    Returns:
-        The value at place ``floor(quantile * (n - 1))`` when sorted, a scalar; 0 where n is 0.
-
-    Example:
-        >>> curvature_limit(torch.tensor([0.3, 0.1, 0.2]), 0.95).item() < 0.21
-        True
-    """
-    if len(curvature) == 0:
-        return curvature.new_zeros(())
-    return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
-
-
-def number_by_size(heads: NDArray[np.integer], min_size: int) -> NDArray[np.int64]:
+def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, those of equal size by their first point.
 
     Args:
-        heads: Any number that is the same in a region and another elsewhere, below N; -1 for none.
+        regions: Any number below N that is the same in a region and another elsewhere, -1 for
+            none, shape ``(N,)``.
         min_size: Smaller regions get :data:`torchrg.UNLABELED`.
 
     Returns:
-        Labels, shape ``(N,)``.
+        Labels, shape ``(N,)``, int64.
 
     Example:
-        >>> number_by_size(np.array([3, 1, 1, 3, -1, 2, 1]), 2).tolist()
-        [1, 0, 0, 1, -1, -1, 0]
+        >>> number_by_size(torch.tensor([3, 1, 1, 3, -1, 2, 1]), 2)
+        tensor([ 1,  0,  0,  1, -1, -1,  0])
     """
+    heads = regions.cpu().numpy()
     placed = np.flatnonzero(heads >= 0)
     sizes = np.bincount(heads[placed], minlength=len(heads))
     firsts = np.full(len(heads), len(heads))
@@ -330,8 +125,7 @@ def number_by_size(heads: NDArray[np.integer], min_size: int) -> NDArray[np.int6
     # The last entry is what a head of -1 finds.
     numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int64)
     numbers[kept] = np.arange(len(kept))
-    labels: NDArray[np.int64] = numbers[heads]
-    return labels
+    return torch.from_numpy(numbers[heads]).to(regions.device)
 
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
@@ -339,28 +133,133 @@ def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArra
     curvature, valid = cloud.curvature.cpu().numpy(), cloud.valid.cpu().numpy()
     order = np.argsort(curvature, kind="stable").astype(np.int32)
     order = order[valid[order]]
-    limit = curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
-    finder = EdgeFinder(cloud, config, limit)
-    num_points, k = cloud.neighbors.indices.shape
+    limit = _curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
     if not config.is_order_free:
-        edges = pack_edges(
-            finder.coded,
-            num_points,
-            capacity=num_points * k,
-            chunk_size=chunk_size,
-            device=cloud.points.device,
-        )
-        return grow_in_turn(edges, order, valid)
+        edges = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
+        return _grow_first_in_first_out(edges, order, valid)
     seeds = order[curvature[order] <= limit.cpu().numpy()]
-    edges = pack_edges(
-        finder.spreading,
-        num_points,
-        capacity=num_points * k + 2 * len(seeds),
-        chunk_size=chunk_size,
-        device=cloud.points.device,
-    )
-    heads = first_to_reach(edges, seeds, num_points)
-    # A point that does not spread claims at most its k - 1 neighbours.
-    if config.min_size <= k:
-        claim_leftovers(*finder.others(), heads, order)
+    edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
+    heads = _first_to_reach(edges, seeds, len(valid))
+    # What no seed reaches are points that claim at most their k - 1 neighbours.
+    if config.min_size <= cloud.neighbors.indices.shape[1]:
+        free = heads < 0
+        left = _grow_first_in_first_out(others, order[free[order]], free)
+        heads = np.where(free, left, heads)
     return heads
+
+
+def _curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
+    """Return the lower quantile of curvatures ``(n,)``, one of the values; 0 where n is 0."""
+    if len(curvature) == 0:
+        return curvature.new_zeros(())
+    return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
+
+
+def _first_to_reach(
+    edges: EdgeLists, seeds: NDArray[np.int32], num_points: int
+) -> NDArray[np.int32]:
+    """Return for each point the first of the seeds that reaches it along edges, -1 for none.
+
+    This is what growing one region after the other, from each seed that is still free, comes to,
+    if every point spreads alike whoever claimed it: the first seed that reaches a point finds all
+    of its way free. One depth-first search does it, through a chain of extra nodes that each lead
+    to one seed and then to the next node; its edges are written into the room behind the others.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import depth_first_order
+
+    heads = np.full(num_points, -1, dtype=np.int32)
+    if len(seeds) == 0:
+        return heads
+    num_nodes = num_points + len(seeds)
+    num_edges = int(edges.starts[-1])
+    total = num_edges + 2 * len(seeds) - 1
+    edges.targets[num_edges:total:2] = seeds
+    edges.targets[num_edges + 1 : total : 2] = np.arange(num_points + 1, num_nodes)
+    ends = num_edges + 2 * np.arange(1, len(seeds) + 1, dtype=edges.starts.dtype)
+    ends[-1] = total
+    # The search reads no weights; an array of one repeated value takes no memory.
+    weights = np.broadcast_to(np.float64(1), total)
+    graph = csr_array(
+        (weights, edges.targets[:total], np.concatenate([edges.starts, ends])),
+        shape=(num_nodes, num_nodes),
+    )
+    visited, parents = depth_first_order(graph, num_points, directed=True)
+    visited = visited[visited < num_points]
+    is_head = parents[visited] >= num_points
+    heads[visited] = visited[is_head][np.cumsum(is_head) - 1]
+    return heads
+
+
+def _grow_first_in_first_out(
+    edges: EdgeLists, order: NDArray[np.int32], valid: NDArray[np.bool_]
+) -> NDArray[np.int32]:
+    """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
+
+    A point belongs to the first seed in the queue that has an edge to it, and whether it becomes a
+    seed itself is a property of that edge: targets are ``2 * row + (whether it does)``. Long queues
+    are taken a level at a time: all edges of the waiting seeds in their order, of which the first
+    to a point claims it. This is the order of the queue, exactly.
+
+    Returns the head of each point's region, -1 where not valid.
+    """
+    codes = edges.targets
+    starts = memoryview(edges.starts.data)
+    free = bytearray(valid.tobytes())
+    heads = array("i", bytes(4 * len(valid)))
+    open_points = np.frombuffer(free, dtype=np.bool_)
+    heads_view = np.frombuffer(heads, dtype=np.int32)
+    heads_view[:] = -1
+    slots = np.empty(len(valid), dtype=np.int32)
+    for head in order.tolist():
+        if not free[head]:
+            continue
+        free[head] = 0
+        heads[head] = head
+        queue = [head]
+        done = 0
+        while done < len(queue):
+            if len(queue) - done >= _LONG_QUEUE:
+                level = np.array(queue[done:], dtype=np.int32)
+                while len(level) >= _LONG_QUEUE:
+                    level = _claim_level(edges, level, head, open_points, heads_view, slots)
+                queue, done = level.tolist(), 0
+                continue
+            seed = queue[done]
+            done += 1
+            for code in codes[starts[seed] : starts[seed + 1]].tolist():
+                target = code >> 1
+                if free[target]:
+                    free[target] = 0
+                    heads[target] = head
+                    if code & 1:
+                        queue.append(target)
+    return heads_view
+
+
+def _claim_level(
+    edges: EdgeLists,
+    level: NDArray[np.int32],
+    head: int,
+    open_points: NDArray[np.bool_],
+    heads: NDArray[np.int32],
+    slots: NDArray[np.int32],
+) -> NDArray[np.int32]:
+    """Let a level of seeds claim points, and return the seeds among them in queue order."""
+    starts = edges.starts[level]
+    counts = edges.starts[level + 1] - starts
+    ends = np.cumsum(counts)
+    places = np.repeat(starts - ends + counts, counts)
+    places += np.arange(len(places), dtype=places.dtype)
+    codes = edges.targets[places]
+    codes = codes[open_points[codes >> 1]]
+    targets = codes >> 1
+    numbers = np.arange(len(targets), dtype=np.int32)
+    # Of several writes to one place the last one stays: in reverse, the first edge to a point.
+    slots[targets[::-1]] = numbers[::-1]
+    first = slots[targets] == numbers
+    codes, targets = codes[first], targets[first]
+    open_points[targets] = False
+    heads[targets] = head
+    seeds: NDArray[np.int32] = targets[(codes & 1).astype(bool)]
+    return seeds

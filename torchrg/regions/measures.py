@@ -1,7 +1,6 @@
 """What a region measures: the area it covers, the rectangle about it, its outline."""
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +11,12 @@ from torch import Tensor
 from torchrg._optional import require
 from torchrg.linalg.moments import Segments
 
-_NUM_DIRECTIONS = 32
-_SLACK = 1 - 1e-6
-_COARSE_STEP_DEG, _FINE_STEP_DEG = 2.0, 0.1
+_TIE = 1e-9
+"""Rectangles whose areas differ by less than this share are equal but for rounding."""
+
+_TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
+"""From an edge to the edges across its direction in front, to the opposite one, and to those behind
+it: 0.5, 1 and 1.5 times pi, and another pi that the range of angles begins below 0."""
 
 
 class Rectangles(NamedTuple):
@@ -33,26 +35,27 @@ class Rectangles(NamedTuple):
 
 
 def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
-    """Find the rectangle of least area about each region, to a tenth of a degree.
+    """Find the rectangle of least area about each region.
 
-    The turn is searched with the extreme points of 64 directions; the sides then hold all points.
+    One of its sides runs along an edge of the region's convex hull [1].
 
     Args:
         segments: The regions.
-        u: First coordinate in the plane, in the order of :meth:`Segments.take`.
+        u: First coordinate in the plane, in the order of :meth:`Segments.take`, finite.
         v: Second coordinate.
 
     Returns:
-        The rectangles. A region of one place has sides 0.
+        The rectangles; of equally small ones that with the least angle to the coordinates. A region
+        on one line has a short side of 0, one of one place two.
 
-    Example:
-        >>> corners = torch.tensor([[0.0, 0], [2, 2], [3, 1], [1, -1]])
-        >>> segments = Segments(torch.zeros(4, dtype=torch.int64))
-        >>> fit_rectangles(segments, *corners.unbind(1)).sides
-        tensor([[2.8284, 1.4142]])
+    References:
+        [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
+        closed curve. Communications of the ACM 18(7), 1975.
     """
-    turn = _best_turn(*_extreme_points(segments, u, v))
-    cosine, sine = turn.cos(), turn.sin()
+    regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
+    angles = [_least_area_angle(places.numpy().astype(np.float64)) for places in regions]
+    cosine = u.new_tensor([math.cos(angle) for angle in angles])
+    sine = u.new_tensor([math.sin(angle) for angle in angles])
     c, s = segments.spread(cosine), segments.spread(sine)
     one, other = segments.bounds(u * c + v * s), segments.bounds(v * c - u * s)
     low, high = (torch.stack(pair, dim=1) for pair in zip(one, other, strict=True))
@@ -66,57 +69,34 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     )
 
 
-def _extreme_points(segments: Segments, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return corners of each region's convex hull, two arrays ``(M, 2 * directions)``."""
-    # Stretching keeps the corners of a hull; a thin strip needs it to have more than two.
-    scale_u, scale_v = (segments.spread(segments.mean(x.abs())) for x in (u, v))
-    wide_u = u / torch.where(scale_u > 0, scale_u, 1.0)
-    wide_v = v / torch.where(scale_v > 0, scale_v, 1.0)
-    corners = _extremes(segments, wide_u, wide_v, (0.0, math.pi / 2))
-    angles = [math.pi * step / _NUM_DIRECTIONS for step in range(_NUM_DIRECTIONS)]
-    # Nearer to the origin than the hull of four of its points is anywhere: no corner of the hull.
-    near = _least_reach(wide_u[corners], wide_v[corners], angles) * _SLACK
-    outer = wide_u * wide_u + wide_v * wide_v >= segments.spread(near * near.abs())
-    rows = outer.nonzero().squeeze(1)
-    corners = rows[_extremes(Segments(segments.labels[rows]), wide_u[rows], wide_v[rows], angles)]
-    return u[corners], v[corners]
+def _least_area_angle(places: NDArray[np.float64]) -> float:
+    """Return the angle of the smallest rectangle about points ``(n, 2)``, in [0, 90) degrees.
+
+    A corner of the hull is the farthest in a direction if the edges before and after it are on
+    either side of the edge that would be across it: a search among the angles of the edges.
+    """
+    corners = places[_hull_corners(places)] @ [1, 1j]
+    angles = np.angle(np.roll(corners, -1) - corners)
+    order = np.argsort(angles)
+    corners, angles = corners[order], angles[order]
+    across = (angles + np.pi * _TO_OTHER_SIDES) % (2 * np.pi) - np.pi
+    front, top, back = corners[np.searchsorted(angles, across) % len(corners)]
+    to_edge = np.exp(-1j * angles)
+    length, height = ((front - back) * to_edge).real, ((top - corners) * to_edge).imag
+    area = (length * height).clip(min=0)
+    smallest = angles[area <= area.min() * (1 + _TIE)] % (np.pi / 2)
+    return float(np.where(smallest < np.pi / 2 - _TIE, smallest, smallest - np.pi / 2).min())
 
 
-def _extremes(segments: Segments, u: Tensor, v: Tensor, angles: Sequence[float]) -> Tensor:
-    """Return the places of the points that reach farthest along and against directions."""
-    places = []
-    for angle in angles:
-        reach = u * math.cos(angle) + v * math.sin(angle)
-        places += [
-            segments.first_of_each(reach == segments.spread(bound))
-            for bound in segments.bounds(reach)
-        ]
-    return torch.stack(places, dim=1)
+def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
+    """Return the corners of the convex hull, counter-clockwise; the two ends of a line."""
+    from scipy.spatial import ConvexHull, QhullError
 
-
-def _least_reach(u: Tensor, v: Tensor, angles: Sequence[float]) -> Tensor:
-    """Return how far some points reach along that direction, or against, where it is least."""
-    reach = [u * math.cos(angle) + v * math.sin(angle) for angle in angles]
-    ends = [bound for along in reach for bound in (along.amax(dim=1), -along.amin(dim=1))]
-    return torch.stack(ends).amin(dim=0)
-
-
-def _best_turn(u: Tensor, v: Tensor) -> Tensor:
-    """Return the angle of least area in [0, 90) degrees, in radians, shape ``(M,)``."""
-    best = torch.zeros(len(u), dtype=u.dtype, device=u.device)
-    for step, reach in ((_COARSE_STEP_DEG, 90.0), (_FINE_STEP_DEG, _COARSE_STEP_DEG)):
-        start = best.clone()
-        least = torch.full_like(best, math.inf)
-        for place in range(-round(reach / step) + 1, round(reach / step)):
-            if reach == 90.0 and place < 0:
-                continue
-            turn = start + math.radians(place * step)
-            cosine, sine = turn.cos()[:, None], turn.sin()[:, None]
-            one, other = u * cosine + v * sine, v * cosine - u * sine
-            area = (one.amax(1) - one.amin(1)) * (other.amax(1) - other.amin(1))
-            best = torch.where(area < least, turn, best)
-            least = torch.minimum(least, area)
-    return best
+    try:
+        corners: NDArray[np.integer] = ConvexHull(places).vertices
+    except QhullError:
+        corners = np.lexsort(places.T)[[0, -1]]
+    return corners
 
 
 _POINTS_PER_CELL = 9.0
@@ -126,7 +106,7 @@ _NUM_DOUBLINGS = 4
 _SETTLED = 1.05
 """Cells are wide enough when cells twice as wide give less than this times the area."""
 
-_TURN = math.radians(28.0)
+_CELL_ANGLE = math.radians(28.0)
 """Angle between cells and rectangle: along a parallel edge all cells would be cut alike."""
 
 
@@ -159,22 +139,14 @@ def covered_areas(
     Returns:
         Areas, shape ``(M,)``, 0 where the points are on one line; and the width of cells that
         leaves no holes between points, shape ``(M,)``.
-
-    Example:
-        >>> from torchrg.regions.measures import fit_rectangles
-        >>> u, v = torch.cartesian_prod(torch.arange(60.0), torch.arange(60.0)).unbind(1)
-        >>> segments = Segments(torch.zeros(3600, dtype=torch.int64))
-        >>> area, width = covered_areas(segments, u, v, fit_rectangles(segments, u, v))
-        >>> bool((area - 60 * 60).abs() < 150)
-        True
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()
     # A strip thinner than the spacing would have more cells than points.
     size = torch.maximum(size, boxes.sides[:, 0] / segments.counts)
     cosine, sine = boxes.directions[:, 0].unbind(dim=1)
-    c = segments.spread(cosine * math.cos(_TURN) - sine * math.sin(_TURN))
-    s = segments.spread(sine * math.cos(_TURN) + cosine * math.sin(_TURN))
+    c = segments.spread(cosine * math.cos(_CELL_ANGLE) - sine * math.sin(_CELL_ANGLE))
+    s = segments.spread(sine * math.cos(_CELL_ANGLE) + cosine * math.sin(_CELL_ANGLE))
     row = _numbered(segments, u * c + v * s, size)
     column = _numbered(segments, v * c - u * s, size)
     cells = _occupied(segments.labels, row, column, len(size))
@@ -257,16 +229,8 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
 
     Raises:
         MissingDependencyError: If shapely is not installed.
-
-    Example:
-        >>> grid = np.stack(np.mgrid[:30, :30], axis=-1).reshape(-1, 2).astype(float)
-        >>> frame = grid[((grid < 10) | (grid >= 20)).any(axis=1)]
-        >>> outer, hole = trace_outline(frame, 3.0)
-        >>> sorted(map(tuple, outer.tolist()))
-        [(0.0, 0.0), (0.0, 29.0), (29.0, 0.0), (29.0, 29.0)]
-        >>> float(hole.min()), float(hole.max())
-        (9.0, 20.0)
     """
+    from scipy.ndimage import binary_erosion
     from scipy.spatial import Delaunay, QhullError
 
     shapely = require("shapely", extra="outline", purpose="trace outlines")
@@ -275,7 +239,8 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
     occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
     occupied[tuple(cells.T)] = True
-    corners = places[~_is_inside(occupied)[tuple(cells.T)]]
+    inside = binary_erosion(occupied, np.ones((3, 3), dtype=bool))
+    corners = places[~inside[tuple(cells.T)]]
     try:
         triangles = corners[Delaunay(corners).simplices]
     except (QhullError, ValueError):
@@ -286,18 +251,6 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
     shape = shapely.union_all(shapely.polygons(triangles[covered]))
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
-
-
-def _is_inside(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which cells have eight occupied neighbours; the border has none."""
-    inside = np.zeros_like(occupied)
-    inner = np.ones_like(occupied[1:-1, 1:-1])
-    height, length = occupied.shape
-    for i in range(3):
-        for j in range(3):
-            inner &= occupied[i : height - 2 + i, j : length - 2 + j]
-    inside[1:-1, 1:-1] = inner
-    return inside
 
 
 def _rings(shapely: Any, shape: Any, min_area: float) -> list[Ring]:  # noqa: ANN401

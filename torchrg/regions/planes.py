@@ -1,4 +1,4 @@
-"""The plane table: one plane fitted to each region."""
+"""The plane table: one plane fitted to each region, measured and classified."""
 
 import json
 import math
@@ -22,14 +22,30 @@ from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 _BISQUARE_CUT = 4.685
 """Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
 
-_NUM_ROUNDS = 4
+_NUM_FITS = 4
+"""So many reweighted fits settle the plane."""
+
 _FLAT_RATIO = 4.0
 """Where one variance is not this many times the next smaller one, rounding and noise decide between
 their directions."""
 
-
 _SAME_MAGNITUDE = 1e-6
 """Components of a normal that differ by less than this share are equal but for rounding."""
+
+_CURVED_SPREAD_DEG = 8.0
+"""A smooth bend by three to four times this angle has this spread."""
+
+_MAX_TILT_DEG = 15.0
+"""A floor or ceiling is within this angle of horizontal, a wall of vertical."""
+
+_END_SHARE = 0.15
+"""A floor lies in this lowest share of the cloud's height, a ceiling in the highest."""
+
+_LEAST_AREA_SHARE = 0.1
+"""A floor or ceiling has at least this share of the largest horizontal plane's area."""
+
+_LEAST_WALL_SHARE = 0.5
+"""A wall reaches over at least this share of the cloud's height."""
 
 
 class FittedPlanes(NamedTuple):
@@ -42,6 +58,8 @@ class FittedPlanes(NamedTuple):
         covariance: Weighted covariance, shape ``(M, 3, 3)``.
         thickness: Robust standard deviation of the points from the plane, shape ``(M,)``.
         residuals: Signed distance of each point, in the order of :meth:`Segments.take`.
+        num_points: Number of points, shape ``(M,)``, int64.
+        curved: Whether the points' normals are spread too much for a plane, shape ``(M,)``, bool.
     """
 
     normal: Tensor
@@ -50,163 +68,8 @@ class FittedPlanes(NamedTuple):
     covariance: Tensor
     thickness: Tensor
     residuals: Tensor
-
-
-def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPlanes:
-    r"""Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
-
-    The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
-    (1.4826 times their median), so that points of another surface do not tilt the plane.
-
-    Args:
-        segments: The regions.
-        points: Points, shape ``(N, 3)``.
-        normals: Unit normals of any sign, shape ``(N, 3)``: they decide where points do not, in
-            regions of one or two points or along a line.
-
-    Returns:
-        The planes. The normal's component of largest magnitude, of equal ones the last, is
-        positive.
-
-    References:
-        [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
-
-    Example:
-        >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [0.5, 0.5, 2.5]])
-        >>> segments = Segments(torch.zeros(5, dtype=torch.int64))
-        >>> fit_planes(segments, points, torch.eye(3)[[2] * 5]).normal.tolist()
-        [[0.0, 0.0, 1.0]]
-    """
-    usual = shared_moments(segments, normals)[1][:, :, 2]
-    origin = segments.first(points).double()
-    starts = segments.spread_columns(origin)
-    local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
-    resolution = coordinate_resolution(segments.first(points)).double()
-    weights = torch.ones_like(local[0])
-    for last in range(_NUM_ROUNDS):
-        mean = _means(segments, local, weights)
-        middle = segments.spread_columns(mean)
-        centered = [x - m for x, m in zip(local, middle, strict=True)]
-        covariance = _covariances(segments, centered, weights)
-        variances, axes = eigh3_of_few(covariance)
-        normal = _with_sign(_plane_normals(variances, axes, usual))
-        residuals = sum_of_products(centered, segments.spread_columns(normal))
-        thickness = MAD_FACTOR * segments.median(residuals.abs())
-        if last == _NUM_ROUNDS - 1:
-            break
-        cut = _BISQUARE_CUT * torch.maximum(thickness, resolution)
-        # A region of one place at the origin has cut 0: its residuals are 0 too.
-        ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
-        weights = (1 - ratio * ratio).clamp(min=0).square()
-    along = axes[:, :, 2]
-    return FittedPlanes(normal, origin + mean, along, covariance, thickness, residuals)
-
-
-def sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
-    """Return the scalar products of vectors given by columns."""
-    (a, b, c), (x, y, z) = first, second
-    return a * x + b * y + c * z
-
-
-def shared_moments(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Return eigenvalues and eigenvectors of the normals' second moments, in ascending order.
-
-    The last eigenvector is the direction that the normals of a region share, signs aside.
-    """
-    columns = segments.take_columns(normals)
-    return eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
-
-
-def _means(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
-    """Return weighted means, shape ``(M, 3)``."""
-    total = segments.sum(weights)
-    return torch.stack([segments.sum(column * weights) / total for column in columns], dim=1)
-
-
-def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
-    """Return weighted second moments about zero, shape ``(M, 3, 3)``."""
-    return second_moments(columns, weights, segments.sum, segments.sum(weights))
-
-
-def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
-    """Return the normals of planes, from the points' own normals where the points give none."""
-    low, middle, high = variances.unbind(dim=1)
-    along = axes[:, :, 2]
-    is_line = high > _FLAT_RATIO * middle
-    component = (usual * along).sum(dim=1, keepdim=True) * along
-    across = usual - torch.where(is_line[:, None], component, 0.0)
-    length = across.norm(dim=1, keepdim=True)
-    across = torch.where(length > 0, across / length, axes[:, :, 0])
-    is_flat = middle > _FLAT_RATIO * low
-    return torch.where(is_flat[:, None], axes[:, :, 0], across)
-
-
-def _with_sign(normals: Tensor) -> Tensor:
-    """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
-    magnitudes = normals.abs()
-    near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)
-    last = 2 - near.flip(1).to(torch.uint8).argmax(dim=1, keepdim=True)
-    return torch.where(normals.gather(1, last) < 0, -normals, normals)
-
-
-_MAX_TILT_DEG = 15.0
-_END_SHARE = 0.15
-"""A floor lies in this lowest share of the cloud's height, a ceiling in the highest."""
-
-_LEAST_AREA_SHARE = 0.1
-"""A floor or ceiling has at least this share of the largest horizontal plane's area."""
-
-_LEAST_WALL_SHARE = 0.5
-"""A wall reaches over at least this share of the cloud's height."""
-
-
-def classify_planes(planes: Planes, up: Tensor) -> Tensor:
-    """Return a simple class for each plane.
-
-    A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
-    planes take up, a ceiling in the highest, if it is not small beside the largest horizontal one.
-    A plane within 15 degrees of vertical is a wall if it takes up half of that height. What is
-    left, and what is curved, is "other". A single horizontal plane is a floor.
-
-    Args:
-        planes: The plane table.
-        up: The upward direction, shape ``(3,)``.
-
-    Returns:
-        Places in :data:`torchrg.structures.PLANE_KINDS`, shape ``(M,)``, int64.
-
-    Example:
-        >>> from torchrg.regions.planes import summarize_planes
-        >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
-        >>> cloud = torch.cat([grid, grid[:, [2, 1, 0]], grid + torch.tensor([0.0, 0, 19])])
-        >>> normals = torch.eye(3)[[2, 0, 2]].repeat_interleave(400, dim=0)
-        >>> planes = summarize_planes(cloud, normals, torch.arange(3).repeat_interleave(400))
-        >>> [PLANE_KINDS[kind] for kind in classify_planes(planes, torch.tensor([0.0, 0, 1]))]
-        ['floor', 'wall', 'ceiling']
-    """
-    other, floor, ceiling, wall = (
-        PLANE_KINDS.index(name) for name in ("other", "floor", "ceiling", "wall")
-    )
-    kind = torch.full_like(planes.count, other)
-    if len(kind) == 0:
-        return kind
-    up = up.to(planes.normal.dtype) / up.to(planes.normal.dtype).norm()
-    steepness = (planes.normal * up).sum(dim=1).abs()
-    height = (planes.center * up).sum(dim=1)
-    reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2
-    low, high = (height - reach).amin(), (height + reach).amax()
-    level = ~planes.curved & (steepness >= math.cos(math.radians(_MAX_TILT_DEG)))
-    largest = torch.where(level, planes.area, 0).amax()
-    broad = level & (planes.area >= _LEAST_AREA_SHARE * largest)
-    upright = ~planes.curved & (steepness <= math.sin(math.radians(_MAX_TILT_DEG)))
-    kind[upright & (2 * reach >= _LEAST_WALL_SHARE * (high - low))] = wall
-    kind[broad & (height >= high - _END_SHARE * (high - low))] = ceiling
-    kind[broad & (height <= low + _END_SHARE * (high - low))] = floor
-    return kind
-
-
-_CURVED_SPREAD_DEG = 8.0
-"""A smooth bend by three to four times this angle has this spread."""
+    num_points: Tensor
+    curved: Tensor
 
 
 def summarize_planes(
@@ -258,10 +121,9 @@ def summarize_planes(
     centered = [place - center for place, center in zip(places, centers, strict=True)]
     u, v = (sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
     boxes = fit_rectangles(segments, u, v)
+    area, width = covered_areas(segments, u, v, boxes)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)
     axes = boxes.directions @ torch.stack([first, second], dim=1)
-
-    area, width = covered_areas(segments, u, v, boxes)
 
     def own(values: Tensor) -> Tensor:
         return values.to(points.dtype)
@@ -271,60 +133,41 @@ def summarize_planes(
         offset=own((fit.center * fit.normal).sum(dim=1)),
         centroid=own(fit.center + mean),
         area=own(area),
-        count=segments.counts,
+        count=fit.num_points,
         rms=own(segments.mean(fit.residuals * fit.residuals).sqrt()),
         extent=own(boxes.sides),
         axes=own(axes),
         center=own(fit.center + (boxes.center[:, None] @ axes).squeeze(1)),
-        curved=are_curved(segments, normals),
+        curved=fit.curved,
     )
     if up is not None:
-        planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
+        planes = planes._replace(kind=_classify(planes, _direction(up, points)))
     if outline:
         frame = (fit.center, first, second)
         planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
     if neighbors is not None:
         found = find_adjacency(
-            points, labels, neighbors, fit.normal, fit.thickness, curved=planes.curved
+            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
         lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
     return planes
 
 
-def are_curved(segments: Segments, normals: Tensor) -> Tensor:
-    """Tell regions whose normals turn from flat ones.
-
-    Args:
-        segments: The regions.
-        normals: Unit normals, shape ``(N, 3)``.
-
-    Returns:
-        Shape ``(M,)``, bool.
-
-    Example:
-        >>> are_curved(Segments(torch.tensor([0, 0, 1])), torch.eye(3))
-        tensor([ True, False])
-    """
-    return normal_spread_deg(segments, normals) > _CURVED_SPREAD_DEG
+def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
+    """Return two unit directions that span each plane, the first along the region."""
+    first = _without(fit.along, fit.normal)
+    # The points of one place have no direction of their own: any in the plane will do.
+    least = fit.normal.abs().argmin(dim=1)
+    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
+    first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
+    first = first / first.norm(dim=1, keepdim=True)
+    return first, torch.linalg.cross(fit.normal, first)
 
 
-def normal_spread_deg(segments: Segments, normals: Tensor) -> Tensor:
-    """Return the root mean square angle of normals to the direction they share, signs aside.
-
-    Args:
-        segments: The regions.
-        normals: Unit normals, shape ``(N, 3)``.
-
-    Returns:
-        Degrees, shape ``(M,)``: of an arc of 30 degrees 8.7, of a full column 45.
-
-    Example:
-        >>> normal_spread_deg(Segments(torch.zeros(2, dtype=torch.int64)), torch.eye(3)[:2])
-        tensor([45.0000], dtype=torch.float64)
-    """
-    shared = shared_moments(segments, normals)[0][:, 2]
-    return (1 - shared).clamp(min=0, max=1).sqrt().asin().rad2deg()
+def _without(vectors: Tensor, normals: Tensor) -> Tensor:
+    """Return vectors less their component along the normals."""
+    return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
 
 
 def _direction(up: Sequence[float], points: Tensor) -> Tensor:
@@ -335,6 +178,143 @@ def _direction(up: Sequence[float], points: Tensor) -> Tensor:
             f"summarize_planes: expected up to be three numbers, not all zero, got {up!r}."
         )
     return direction
+
+
+def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPlanes:
+    r"""Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
+
+    The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
+    (1.4826 times their median), so that points of another surface do not tilt the plane.
+
+    Args:
+        segments: The regions.
+        points: Points, shape ``(N, 3)``.
+        normals: Unit normals of any sign, shape ``(N, 3)``: they decide where points do not, in
+            regions of one or two points or along a line.
+
+    Returns:
+        The planes. The normal's component of largest magnitude, of equal ones the last, is
+        positive.
+
+    References:
+        [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [0.5, 0.5, 2.5]])
+        >>> segments = Segments(torch.zeros(5, dtype=torch.int64))
+        >>> fit_planes(segments, points, torch.eye(3)[[2] * 5]).normal.tolist()
+        [[0.0, 0.0, 1.0]]
+    """
+    shares, directions = shared_moments(segments, normals)
+    usual, curved = directions[:, :, 2], _spread_deg(shares[:, 2]) > _CURVED_SPREAD_DEG
+    origin = segments.first(points).double()
+    starts = segments.spread_columns(origin)
+    local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
+    resolution = coordinate_resolution(segments.first(points)).double()
+    weights = torch.ones_like(local[0])
+    for last in range(_NUM_FITS):
+        mean = _means(segments, local, weights)
+        middle = segments.spread_columns(mean)
+        centered = [x - m for x, m in zip(local, middle, strict=True)]
+        covariance = _covariances(segments, centered, weights)
+        variances, axes = eigh3_of_few(covariance)
+        normal = _with_sign(_plane_normals(variances, axes, usual))
+        residuals = sum_of_products(centered, segments.spread_columns(normal))
+        thickness = MAD_FACTOR * segments.median(residuals.abs())
+        if last == _NUM_FITS - 1:
+            break
+        cut = _BISQUARE_CUT * torch.maximum(thickness, resolution)
+        # A region of one place at the origin has cut 0: its residuals are 0 too.
+        ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
+        weights = (1 - ratio * ratio).clamp(min=0).square()
+    along = axes[:, :, 2]
+    center, sizes = origin + mean, segments.counts
+    return FittedPlanes(normal, center, along, covariance, thickness, residuals, sizes, curved)
+
+
+def _spread_deg(share: Tensor) -> Tensor:
+    """Return the root mean square angle of normals to the direction they share, signs aside.
+
+    From the largest eigenvalue of their second moments, shape ``(M,)``: of an arc of 30 degrees
+    8.7, of a full column 45.
+    """
+    return (1 - share).clamp(min=0, max=1).sqrt().asin().rad2deg()
+
+
+def sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
+    """Return the scalar products of vectors given by columns."""
+    (a, b, c), (x, y, z) = first, second
+    return a * x + b * y + c * z
+
+
+def shared_moments(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return eigenvalues and eigenvectors of the normals' second moments, in ascending order.
+
+    The last eigenvector is the direction that the normals of a region share, signs aside.
+    """
+    columns = segments.take_columns(normals)
+    return eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
+
+
+def _means(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
+    """Return weighted means, shape ``(M, 3)``."""
+    total = segments.sum(weights)
+    return torch.stack([segments.sum(column * weights) / total for column in columns], dim=1)
+
+
+def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
+    """Return weighted second moments about zero, shape ``(M, 3, 3)``."""
+    return second_moments(columns, weights, segments.sum, segments.sum(weights))
+
+
+def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
+    """Return the normals of planes, from the points' own normals where the points give none."""
+    low, middle, high = variances.unbind(dim=1)
+    along = axes[:, :, 2]
+    is_line = high > _FLAT_RATIO * middle
+    component = (usual * along).sum(dim=1, keepdim=True) * along
+    across = usual - torch.where(is_line[:, None], component, 0.0)
+    length = across.norm(dim=1, keepdim=True)
+    across = torch.where(length > 0, across / length, axes[:, :, 0])
+    is_flat = middle > _FLAT_RATIO * low
+    return torch.where(is_flat[:, None], axes[:, :, 0], across)
+
+
+def _with_sign(normals: Tensor) -> Tensor:
+    """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
+    magnitudes = normals.abs()
+    near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)
+    last = 2 - near.flip(1).to(torch.uint8).argmax(dim=1, keepdim=True)
+    return torch.where(normals.gather(1, last) < 0, -normals, normals)
+
+
+def _classify(planes: Planes, up: Tensor) -> Tensor:
+    """Return a simple class for each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
+
+    A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
+    planes take up, a ceiling in the highest, if it is not small beside the largest horizontal one.
+    A plane within 15 degrees of vertical is a wall if it takes up half of that height. What is
+    left, and what is curved, is "other". A single horizontal plane is a floor.
+    """
+    other, floor, ceiling, wall = (
+        PLANE_KINDS.index(name) for name in ("other", "floor", "ceiling", "wall")
+    )
+    kind = torch.full_like(planes.count, other)
+    if len(kind) == 0:
+        return kind
+    up = up.to(planes.normal.dtype) / up.to(planes.normal.dtype).norm()
+    steepness = (planes.normal * up).sum(dim=1).abs()
+    height = (planes.center * up).sum(dim=1)
+    reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2
+    low, high = (height - reach).amin(), (height + reach).amax()
+    level = ~planes.curved & (steepness >= math.cos(math.radians(_MAX_TILT_DEG)))
+    largest = torch.where(level, planes.area, 0).amax()
+    broad = level & (planes.area >= _LEAST_AREA_SHARE * largest)
+    upright = ~planes.curved & (steepness <= math.sin(math.radians(_MAX_TILT_DEG)))
+    kind[upright & (2 * reach >= _LEAST_WALL_SHARE * (high - low))] = wall
+    kind[broad & (height >= high - _END_SHARE * (high - low))] = ceiling
+    kind[broad & (height <= low + _END_SHARE * (high - low))] = floor
+    return kind
 
 
 def _outlines(
@@ -358,36 +338,6 @@ def _outlines(
     return tuple(outlines)
 
 
-def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
-    """Return two unit directions that span each plane, the first along the region."""
-    first = _without(fit.along, fit.normal)
-    # The points of one place have no direction of their own: any in the plane will do.
-    least = fit.normal.abs().argmin(dim=1)
-    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
-    first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
-    first = first / first.norm(dim=1, keepdim=True)
-    return first, torch.linalg.cross(fit.normal, first)
-
-
-def _without(vectors: Tensor, normals: Tensor) -> Tensor:
-    """Return vectors less their component along the normals."""
-    return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
-
-
-_COLUMNS = (
-    "normal",
-    "offset",
-    "centroid",
-    "area",
-    "count",
-    "rms",
-    "extent",
-    "axes",
-    "center",
-    "curved",
-)
-
-
 def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
     """Return the plane table as one mapping for each plane, for ``pandas.DataFrame(rows)``.
 
@@ -408,8 +358,9 @@ def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
         >>> rows[0]["label"], rows[0]["count"], rows[0]["curved"]
         (0, 3, True)
     """
-    columns = {name: getattr(planes, name).tolist() for name in _COLUMNS}
-    rows = [
+    names = [name for name in planes._fields if name not in planes._field_defaults]
+    columns = {name: getattr(planes, name).tolist() for name in names}
+    rows: list[dict[str, Any]] = [
         {"label": label, **{name: values[label] for name, values in columns.items()}}
         for label in range(len(planes.offset))
     ]
@@ -421,7 +372,7 @@ def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
         if planes.adjacency is not None:
             row["neighbors"] = []
     if planes.adjacency is not None:
-        for (a, b), *values in zip(*(_as_list(part) for part in planes.adjacency), strict=True):
+        for (a, b), *values in zip(*(part.tolist() for part in planes.adjacency), strict=True):
             found = dict(zip(("boundary_length", "dihedral_deg"), values, strict=True))
             rows[a]["neighbors"].append({"plane": b, **found})
             rows[b]["neighbors"].append({"plane": a, **found})
@@ -445,8 +396,3 @@ def planes_to_json(planes: Planes) -> str:
         3
     """
     return json.dumps({"planes": planes_to_rows(planes)})
-
-
-def _as_list(values: Tensor) -> list[Any]:
-    listed: list[Any] = values.tolist()
-    return listed

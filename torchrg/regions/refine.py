@@ -1,4 +1,4 @@
-"""What happens to regions after growth: release, absorption, merging."""
+"""What settings may ask for after growth: release, absorption, merging."""
 
 import heapq
 from typing import NamedTuple
@@ -10,10 +10,73 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
-from torchrg.regions.criteria import neighborhood_radii
-from torchrg.regions.edges import GrowingCloud
-from torchrg.regions.planes import FittedPlanes, are_curved, fit_planes
+from torchrg.regions.criteria import GrowingCloud, neighborhood_radii
+from torchrg.regions.planes import FittedPlanes, fit_planes
 from torchrg.structures import UNLABELED, Neighbors
+
+_LEAST_CONTACTS = 3
+"""Regions that touch in fewer points are not merged: one may be an outlier's."""
+
+
+def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
+    """Apply the steps after growth that the settings ask for.
+
+    Args:
+        cloud: The cloud, in canonical order.
+        labels: Region of each point, shape ``(N,)``: 0 to M-1 or :data:`torchrg.UNLABELED`.
+        config: Settings.
+
+    Returns:
+        Regions, shape ``(N,)``, numbered below M, perhaps with gaps.
+    """
+    if not bool((labels >= 0).any()):
+        return labels
+    if config.max_plane_residual is not None:
+        fit, floor = _fit(cloud, labels, config)
+        limit = config.max_plane_residual * torch.maximum(fit.thickness, floor)
+        segments = Segments(labels)
+        far = fit.residuals.abs() > segments.spread(limit)
+        labels = labels.index_fill(0, segments.rows[far], UNLABELED)
+    if config.absorb:
+        fit, floor = _fit(cloud, labels, config)
+        labels = absorb_points(
+            cloud.points,
+            cloud.normals,
+            labels,
+            cloud.neighbors,
+            (fit.normal, fit.center, reach_of_planes(fit, floor, config.absorb_reach)),
+            valid=cloud.valid,
+            max_angle_deg=config.absorb_angle_deg,
+        )
+    if config.merge_coplanar:
+        fit, floor = _fit(cloud, labels, config)
+        labels = merge_coplanar(
+            labels, cloud.neighbors, fit, floor, tolerance=config.merge_tolerance
+        )
+    return labels
+
+
+def _fit(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> tuple[FittedPlanes, Tensor]:
+    """Return the planes of the regions, and the least thickness of each, shape ``(M,)``.
+
+    The least is the floor of the coplanarity test: a fraction of the median neighbourhood's radius.
+    """
+    segments = Segments(labels)
+    fit = fit_planes(segments, cloud.points, cloud.normals)
+    radii = neighborhood_radii(cloud.points, cloud.neighbors)
+    radius = segments.median(segments.take(radii)).double()
+    return fit, config.coplanarity_floor * radius
+
+
+def reach_of_planes(fit: FittedPlanes, floor: Tensor, factor: float) -> Tensor:
+    """Return how far from its plane a point may join a region: NaN, not at all, if it is curved.
+
+    Args:
+        fit: Planes of the regions.
+        floor: Least thickness of each, shape ``(M,)``.
+        factor: So many times the thickness.
+    """
+    return torch.where(fit.curved, torch.nan, factor * torch.maximum(fit.thickness, floor))
 
 
 def absorb_points(
@@ -30,8 +93,8 @@ def absorb_points(
 
     A point may join a region when one of its 8 nearest neighbours belongs to it, its distance to
     the region's plane is within reach, and its normal is within the angle of the plane's. Of
-    several regions it joins the one whose plane is nearest. Points that joined in one round are
-    neighbours in the next.
+    several regions it joins the one whose plane is nearest. Points that joined are neighbours of
+    the next.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -63,8 +126,7 @@ def absorb_points(
     limit = deg_to_sq_chord(max_angle_deg)
     waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
     while len(waiting):
-        near = labels[nearest[waiting]]
-        near = torch.where(counted[waiting], near, UNLABELED)
+        near = torch.where(counted[waiting], labels[nearest[waiting]], UNLABELED)
         touches = (near >= 0).any(dim=1)
         rows, near = waiting[touches], near[touches]
         if len(rows) == 0:
@@ -86,15 +148,44 @@ def absorb_points(
     return labels
 
 
-_LEAST_CONTACTS = 3
+def merge_coplanar(
+    labels: Tensor, neighbors: Neighbors, fit: FittedPlanes, floor: Tensor, *, tolerance: float
+) -> Tensor:
+    """Merge flat regions that touch and lie on one plane, the pair that fits best first.
+
+    Two regions are merged when one plane explains both: the root mean square distance of either to
+    the plane through both is at most ``tolerance`` times what it is to its own. What is merged is
+    one region from then on.
+
+    Args:
+        labels: Region of each point, shape ``(N,)``: 0 to M-1 or :data:`torchrg.UNLABELED`.
+        neighbors: Neighbours of each point.
+        fit: Planes of the regions.
+        floor: Least distance to its own plane that counts for a region, shape ``(M,)``.
+        tolerance: See above.
+
+    Returns:
+        Labels, shape ``(N,)``: of each region the smallest of those it is merged with.
+    """
+    pairs, num_contacts = count_contacts(labels, neighbors)
+    pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].any(dim=1)]
+    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
+    moments = _Moments(
+        fit.num_points.double(),
+        fit.center - fit.center[:1],
+        fit.covariance,
+        torch.maximum(own.clamp(min=0).sqrt(), floor),
+    )
+    owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
+    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
 
 
-class Moments(NamedTuple):
-    """What merging reads of each of M regions.
+class _Moments(NamedTuple):
+    """What merging reads of M regions, in float64.
 
     Attributes:
         weight: Number of points, shape ``(M,)``.
-        mean: Mean of the points, shape ``(M, 3)``.
+        mean: Mean of the points, about an origin near them, shape ``(M, 3)``.
         covariance: Covariance of the points, shape ``(M, 3, 3)``.
         scale: Distance from its plane that counts as lying on it, shape ``(M,)``.
     """
@@ -104,46 +195,24 @@ class Moments(NamedTuple):
     covariance: Tensor
     scale: Tensor
 
+    def at(self, rows: Tensor | slice) -> "_Moments":
+        """Return those of some of the regions."""
+        return _Moments(*(values[rows] for values in self))
 
-def merge_coplanar(
-    moments: Moments, pairs: Tensor, num_contacts: Tensor, *, tolerance: float
-) -> Tensor:
-    """Merge regions pair by pair, the pair that fits best first.
 
-    Two regions are merged when one plane explains both: the root mean square distance of either to
-    the plane through both is at most ``tolerance`` times its own scale. What is merged is one
-    region from then on.
-
-    Args:
-        moments: The regions, in float64, about an origin near them.
-        pairs: Pairs of regions that touch, shape ``(E, 2)``.
-        num_contacts: Number of points that touch, shape ``(E,)``; less than three do not count.
-        tolerance: See above.
-
-    Returns:
-        For each region the smallest of those it is merged with, shape ``(M,)``, int64.
-
-    Example:
-        >>> flat = torch.diag(torch.tensor([1.0, 1, 1e-6]).double()).expand(3, 3, 3)
-        >>> mean = torch.tensor([[0.0, 0, 0], [4, 0, 0], [8, 0, 1]]).double()
-        >>> regions = Moments(torch.ones(3).double(), mean, flat, torch.full((3,), 1e-3).double())
-        >>> pairs, contacts = torch.tensor([[0, 1], [1, 2]]), torch.tensor([9, 9])
-        >>> merge_coplanar(regions, pairs, contacts, tolerance=1.2).tolist()
-        [0, 0, 2]
-    """
-    groups = [_row(moments, i) for i in range(len(moments.weight))]
+def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
+    """Return for each region the smallest of those that it is merged with."""
+    groups = [moments.at(slice(i, i + 1)) for i in range(len(moments.weight))]
     touching: list[set[int]] = [set() for _ in groups]
-    owner = list(range(len(groups)))
-    pairs = pairs[num_contacts >= _LEAST_CONTACTS]
-    misfits = _misfit(_select(moments, pairs[:, 0]), _select(moments, pairs[:, 1]))
+    owner, age = list(range(len(groups))), [0] * len(groups)
     queue = []
+    misfits = _misfit(moments.at(pairs[:, 0]), moments.at(pairs[:, 1]))
     for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
         touching[a].add(b)
         touching[b].add(a)
         if misfit <= tolerance:
             queue.append((misfit, a, b, 0, 0))
     heapq.heapify(queue)
-    age = [0] * len(groups)
     while queue:
         _, a, b, age_a, age_b = heapq.heappop(queue)
         if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
@@ -151,33 +220,25 @@ def merge_coplanar(
         groups[a] = _joined(groups[a], groups[b])
         owner[b] = a
         age[a] += 1
-        touching[a] |= touching[b]
-        touching[a] = {_root(owner, c) for c in touching[a]} - {a}
+        touching[a] = {_root(owner, c) for c in touching[a] | touching[b]} - {a}
         for c in touching[a]:
             touching[c].add(a)
             first, second = min(a, c), max(a, c)
             misfit = float(_misfit(groups[first], groups[second]))
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, first, second, age[first], age[second]))
-    return torch.tensor([_root(owner, i) for i in range(len(owner))], dtype=torch.int64)
+    return [_root(owner, i) for i in range(len(owner))]
 
 
 def _root(owner: list[int], i: int) -> int:
+    """Return the region that region i has become part of."""
     while owner[i] != i:
         owner[i] = owner[owner[i]]
         i = owner[i]
     return i
 
 
-def _select(moments: Moments, rows: Tensor) -> Moments:
-    return Moments(*(values[rows] for values in moments))
-
-
-def _row(moments: Moments, i: int) -> Moments:
-    return Moments(*(values[i : i + 1] for values in moments))
-
-
-def _joined(a: Moments, b: Moments) -> Moments:
+def _joined(a: _Moments, b: _Moments) -> _Moments:
     """Return the moments of two sets of regions, taken together one by one."""
     weight = a.weight + b.weight
     share_a, share_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
@@ -187,10 +248,10 @@ def _joined(a: Moments, b: Moments) -> Moments:
         shift = part.mean - mean
         spread = part.covariance + shift[:, :, None] * shift[:, None, :]
         covariance = covariance + share[:, :, None] * spread
-    return Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale))
+    return _Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale))
 
 
-def _misfit(a: Moments, b: Moments) -> Tensor:
+def _misfit(a: _Moments, b: _Moments) -> Tensor:
     """Return how far from the joint plane the worse of two regions is, in its own scales."""
     both = _joined(a, b)
     normal = eigh3_of_few(both.covariance)[1][:, :, 0]
@@ -201,85 +262,3 @@ def _misfit(a: Moments, b: Moments) -> Tensor:
         rms = (own.clamp(min=0) + shift * shift).sqrt()
         misfits.append(torch.where(rms > 0, rms / part.scale, 0.0))
     return torch.maximum(*misfits)
-
-
-def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
-    """Apply the steps after growth that the settings ask for.
-
-    Args:
-        cloud: The cloud, in canonical order.
-        labels: Region of each point, shape ``(N,)``: 0 to M-1 or :data:`torchrg.UNLABELED`.
-        config: Settings.
-
-    Returns:
-        Regions, shape ``(N,)``, numbered below M, perhaps with gaps.
-    """
-    if not bool((labels >= 0).any()):
-        return labels
-    if config.max_plane_residual is not None:
-        labels = _release(cloud, labels, config, config.max_plane_residual)
-    if config.absorb:
-        labels = _absorb(cloud, labels, config)
-    if config.merge_coplanar:
-        labels = _merge(cloud, labels, config)
-    return labels
-
-
-def _release(
-    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, max_residual: float
-) -> Tensor:
-    """Take away the label of points far from the plane of their region."""
-    segments, fit, floor = _planes_of(cloud, labels, config)
-    scale = torch.maximum(fit.thickness, floor)
-    far = fit.residuals.abs() > max_residual * segments.spread(scale)
-    return labels.index_fill(0, segments.rows[far], UNLABELED)
-
-
-def _absorb(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
-    """Give unlabelled points to the flat regions that they touch and whose plane they are on."""
-    segments, fit, floor = _planes_of(cloud, labels, config)
-    reach = config.absorb_reach * torch.maximum(fit.thickness, floor)
-    reach = torch.where(are_curved(segments, cloud.normals), torch.nan, reach)
-    return absorb_points(
-        cloud.points,
-        cloud.normals,
-        labels,
-        cloud.neighbors,
-        (fit.normal, fit.center, reach),
-        valid=cloud.valid,
-        max_angle_deg=config.absorb_angle_deg,
-    )
-
-
-def _merge(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
-    """Merge flat regions that touch and lie on one plane."""
-    segments, fit, floor = _planes_of(cloud, labels, config)
-    pairs, num_contacts = count_contacts(labels, cloud.neighbors)
-    curved = are_curved(segments, cloud.normals)
-    flat = ~curved[pairs].any(dim=1)
-    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
-    moments = Moments(
-        segments.counts.double(),
-        fit.center - fit.center[:1],
-        fit.covariance,
-        torch.maximum(own.clamp(min=0).sqrt(), floor),
-    )
-    owner = merge_coplanar(
-        moments, pairs[flat], num_contacts[flat], tolerance=config.merge_tolerance
-    )
-    owner = torch.cat([owner.to(labels.device), labels.new_tensor([UNLABELED])])
-    return owner[labels]
-
-
-def _planes_of(
-    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig
-) -> tuple[Segments, FittedPlanes, Tensor]:
-    """Return regions, their planes, and the least thickness of each, shape ``(M,)``.
-
-    The least is the floor of the coplanarity test: a fraction of the median neighbourhood's radius.
-    """
-    segments = Segments(labels)
-    fit = fit_planes(segments, cloud.points, cloud.normals)
-    radii = neighborhood_radii(cloud.points, cloud.neighbors)
-    radius = segments.median(segments.take(radii)).double()
-    return segments, fit, config.coplanarity_floor * radius

@@ -1,4 +1,6 @@
-"""How many neighbours two points have in common, counted exactly."""
+"""Shared nearest neighbours: whether two points have enough of them in common, counted exactly."""
+
+import math
 
 import numpy as np
 import torch
@@ -20,8 +22,26 @@ _PATCH_SIZE = 1024
 side."""
 
 
+def min_shared_neighbors(connectivity: float, k: int) -> int:
+    """Return the least number of common neighbours of connected points, eq. (10).
+
+    Args:
+        connectivity: Fraction of the k neighbours.
+        k: Number of neighbours, the point itself included.
+
+    Returns:
+        ``ceil(connectivity * k)``, of the decimal fraction that was written (0.07 * 100 is 7, not
+        the 7.000000000000001 of binary arithmetic).
+
+    Example:
+        >>> min_shared_neighbors(0.75, 50), min_shared_neighbors(0.07, 100)
+        (38, 7)
+    """
+    return math.ceil(round(connectivity * k, 9))
+
+
 class SharedNeighbors:
-    """Neighbour lists of a cloud, prepared for counting what two of them have in common.
+    """Tells which points of a cloud are connected: share at least so many of their neighbours.
 
     The lists of a block of points are held as bit sets over the points that occur in them, so that
     an edge costs a few AND and popcount instructions; lists of points outside the block lose only
@@ -30,30 +50,32 @@ class SharedNeighbors:
 
     Args:
         neighbors: Neighbours of all points, each with itself among them.
+        min_shared: Least number of common neighbours of connected points.
 
     Example:
         >>> lists = torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])
-        >>> SharedNeighbors(Neighbors(lists)).at_least(3, slice(0, 1), torch.ones(1, 3).bool())
+        >>> shared = SharedNeighbors(Neighbors(lists), 3)
+        >>> shared.connected(slice(0, 1), torch.ones(1, 3, dtype=torch.bool))
         tensor([[ True,  True, False]])
     """
 
-    def __init__(self, neighbors: Neighbors) -> None:
+    def __init__(self, neighbors: Neighbors, min_shared: int) -> None:
         self._indices = neighbors.indices.cpu().numpy()
         self._counted = None if neighbors.valid is None else neighbors.valid.cpu().numpy()
+        self._min_shared = min_shared
         self._free_numbers: list[NDArray[np.intp]] = []
 
-    def at_least(self, min_shared: int, rows: slice, asked: Tensor) -> Tensor:
-        """Tell which edges join points that share enough neighbours, eq. (10).
+    def connected(self, rows: slice, asked: Tensor) -> Tensor:
+        """Tell which of a block's edges join connected points, eq. (10).
 
         Args:
-            min_shared: Least number of common neighbours.
             rows: The points that the edges lead from.
             asked: Which of the edges to their neighbours to test, shape ``(n, K)``, bool.
 
         Returns:
             Shape ``(n, K)``, bool; False where not asked.
         """
-        if min_shared <= 0:
+        if self._min_shared <= 0:
             return asked.clone()
         result = asked.cpu().numpy().copy()
 
@@ -61,7 +83,7 @@ class SharedNeighbors:
             if result[block].any():
                 first = rows.start + block.start
                 counts = self._count(first, first + len(result[block]))
-                result[block] &= counts >= min_shared
+                result[block] &= counts >= self._min_shared
 
         run_chunks(test, chunks_of(len(result), _PATCH_SIZE), torch.device("cpu"))
         return torch.from_numpy(result).to(asked.device)
@@ -85,14 +107,12 @@ class SharedNeighbors:
     def _local_lists(
         self, start: int, stop: int
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-        """Number the points that occur in the lists of a patch: its members.
+        """Number the points that occur in the lists of a patch, its members, -1 for the others.
 
-        Returns:
-            The numbers of the points of the patch ``(n,)``, and by these numbers their lists
-            ``(n, K)`` and those of all members ``(M, K)``; -1 for what is no member.
+        Returns the numbers of the points of the patch ``(n,)``, and by these numbers their lists
+        ``(n, K)`` and those of all members ``(M, K)``.
         """
-        # Number of each point, -1 for the others; kept between patches, because filling it takes
-        # longer than a patch.
+        # Kept between patches, because filling it takes longer than a patch.
         numbers = (
             self._free_numbers.pop() if self._free_numbers else np.full(len(self._indices), -1)
         )
@@ -116,13 +136,9 @@ def _bit_sets(
 ) -> tuple[NDArray[np.intp], NDArray[np.uint64]]:
     """Hold the lists of the members that occur in a block as bit sets over these, block by block.
 
-    Args:
-        lists: List of each member, -1 for what is none, shape ``(M, K)``.
-        occurs: Members of each block, shape ``(blocks, M + 1)``; none in the last column.
-
-    Returns:
-        Row of each member of each block among the sets, shape ``(blocks * (M + 1),)``, and the
-        sets, shape ``(rows, words)``.
+    From the list of each member ``(M, K)``, -1 for what is none, and the members of each block
+    ``(blocks, M + 1)``, none in the last column: the row of each member of each block among the
+    sets, shape ``(blocks * (M + 1),)``, and the sets, shape ``(rows, words)``.
     """
     stride = occurs.shape[1]
     found = np.flatnonzero(occurs)
@@ -144,12 +160,7 @@ def _bit_sets(
 
 
 def _sum_of_bits(words: NDArray[np.uint64], at_most: int) -> NDArray[np.unsignedinteger]:
-    """Return the number of bits in each row of words ``(E, 8 n)``, known to be ``at_most`` so many.
-
-    Example:
-        >>> _sum_of_bits(np.full((1, 8), 5, dtype=np.uint64), at_most=16).tolist()
-        [16]
-    """
+    """Return the number of bits in each row of words ``(E, 8 n)``, known to be at most so many."""
     counts = np.bitwise_count(words)
     if at_most >= 2**8:
         total: NDArray[np.unsignedinteger] = counts.sum(axis=1, dtype=np.uint64)

@@ -6,8 +6,7 @@ import torch
 
 from tests.regions import growing_clouds
 from torchrg.neighbors import search_knn
-from torchrg.regions.edges import min_shared_neighbors
-from torchrg.regions.shared_neighbors import SharedNeighbors
+from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.structures import Neighbors
 
 
@@ -30,14 +29,14 @@ def expected(neighbors, min_shared):
 @pytest.mark.parametrize("kind", ["graded", "blob", "doubled", "lattice"])
 @pytest.mark.parametrize("max_distance", [None, 0.3])
 def test_counts_equal_those_of_sets(kind, max_distance, monkeypatch):
-    monkeypatch.setitem(SharedNeighbors.at_least.__globals__, "_BLOCK_SIZE", 16)
+    monkeypatch.setattr("torchrg.regions.shared_neighbors._BLOCK_SIZE", 16)
     points = growing_clouds.prepare(growing_clouds.KINDS[kind](np.random.default_rng(0)), 12)[0]
     neighbors = search_knn(points, 12, max_distance=max_distance, canonical=True)
-    shared = SharedNeighbors(neighbors)
     counted = torch.ones(len(points), 12).bool() if max_distance is None else neighbors.valid
     for min_shared in (0, 1, 6, 9, 12):
+        shared = SharedNeighbors(neighbors, min_shared)
         for rows in (slice(0, 50), slice(50, len(points))):
-            found = shared.at_least(min_shared, rows, counted[rows])
+            found = shared.connected(rows, counted[rows])
             assert torch.equal(found, (expected(neighbors, min_shared) & counted)[rows])
 
 
@@ -45,20 +44,20 @@ def test_the_point_itself_may_be_anywhere_in_its_list():
     points = growing_clouds.prepare(growing_clouds.KINDS["blob"](np.random.default_rng(0)), 12)[0]
     neighbors = Neighbors(search_knn(points, 12, canonical=True).indices.flip(1))
     everyone = torch.ones(len(points), 12, dtype=torch.bool)
-    found = SharedNeighbors(neighbors).at_least(9, slice(0, len(points)), everyone)
+    found = SharedNeighbors(neighbors, 9).connected(slice(0, len(points)), everyone)
     assert torch.equal(found, expected(neighbors, 9))
 
 
 def test_long_lists_do_not_overflow_the_counter():
     neighbors = Neighbors(torch.arange(300).expand(300, 300))
     everyone = torch.ones(300, 300, dtype=torch.bool)
-    assert SharedNeighbors(neighbors).at_least(300, slice(0, 300), everyone).all()
+    assert SharedNeighbors(neighbors, 300).connected(slice(0, 300), everyone).all()
 
 
 def test_only_edges_that_were_asked_for_are_answered():
     neighbors = Neighbors(torch.arange(4).expand(4, 4))
     asked = torch.eye(4, dtype=torch.bool)
-    assert torch.equal(SharedNeighbors(neighbors).at_least(2, slice(0, 4), asked), asked)
+    assert torch.equal(SharedNeighbors(neighbors, 2).connected(slice(0, 4), asked), asked)
 
 
 def test_the_fraction_is_the_decimal_that_was_written():
@@ -67,4 +66,3 @@ def test_the_fraction_is_the_decimal_that_was_written():
         29,
         57,
     ]
-    assert min_shared_neighbors(None, 50) == 0
