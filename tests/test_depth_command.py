@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from torchrg.cli import main
+from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
 from torchrg.structures import Cloud
-from torchrg.transforms import segment_depth
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]
 INTRINSICS = make_intrinsics(50.0, 50.0, 39.5, 29.5)

@@ -13,11 +13,11 @@ from torchrg.batch.plan import list_jobs
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.config import load_config
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.errors import ConfigError
 from torchrg.io import Cloud, write_cloud
 from torchrg.io.counts import estimate_points
 from torchrg.pipeline import segment_planes
-from torchrg.transforms import DepthConfig, segment_depth
 
 CLASSIC = load_config("classic")
 

@@ -7,6 +7,7 @@ import torch
 from reproduction.scenes import cameras_around, render_depth
 from reproduction.scenes.cameras import KINECT_LAYOUT
 
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io import read_cloud
@@ -14,7 +15,6 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_labels
 from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED
-from torchrg.transforms import DepthConfig, segment_depth
 
 SMALL = make_intrinsics(100.0, 100.0, 79.5, 59.5)
 

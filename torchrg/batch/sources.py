@@ -23,13 +23,13 @@ from torchrg.datasets import (
 )
 from torchrg.datasets.rgbd import RGBDFrames
 from torchrg.datasets.rgbd_layouts import RGBDFrame
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
 from torchrg.io.counts import estimate_points
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud
-from torchrg.transforms import DepthConfig, segment_depth
 
 COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""

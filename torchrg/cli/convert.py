@@ -37,8 +37,8 @@ from torchrg.config import (
     PipelineConfig,
     PlanesConfig,
 )
+from torchrg.depth import DepthConfig
 from torchrg.errors import ConfigError, FormatError
-from torchrg.transforms import DepthConfig
 
 
 @dataclass(frozen=True)

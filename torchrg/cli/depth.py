@@ -14,13 +14,13 @@ from torchrg.batch.records import describe_versions, hash_file
 from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
 from torchrg.cli.picture import check_picture, picture_paths
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
 from torchrg.render import color_planes, write_png
 from torchrg.structures import Cloud, Segmentation
-from torchrg.transforms import DepthConfig, segment_depth
 
 
 def read_frame(

@@ -60,7 +60,7 @@ def fit_pixels(
         seen: Pixels with depth, shape ``(H, W)``, bool.
         u: Columns from the optical axis, shape ``(W,)``.
         v: Rows from the optical axis, shape ``(H, 1)``.
-        noise: See :class:`torchrg.transforms.DepthConfig`.
+        noise: See :class:`torchrg.config.DepthConfig`.
         dtype: Dtype of the depth.
 
     Returns:

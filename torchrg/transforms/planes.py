@@ -52,10 +52,6 @@ class EstimateNormals(CloudTransform):
         found = {"normal": fit.normals, "curvature": fit.curvature}
         return {**found, "residual": fit.residual_rms} if self.residual else found
 
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
-
 
 class GrowRegions(CloudTransform):
     """Add plane labels grown on the normals that a sample has; see :func:`torchrg.grow_regions`.
@@ -147,7 +143,3 @@ class SegmentPlanes(CloudTransform):
         """Return plane labels, normals and curvature of a cloud."""
         seg = segment_planes(cloud["coord"], self.config)
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
