@@ -11,11 +11,13 @@ import scipy
 import torch
 
 from torchrg.batch.scans import Converted, Job
-from torchrg.config import NormalsConfig, PipelineConfig
+from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.io import atomic_path
 
 
-def describe_run(source: Path, settings: PipelineConfig | NormalsConfig) -> dict[str, Any]:
+def describe_run(
+    source: Path, settings: PipelineConfig | NormalsConfig | DepthConfig
+) -> dict[str, Any]:
     """Return what is needed to make a result of one file again, ready for JSON.
 
     Args:

@@ -1,6 +1,7 @@
 """``torchrg normals``: normals and curvature of scans."""
 
 import dataclasses
+import functools
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +12,9 @@ import torch
 import tyro
 
 from torchrg.batch.records import describe_run
-from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.cli import console
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
-from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.errors import ConfigError, FormatError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import Orientation
@@ -45,44 +46,19 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, estimate the normals of each input and write them."""
-    arguments = parse(Arguments, argv, prog="torchrg normals")
-    _check(arguments)
-    if arguments.method is not None:
-        arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
-    if arguments.threads is not None:
-        torch.set_num_threads(arguments.threads)
-    outputs = output_paths(arguments.inputs, arguments.out)
-    failed = 0
-    for source, target in zip(arguments.inputs, outputs, strict=True):
-        try:
-            _estimate_file(source, target, arguments)
-        except TorchrgError as error:
-            if len(outputs) == 1:
-                raise
-            failed += 1
-            fail(str(error))
-    if failed:
-        return fail(
-            f"{failed} of {len(outputs)} inputs failed, the others are written.", code=SOME_FAILED
-        )
-    return 0
-
-
-def _check(arguments: Arguments) -> None:
-    """Refuse settings out of range, before any work.
-
-    Raises:
-        ConfigError: If there is one.
-    """
-    if arguments.threads is not None and arguments.threads < 1:
-        raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
+    arguments = console.parse(Arguments, argv, prog="torchrg normals")
     if arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
     if (arguments.orient == "viewpoint") != (arguments.viewpoint is not None):
         raise ConfigError("expected --viewpoint X Y Z and --orient viewpoint together.")
+    console.use_threads(arguments.threads)
+    if arguments.method is not None:
+        arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
+    outputs = console.output_paths(arguments.inputs, arguments.out)
+    return console.run_each(functools.partial(_estimate_file, arguments), arguments.inputs, outputs)
 
 
-def _estimate_file(source: Path, target: Path, arguments: Arguments) -> None:
+def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
@@ -105,7 +81,9 @@ def _estimate_file(source: Path, target: Path, arguments: Arguments) -> None:
     write_cloud(target, result, provenance=settings)
     num_valid = int(fit.valid.sum())
     if num_valid < len(cloud):
-        warn(f"{source}: {len(cloud) - num_valid:,} of {len(cloud):,} points have no normal.")
+        console.warn(
+            f"{source}: {len(cloud) - num_valid:,} of {len(cloud):,} points have no normal."
+        )
     sharp = "" if fit.sharp is None else f"{int(fit.sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
     print(f"{source}: {len(cloud):,} points, {sharp}{seconds:.1f} s -> {target}")

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
 
+KEYS = ("coord", "normal", "curvature", "residual", "plane", "inverse", "origin")
+"""Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos"}
 """Names that a PyG ``Data`` has instead of ours, unless others are given."""
 NOT_PER_POINT = ("offset", "origin", "pose", "inverse")
@@ -31,19 +33,10 @@ class SampleTransform(nn.Module):
     points out of them too.
 
     Args:
-        keys: Other names for some of ``names``, as in ``{"coord": "pos"}``.
+        keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
     """
 
-    names: Sequence[str] = (
-        "coord",
-        "normal",
-        "curvature",
-        "residual",
-        "plane",
-        "inverse",
-        "origin",
-    )
-    """Keys of a sample (Pointcept's, and ours)."""
+    names: Sequence[str] = KEYS
 
     def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
         super().__init__()
