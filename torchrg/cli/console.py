@@ -142,17 +142,10 @@ def use_threads(threads: int | None) -> None:
 
 
 def run_each(write: Callable[..., None], *paths: Sequence[Path | None]) -> int:
-    """Write the result of each input, where one that fails stops no other.
+    """Call ``write`` with the paths of each input in turn, and return the exit code.
 
-    Args:
-        write: Called with what each of ``paths`` has for an input.
-        *paths: The inputs, their results, and what else belongs to each.
-
-    Returns:
-        The exit code.
-
-    Raises:
-        TorchrgError: If the only input fails.
+    One that fails stops no other and is told in one line; where it is the only one, its error is
+    that of the command.
     """
     rows = list(zip(*paths, strict=True))
     num_failed = 0
