@@ -94,9 +94,6 @@ class PlaneSettings:
     def asked_for(cls, argv: list[str]) -> "PlaneSettings":
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
 
-        Raises:
-            ConfigError: If there is no such preset or file, or it is wrong.
-
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
             'pca'
@@ -114,11 +111,7 @@ SettingsFlags = Annotated[PlaneSettings, tyro.conf.arg(name="")]
 
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
-    """Return the four numbers of ``fx,fy,cx,cy``.
-
-    Raises:
-        ConfigError: If these are not four numbers.
-    """
+    """Return the four numbers of ``fx,fy,cx,cy``, or say that they are none."""
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:
@@ -129,16 +122,11 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
 
 
 def use_threads(threads: int | None) -> None:
-    """Let torch use so many threads; as many as it decides for None.
-
-    Raises:
-        ConfigError: If there are none.
-    """
-    if threads is None:
-        return
-    if threads < 1:
+    """Let torch use so many threads; None leaves it to torch."""
+    if threads is not None and threads < 1:
         raise ConfigError(f"expected --threads >= 1, got {threads}.")
-    torch.set_num_threads(threads)
+    if threads is not None:
+        torch.set_num_threads(threads)
 
 
 def run_each(write: Callable[..., None], *paths: Sequence[Path | None]) -> int:

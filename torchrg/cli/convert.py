@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Literal, NoReturn
 
 import tyro
@@ -159,11 +158,7 @@ def run(argv: list[str]) -> int:
 
 
 def _check(arguments: Arguments) -> None:
-    """Check what the types of the arguments do not say.
-
-    Raises:
-        ConfigError: If a value is out of range, or two do not go together.
-    """
+    """Refuse values that are out of range, or do not go together."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     if arguments.limit_memory is not None and not arguments.limit_memory > 0:
@@ -181,9 +176,8 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
     check_space(plan)
-    limit = int(SHARE * available_memory())
-    if arguments.limit_memory is not None:
-        limit = int(arguments.limit_memory * 1e9)
+    given = arguments.limit_memory
+    limit = int(SHARE * available_memory() if given is None else given * 1e9)
     for job in too_large(plan, limit):
         console.warn(
             f"{job.scan.name}: about {job.scan.num_points:,} points may need more memory than "
@@ -200,10 +194,8 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     total = sum(job.scan.num_points for job in jobs)
     # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
     with tqdm(total=total, unit="pt", unit_scale=True, smoothing=0, disable=None) as bar:
-        progress = _Progress(bar, plan)
-        ending = run_plan(
-            plan, reports, engine=arguments.engine, workers=workers, on_report=progress
-        )
+        shown, engine = _Progress(bar, plan), arguments.engine
+        ending = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
     return _finish(ending, out)
 
 
@@ -271,11 +263,7 @@ def _warnings_as_lines() -> Iterator[None]:
 @contextmanager
 def _terminate_as_interrupt() -> Iterator[None]:
     """Let SIGTERM, which batch systems send, end the command as Ctrl-C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:

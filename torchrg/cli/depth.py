@@ -95,12 +95,7 @@ def _segment_image(arguments: Arguments, source: Path, target: Path, picture: Pa
 
 
 def _read_frame(source: Path, arguments: Arguments) -> tuple[Cloud, Tensor, Tensor]:
-    """Return the cloud in camera coordinates, its depth ``(H, W)``, the camera matrix ``(3, 3)``.
-
-    Raises:
-        ConfigError: If the file needs a camera or a scale that is not given.
-        FormatError: If it is damaged, or neither a depth image nor an organised cloud.
-    """
+    """Return the cloud in camera coordinates, its depth ``(H, W)``, and the camera matrix."""
     given, scale = arguments.intrinsics, arguments.depth_scale
     camera = None if given is None else make_intrinsics(*console.parse_intrinsics(given))
     if source.suffix.lower() not in DEPTH_SUFFIXES:

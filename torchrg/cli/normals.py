@@ -18,7 +18,6 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import Orientation
-from torchrg.structures import Cloud, NormalFit
 
 
 @dataclass(frozen=True)
@@ -66,37 +65,24 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         raise FormatError(f"{source}: expected finite points, got none in {len(cloud):,} points.")
     check_output(target, cloud)
     fit = estimate_normals(cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size)
-    if arguments.orient != "none":
+    if (way := arguments.orient) != "none":
         place = arguments.viewpoint
-        towards = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
-        turned = orient_normals(
-            cloud.points, fit.normals, towards=arguments.orient, viewpoint=towards
-        )
+        viewpoint = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
+        turned = orient_normals(cloud.points, fit.normals, towards=way, viewpoint=viewpoint)
         fit = fit._replace(normals=turned)
     settings = describe_run(source, arguments.normals)
     settings |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
+    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
+    found = {"normals": fit.normals, "curvature": fit.curvature, "sharp": sharp, "valid": fit.valid}
     # As with segmentations, .npz holds the results alone, other formats the cloud's fields too.
     kept = {} if target.suffix.lower() == ".npz" else cloud.fields
-    result = _with_normals(replace(cloud, fields=kept), fit)
-    write_cloud(target, result, provenance=settings)
+    fields = {name: values for name, values in kept.items() if name not in found}
+    fields |= {name: values.numpy() for name, values in found.items()}
+    write_cloud(target, replace(cloud, fields=fields), provenance=settings)
     num_valid = int(fit.valid.sum())
     if num_valid < len(cloud):
-        console.warn(
-            f"{source}: {len(cloud) - num_valid:,} of {len(cloud):,} points have no normal."
-        )
-    sharp = "" if fit.sharp is None else f"{int(fit.sharp.sum()):,} sharp, "
+        num_bad = len(cloud) - num_valid
+        console.warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
+    counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    print(f"{source}: {len(cloud):,} points, {sharp}{seconds:.1f} s -> {target}")
-
-
-def _with_normals(cloud: Cloud, fit: NormalFit) -> Cloud:
-    """Return a cloud with normals, curvature and masks beside its own fields."""
-    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    found = {
-        "normals": fit.normals.numpy(),
-        "curvature": fit.curvature.numpy(),
-        "sharp": sharp.numpy(),
-        "valid": fit.valid.numpy(),
-    }
-    kept = {name: values for name, values in cloud.fields.items() if name not in found}
-    return replace(cloud, fields={**kept, **found})
+    print(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}")

@@ -81,15 +81,9 @@ def run(argv: list[str]) -> int:
 
 
 def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
-    """Return the files of two folders that belong together.
+    """Return both files of each scan of two folders by name, in natural order.
 
-    Returns:
-        Both files of each scan by name, in natural order: ``scan2`` before ``scan10``. The name is
-        the path below the folder without its suffix.
-
-    Raises:
-        FormatError: If a folder has no scan or two files of one name, or if a scan of one folder
-            is not in the other.
+    The name is the path below the folder without its suffix.
     """
     ours, theirs = _scans_of(predicted), _scans_of(truth)
     for folder, missing in (
@@ -131,11 +125,7 @@ def _named(names: Iterable[str]) -> str:
 
 
 def _score_files(predicted: Path, truth: Path) -> Scores:
-    """Return the scores of whatever two files both have.
-
-    Raises:
-        FormatError: If they differ in their number of points, or share neither labels nor normals.
-    """
+    """Return the scores of whatever two files of the same points both have."""
     ours, theirs = read_cloud(predicted), read_cloud(truth)
     if len(ours) != len(theirs):
         raise FormatError(

@@ -62,11 +62,7 @@ def run(argv: list[str]) -> int:
 
 
 def _refuse_images(argv: list[str]) -> None:
-    """Say where depth images went.
-
-    Raises:
-        ConfigError: If the arguments are about them.
-    """
+    """Say where depth images went, if the arguments are about them."""
     for last, argument in zip(["", *argv], argv, strict=False):
         is_flag = argument.partition("=")[0] in IMAGE_FLAGS
         is_value = last.startswith("--") and "=" not in last
@@ -104,11 +100,7 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
 
 
 def _check_points(cloud: Cloud) -> None:
-    """Warn of points that cannot be used.
-
-    Raises:
-        FormatError: If no point can be used.
-    """
+    """Warn of points that cannot be used, and refuse a cloud without others."""
     num_bad = len(cloud) - int(cloud.finite.sum())
     if num_bad == len(cloud):
         raise FormatError(

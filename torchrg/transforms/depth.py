@@ -178,19 +178,14 @@ class SegmentDepth(DepthTransform):
             segment_depth(image, camera, self.config, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
-        images = {
-            "plane": [seg.labels for seg in found],
-            "normal": [seg.normals for seg in found],
-            "curvature": [seg.curvature for seg in found],
-        }
-        if self.is_batch(sample):
-            added: dict[str, Any] = {name: torch.stack(each) for name, each in images.items()}
-        else:
-            added = {name: image for name, (image,) in images.items()}
+        batch, added = self.is_batch(sample), dict[str, Any](sample)
+        for name, part in (("plane", "labels"), ("normal", "normals"), ("curvature", "curvature")):
+            images = [getattr(seg, part) for seg in found]
+            added[self.key(sample, name)] = torch.stack(images) if batch else images[0]
         if self.planes:
             tables = [seg.planes for seg in found]
-            added["planes"] = tables if self.is_batch(sample) else tables[0]
-        return {**sample, **{self.key(sample, name): value for name, value in added.items()}}
+            added[self.key(sample, "planes")] = tables if batch else tables[0]
+        return added
 
     def extra_repr(self) -> str:
         """Return the settings."""

@@ -90,21 +90,19 @@ class GrowRegions(CloudTransform):
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the plane labels of a cloud."""
         points = cloud["coord"]
-        normals = cloud["normal"].to(points.dtype)
-        curvature = cloud["curvature"].to(points.dtype)
         rows = finite_rows(points)
         finite = points[rows]
         if len(finite) == 0:
             return {"plane": torch.full((len(points),), UNLABELED, device=points.device)}
-        residual = cloud["residual"].to(points.dtype)[rows] if "residual" in cloud else None
+        read = {name: values[rows].to(points.dtype) for name, values in cloud.items()}
         grown = grow_regions(
             finite,
-            normals[rows],
-            curvature[rows],
+            read["normal"],
+            read["curvature"],
             search_knn(finite, min(self.k, len(finite)), canonical=True),
             self.config,
-            valid=(normals[rows] != 0).any(dim=-1),
-            residual_rms=residual,
+            valid=(read["normal"] != 0).any(dim=-1),
+            residual_rms=read.get("residual"),
             canonical=True,
         )
         return {"plane": restore_rows(grown, rows, len(points), fill=UNLABELED)}

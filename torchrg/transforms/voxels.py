@@ -99,21 +99,12 @@ def segment_voxels(
     place = counts.argsort(descending=True, stable=True).argsort()
     labels = torch.where(labels >= 0, place[labels], labels) if len(place) else labels
     normals, curvature, sharp, valid = (
-        restore_points(values, voxels.inverse)
-        for values in (seg.normals, seg.curvature, seg.sharp, seg.valid)
+        restore_points(values, voxels.inverse) for values in seg[1:5]
     )
-    rows = finite_rows(tensor)
-    planes = summarize_planes(
-        tensor[rows],
-        normals[rows],
-        labels[rows],
-        up=config.planes.up_direction,
-        outline=config.planes.outline,
-    )
-    adjacency = _renumbered(seg.planes.adjacency, place)
-    return Segmentation(
-        labels, normals, curvature, sharp, valid, planes._replace(adjacency=adjacency)
-    )
+    rows, up, outline = finite_rows(tensor), config.planes.up_direction, config.planes.outline
+    planes = summarize_planes(tensor[rows], normals[rows], labels[rows], up=up, outline=outline)
+    planes = planes._replace(adjacency=_renumbered(seg.planes.adjacency, place))
+    return Segmentation(labels, normals, curvature, sharp, valid, planes)
 
 
 def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:
