@@ -12,9 +12,10 @@ import torch
 import tyro
 
 from torchrg.batch.records import describe_run
+from torchrg.batch.scans import check_finite
 from torchrg.cli import console
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import Orientation
@@ -61,8 +62,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
-    if not cloud.finite.any():
-        raise FormatError(f"{source}: expected finite points, got none in {len(cloud):,} points.")
+    check_finite(cloud)
     check_output(target, cloud)
     fit = estimate_normals(cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size)
     if (way := arguments.orient) != "none":

@@ -11,9 +11,10 @@ import tyro
 from tqdm import tqdm
 
 from torchrg.batch.records import describe_run
+from torchrg.batch.scans import check_finite
 from torchrg.cli import console
 from torchrg.cli.picture import draw_segmentation, picture_paths
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud, Segmentation
@@ -79,7 +80,8 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
     """Segment one file, with a progress bar on a terminal."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
-    _check_points(cloud)
+    for note in check_finite(cloud):
+        console.warn(f"{source}: {note}.")
     check_output(target, cloud)
     settings, voxel = arguments.settings.resolved, arguments.voxel
     with tqdm(total=len(STAGES), desc=source.name, unit="stage", leave=False, disable=None) as bar:
@@ -97,20 +99,6 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
     if picture is not None:
         draw_segmentation(picture, cloud, seg)
     _report(source, target, cloud, seg, time.perf_counter() - begin)
-
-
-def _check_points(cloud: Cloud) -> None:
-    """Warn of points that cannot be used, and refuse a cloud without others."""
-    num_bad = len(cloud) - int(cloud.finite.sum())
-    if num_bad == len(cloud):
-        raise FormatError(
-            f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
-        )
-    if num_bad:
-        console.warn(
-            f"{cloud.source}: {num_bad:,} of {len(cloud):,} points are not finite; they stay in "
-            "place, unlabelled."
-        )
 
 
 def _report(source: Path, target: Path, cloud: Cloud, seg: Segmentation, seconds: float) -> None:
