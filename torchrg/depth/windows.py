@@ -55,19 +55,9 @@ class WindowPlanes(NamedTuple):
 def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor, radius: int) -> WindowPlanes:
     """Fit a plane by least squares to each window of ``2 radius + 1`` pixels square.
 
-    The sums over windows are differences of running sums along rows, then along columns: their cost
-    does not depend on the radius.
-
-    Args:
-        values: Image, shape ``(H, W)``, float64; anything finite where not seen.
-        seen: Pixels that count, shape ``(H, W)``, bool.
-        u: Coordinate of the columns, shape ``(W,)``.
-        v: Coordinate of the rows, shape ``(H, 1)``.
-        radius: Pixels from the middle of a window to its border.
-
-    Returns:
-        The planes. A window with less than 0.4 of its pixels seen, or whose pixels lie nearly on a
-        line, has none.
+    The image ``(H, W)``, float64, holds anything finite where not seen; its columns are at ``u``
+    ``(W,)``, its rows at ``v`` ``(H, 1)``. A window with too few pixels seen, or whose pixels lie
+    nearly on a line, has no plane.
     """
     ones = seen.to(values.dtype)
     w = torch.where(seen, values, 0.0)
@@ -92,7 +82,10 @@ def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor, radius: int)
 
 
 def _window_sums(images: Tensor, radius: int) -> Tensor:
-    """Return the sums over the windows around all pixels, cut off at the borders, ``(C, H, W)``."""
+    """Return the sums over the windows around all pixels, cut off at the borders, ``(C, H, W)``.
+
+    They are differences of running sums, whose cost does not depend on the radius.
+    """
     for axis in (1, 2):
         length = images.shape[axis]
         running = images.cumsum(dim=axis)
@@ -105,12 +98,7 @@ def _window_sums(images: Tensor, radius: int) -> Tensor:
 
 
 def least_in_windows(image: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Return the least value in the window around each pixel, and its row-major place, ``(H, W)``.
-
-    Example:
-        >>> least_in_windows(torch.tensor([[3.0, 1, 2, 5]]), 1)
-        (tensor([[1., 1., 1., 2.]]), tensor([[1, 1, 1, 2]]))
-    """
+    """Return the least value in the window around each pixel, and its row-major place."""
     best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
     for axis in (1, 0):
         size, pad = [1, 1], [0, 0]
@@ -121,12 +109,7 @@ def least_in_windows(image: Tensor, radius: int) -> tuple[Tensor, Tensor]:
 
 
 def moved(image: Tensor, step: tuple[int, int], *, fill: float) -> Tensor:
-    """Return for each pixel the value of the one a step away, ``fill`` outside, ``(H, W, *)``.
-
-    Example:
-        >>> moved(torch.tensor([[1, 2, 3]]), (0, 1), fill=0)
-        tensor([[2, 3, 0]])
-    """
+    """Return for each pixel the value of the one a step away, ``fill`` outside, ``(H, W, *)``."""
     result = torch.full_like(image, fill)
     target, source = [], []
     for length, way in zip(image.shape, step, strict=False):
