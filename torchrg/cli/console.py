@@ -129,17 +129,21 @@ def use_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
-def run_each(write: Callable[..., None], *paths: Sequence[Path | None]) -> int:
-    """Call ``write`` with the paths of each input in turn, and return the exit code.
+def run_each(
+    write: Callable[..., None],
+    arguments: Any,  # noqa: ANN401
+    *paths: Sequence[Path | None],
+) -> int:
+    """Call ``write`` with the arguments and the paths of each input; return the exit code.
 
     One that fails stops no other and is told in one line; where it is the only one, its error is
     that of the command.
     """
-    rows = list(zip(*paths, strict=True))
+    rows = list(zip(arguments.inputs, *paths, strict=True))
     num_failed = 0
     for row in rows:
         try:
-            write(*row)
+            write(arguments, *row)
         except TorchrgError as error:
             if len(rows) == 1:
                 raise

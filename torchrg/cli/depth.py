@@ -1,7 +1,6 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
 import dataclasses
-import functools
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,9 +60,7 @@ def run(argv: list[str]) -> int:
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out, suffix=".png")
     pictures = picture_paths(outputs, arguments.picture)
-    return console.run_each(
-        functools.partial(_segment_image, arguments), arguments.inputs, outputs, pictures
-    )
+    return console.run_each(_segment_image, arguments, outputs, pictures)
 
 
 def _segment_image(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:

@@ -1,7 +1,6 @@
 """``torchrg normals``: normals and curvature of scans."""
 
 import dataclasses
-import functools
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,7 +54,7 @@ def run(argv: list[str]) -> int:
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     outputs = console.output_paths(arguments.inputs, arguments.out)
-    return console.run_each(functools.partial(_estimate_file, arguments), arguments.inputs, outputs)
+    return console.run_each(_estimate_file, arguments, outputs)
 
 
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:

@@ -1,7 +1,6 @@
 """``torchrg segment``: plane labels of scans."""
 
 import dataclasses
-import functools
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,9 +56,7 @@ def run(argv: list[str]) -> int:
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     pictures = picture_paths(outputs, arguments.picture)
-    return console.run_each(
-        functools.partial(_segment_file, arguments), arguments.inputs, outputs, pictures
-    )
+    return console.run_each(_segment_file, arguments, outputs, pictures)
 
 
 def _refuse_images(argv: list[str]) -> None:

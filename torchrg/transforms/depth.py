@@ -25,7 +25,7 @@ class DepthTransform(SampleTransform):
         *("plane", "normal", "curvature", "planes"),
     )
 
-    def __init__(self, *, keys: Mapping[str, str] | None, world: bool) -> None:
+    def __init__(self, *, world: bool = True, keys: Mapping[str, str] | None = None) -> None:
         super().__init__(keys=keys)
         self.world = world
 
@@ -89,9 +89,6 @@ class DepthToCloud(DepthTransform):
         >>> cloud["coord"].tolist(), cloud["pixel"].tolist()
         ([[0.0, 0.0, 2.0], [0.0, 2.0, 2.0], [2.0, 2.0, 2.0]], [0, 2, 3])
     """
-
-    def __init__(self, *, world: bool = True, keys: Mapping[str, str] | None = None) -> None:
-        super().__init__(keys=keys, world=world)
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with the cloud."""
