@@ -1,11 +1,13 @@
 """Settings: presets load, differences only, unknown keys and wrong values are refused."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
 
 from torchrg.config import (
+    DepthConfig,
     GrowingConfig,
     NormalsConfig,
     PipelineConfig,
@@ -86,6 +88,15 @@ def test_missing_file_is_named(tmp_path):
         (GrowingConfig, {"connectivity": 2.0}, "connectivity in"),
         (GrowingConfig, {"min_size": 0}, "min_size >= 1"),
         (PipelineConfig, {"chunk_size": 0}, "chunk_size >= 1"),
+        (DepthConfig, {"noise": (0.0, 0.0)}, "DepthConfig: expected noise two numbers >= 0"),
+        (DepthConfig, {"noise": (-1.0, 0.1)}, "noise two numbers >= 0, not both 0, or none"),
+        (DepthConfig, {"noise": (math.inf, 0.1)}, "noise two numbers"),
+        (DepthConfig, {"max_depth": 0.0}, "DepthConfig: expected max_depth > 0 or none"),
+        (DepthConfig, {"max_angle_deg": 91.0}, r"DepthConfig: expected max_angle_deg in \[0, 90\]"),
+        (DepthConfig, {"max_step": -1.0}, "max_step >= 0"),
+        (DepthConfig, {"min_size": 0}, "DepthConfig: expected min_size >= 1"),
+        (DepthConfig, {"absorb_reach": -1.0}, "DepthConfig: expected absorb_reach >= 0"),
+        (DepthConfig, {"merge_tolerance": 0.5}, "DepthConfig: expected merge_tolerance >= 1"),
     ],
 )
 def test_values_out_of_range_are_refused(kind, values, message):

@@ -1,4 +1,4 @@
-"""``torchrg segment`` of depth images and of organised clouds."""
+"""``torchrg depth``: planes of depth images and of organised clouds."""
 
 import json
 
@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from torchrg.cli import main
+from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
 from torchrg.structures import Cloud
-from torchrg.transforms import segment_depth
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]
 INTRINSICS = make_intrinsics(50.0, 50.0, 39.5, 29.5)
@@ -36,7 +36,7 @@ def frame(tmp_path, depth):
 
 def test_a_depth_image_becomes_labels_and_a_picture(tmp_path, frame, depth, capsys):
     out = tmp_path / "labels.png"
-    assert main(["segment", str(frame), *CAMERA, "--out", str(out)]) == 0
+    assert main(["depth", str(frame), *CAMERA, "--out", str(out)]) == 0
     labels = kornia_rs.io.read_image_png_u16(str(out), "mono")[..., 0].astype(int) - 1
     expected = segment_depth(depth, INTRINSICS).labels.numpy()
     np.testing.assert_array_equal(labels, expected)
@@ -50,7 +50,7 @@ def test_a_depth_image_becomes_labels_and_a_picture(tmp_path, frame, depth, caps
 def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth):
     for suffix in (".npz", ".pcd"):
         out = tmp_path / f"cloud{suffix}"
-        assert main(["segment", str(frame), *CAMERA, "--out", str(out)]) == 0
+        assert main(["depth", str(frame), *CAMERA, "--out", str(out)]) == 0
         cloud = read_cloud(out)
         points = depth_to_points(depth[None].double(), INTRINSICS[None])[0].view(-1, 3)
         np.testing.assert_allclose(cloud.coordinates, points.float(), rtol=1e-6)
@@ -72,14 +72,14 @@ def test_organised_clouds_keep_their_grid(tmp_path, depth, focal):
     write_cloud(source, Cloud(points.numpy(), grid_shape=(60, 80)))
     # A narrow cloud is moved to an origin of its own; its planes stay where they are.
     assert read_cloud(source).origin.any() == (focal == 500)
-    assert main(["segment", str(source), "--image", "--threads", "1", "--out", str(out)]) == 0
+    assert main(["depth", str(source), "--threads", "1", "--out", str(out)]) == 0
     cloud = read_cloud(out)
     assert cloud.grid_shape == (60, 80)
     np.testing.assert_array_equal(cloud.coordinates, points)
     expected = segment_depth(depth, camera).labels.flatten()
     np.testing.assert_array_equal(cloud.fields["labels"], expected)
     result = tmp_path / "out.npz"
-    assert main(["segment", str(source), "--image", "--threads", "1", "--out", str(result)]) == 0
+    assert main(["depth", str(source), "--threads", "1", "--out", str(result)]) == 0
     with np.load(result) as arrays:
         np.testing.assert_allclose(arrays["plane_offset"], [2.0, 2.5], rtol=1e-5)
 
@@ -88,11 +88,11 @@ def test_several_images_go_into_a_folder(tmp_path, frame):
     other, out = tmp_path / "other.png", tmp_path / "out"
     other.write_bytes(frame.read_bytes())
     inputs = [str(frame), str(other)]
-    assert main(["segment", *inputs, *CAMERA, "--out", str(out)]) == 0
+    assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 0
     names = ["frame.png", "frame_planes.png", "other.png", "other_planes.png"]
     assert sorted(path.name for path in out.iterdir()) == names
     other.write_text("no image")
-    assert main(["segment", *inputs, *CAMERA, "--out", str(out)]) == 3
+    assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 3
 
 
 def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
@@ -107,11 +107,44 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
         ([str(frame), "--intrinsics", "1,2,3", *CAMERA[2:], *out], "four numbers without blanks"),
         ([str(frame), str(frame), *CAMERA, *out], "expected a directory for 2 inputs"),
         ([str(frame), *CAMERA[:4], "--threads", "0", *out], "expected --threads >= 1, got 0"),
-        ([str(tmp_path / "list.pcd"), "--image", *out], "expected an organised cloud"),
-        ([str(tmp_path / "turned.pcd"), "--image", *out], "expected points of a pinhole camera"),
+        ([str(tmp_path / "list.pcd"), *out], "expected an organised cloud"),
+        ([str(tmp_path / "turned.pcd"), *out], "expected points of a pinhole camera"),
     ):
-        assert main(["segment", *arguments]) == 2
+        assert main(["depth", *arguments]) == 2
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
     assert not (tmp_path / "a.png").exists()
+
+
+def test_two_files_of_one_name_are_refused(tmp_path, frame, capsys):
+    (tmp_path / "more").mkdir()
+    twin = tmp_path / "more" / frame.name
+    twin.write_bytes(frame.read_bytes())
+    assert main(["depth", str(frame), str(twin), *CAMERA, "--out", str(tmp_path / "out")]) == 2
+    assert "another input has the same name" in capsys.readouterr().err
+
+
+def test_segment_says_where_depth_images_went(tmp_path, frame, capsys):
+    cloud, out = str(tmp_path / "scan.pcd"), ["--out", str(tmp_path / "out.npz")]
+    depth = "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
+    image = f"got the image {frame}; use: torchrg depth {frame} {depth}"
+    for arguments, message in (
+        ([str(frame), *out], image),
+        ([cloud, str(frame), *CAMERA, *out], image),
+        ([*out, "--preset=classic", str(frame)], image),
+        ([cloud, "--image", *out], f"got --image; use: torchrg depth IMAGES... {depth}"),
+        ([cloud, *CAMERA, *out], f"got --intrinsics; use: torchrg depth IMAGES... {depth}"),
+        ([cloud, "--depth-scale=1000", *out], "got --depth-scale=1000; use: torchrg depth IMAGES"),
+    ):
+        assert main(["segment", *arguments]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("torchrg: segment: expected point clouds, got ")
+        assert message in error
+        assert error.count("\n") == 1
+
+
+def test_pictures_of_segment_are_no_images(tmp_path, capsys):
+    for picture in (["--picture", "a.png"], ["--picture=a.png"]):
+        assert main(["segment", str(tmp_path / "no.pcd"), "--out", str(tmp_path), *picture]) == 2
+        assert "no.pcd: no such file" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """All settings, their defaults and their meaning; files and flags hold only differences."""
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -168,6 +169,42 @@ class PipelineConfig:
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
 
+@dataclass(frozen=True)
+class DepthConfig:
+    """How planes are found in depth images; see :func:`torchrg.depth.segment_depth`."""
+
+    noise: tuple[float, float] | None = None
+    """Noise of the sensor: two numbers a and b, for a standard deviation of a + b z^2 at depth z,
+    in the unit of the depth. None: estimated from each image."""
+    max_depth: float | None = None
+    """Depth beyond this is left out, in the unit of the depth. None: all is used."""
+    max_angle_deg: float = 8.0
+    """A pixel joins the region of the next one when the angle between their normals is at most
+    this."""
+    max_step: float = 1.5
+    """And when the planes of the two differ at either by at most this many standard deviations of
+    the noise."""
+    min_size: int = 100
+    """Smaller regions are not labelled, in pixels."""
+    absorb_reach: float = 3.0
+    """Pixels at borders join the flat region beside them when they are within this many standard
+    deviations of its plane."""
+    merge_tolerance: float = 1.2
+    """Flat regions that touch become one when one plane explains both: neither is farther from it
+    than this many times what it is from its own."""
+
+    def __post_init__(self) -> None:
+        parts = (1.0,) if self.noise is None else self.noise
+        is_noise = all(0 <= part < math.inf for part in parts) and sum(parts) > 0
+        _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
+        _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
+        _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
+        _require(self, "max_step", ">= 0", self.max_step >= 0)
+        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
+        _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
+
+
 def preset_names() -> list[str]:
     """Return the names of the presets that come with torchrg, sorted.
 
@@ -198,10 +235,9 @@ def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
     """
     path = Path(name_or_file)
     if path.suffix not in (".yaml", ".yml"):
-        path = _preset_file(
-            str(name_or_file), expected="load_config: expected a .yaml file, or a preset, one of"
-        )
-    return build_config(PipelineConfig, _read_values(path), where=str(path))
+        expected = "load_config: expected a .yaml file, or a preset, one of"
+        path = _preset_file(str(name_or_file), expected=expected)
+    return _build_config(PipelineConfig, _read_values(path), where=str(path))
 
 
 def _read_values(path: Path) -> object:
@@ -235,25 +271,10 @@ def _preset_file(name: object, *, expected: str) -> Path:
     return _preset_folder() / f"{name}.yaml"
 
 
-def build_config(kind: type[Settings], values: object, *, where: str) -> Settings:
+def _build_config(kind: type[Settings], values: object, *, where: str) -> Settings:
     """Make a settings object from nested mappings, and refuse keys and types it does not have.
 
-    Args:
-        kind: The dataclass.
-        values: Its values, as they came from a file.
-        where: File (and section) for messages.
-
-    Returns:
-        An instance of ``kind``.
-
-    Raises:
-        ConfigError: If a key is unknown or a value has the wrong type or range.
-
-    Example:
-        >>> build_config(GrowingConfig, {"max_angle": 5}, where="my.yaml: growing")
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ConfigError: my.yaml: growing: unknown key 'max_angle'; GrowingConfig has ...
+    ``where`` is the file (and section) for messages.
     """
     hints = typing.get_type_hints(kind)
     if not isinstance(values, Mapping):
@@ -264,9 +285,8 @@ def build_config(kind: type[Settings], values: object, *, where: str) -> Setting
             names = ", ".join(hints)
             raise ConfigError(f"{where}: unknown key {key!r}; {kind.__name__} has {names}.")
         if dataclasses.is_dataclass(hints[key]):
-            filled[key] = build_config(
-                typing.cast(type, hints[key]), value, where=f"{where}: {key}"
-            )
+            section = typing.cast(type, hints[key])
+            filled[key] = _build_config(section, value, where=f"{where}: {key}")
         else:
             filled[key] = _checked(value, hints[key], f"{where}: {key}")
     try:

@@ -16,10 +16,10 @@ from torchrg.batch.sources import SOURCES, FolderSource, RGBDSource, S3DISSource
 from torchrg.cli.convert import KINDS, RGBDArguments
 from torchrg.config import load_config
 from torchrg.datasets.rgbd_layouts import LAYOUTS
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.errors import ConfigError
 from torchrg.io import Cloud, estimate_points, write_cloud
 from torchrg.pipeline import segment_planes
-from torchrg.transforms import DepthConfig, segment_depth
 
 CLASSIC = load_config("classic")
 

@@ -6,11 +6,12 @@ import pytest
 import torch
 from reproduction.scenes import cameras_around, render_depth
 
+from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED, Planes
-from torchrg.transforms import DepthToCloud, SegmentDepth, segment_depth
+from torchrg.transforms import DepthToCloud, SegmentDepth
 from torchrg.transforms.fusion import fuse_depth
 
 

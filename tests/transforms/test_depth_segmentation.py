@@ -7,14 +7,14 @@ import torch
 from reproduction.scenes import cameras_around, render_depth
 from reproduction.scenes.cameras import KINECT_LAYOUT
 
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import find_intrinsics, make_intrinsics
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_labels
 from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED
-from torchrg.transforms import DepthConfig, segment_depth
 
 SMALL = make_intrinsics(100.0, 100.0, 79.5, 59.5)
 
@@ -239,15 +239,3 @@ def test_wrong_input_is_refused():
         segment_depth(torch.ones(4, 4, dtype=torch.int64), SMALL)
     with pytest.raises(ShapeError, match="intrinsics"):
         segment_depth(torch.ones(4, 4), torch.eye(4))
-    for name, value in (
-        ("noise", (0.0, 0.0)),
-        ("noise", (-1.0, 0.1)),
-        ("max_depth", 0.0),
-        ("max_angle_deg", 91.0),
-        ("max_step", -1.0),
-        ("min_size", 0),
-        ("absorb_reach", -1.0),
-        ("merge_tolerance", 0.5),
-    ):
-        with pytest.raises(ConfigError, match=f"DepthConfig: expected {name} "):
-            DepthConfig(**{name: value})

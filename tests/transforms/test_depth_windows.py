@@ -2,9 +2,8 @@
 
 import torch
 
-from torchrg.depth.noise import noise_by_radius
 from torchrg.depth.normals import RADII
-from torchrg.depth.windows import fit_windows, least_in_windows, moved
+from torchrg.depth.windows import fit_windows, least_in_windows, moved, noise_by_radius
 
 
 def coordinates(height, width):

@@ -11,14 +11,16 @@ import scipy
 import torch
 
 from torchrg.batch.scans import Converted, Job
-from torchrg.config import NormalsConfig, PipelineConfig
+from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.io import atomic_path
 
 RECORD = "provenance.json"
 """Written last beside the results of a scan, so that a scan without it is not done."""
 
 
-def describe_run(source: Path, settings: PipelineConfig | NormalsConfig) -> dict[str, Any]:
+def describe_run(
+    source: Path, settings: PipelineConfig | NormalsConfig | DepthConfig
+) -> dict[str, Any]:
     """Return what is needed to make a result of one file again, ready for JSON.
 
     Args:

@@ -26,12 +26,12 @@ from torchrg.datasets import (
 )
 from torchrg.datasets.rgbd import RGBDFrames
 from torchrg.datasets.rgbd_layouts import RGBDFrame
+from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import estimate_points, read_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud
-from torchrg.transforms import DepthConfig, segment_depth
 
 _COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""

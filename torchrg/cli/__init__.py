@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 COMMANDS = {
     "segment": "label the planes of scans",
+    "depth": "label the planes of depth images and of organised clouds",
     "normals": "estimate normals and curvature of scans",
     "convert": "segment every scan of a data set, on one machine or a cluster",
     "score": "compare labels and normals with a truth",

@@ -1,15 +1,22 @@
-"""What the commands share: parsing through tyro, one-line errors, exit codes, checks of paths."""
+"""What the commands share: parsing through tyro, the loop over inputs, errors of one line."""
 
 import contextlib
+import dataclasses
 import io
 import re
 import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
+
+import torch
+import tyro
 
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS, check_output
+from torchrg.io.files import check_place
 
 USAGE_ERROR = 2
 SOME_FAILED = 3
@@ -41,8 +48,6 @@ def parse(
     Raises:
         ConfigError: If an argument is wrong, as one line.
     """
-    import tyro
-
     stderr = io.StringIO()
     options: dict[str, Any] = {} if default is None else {"default": default}
     try:
@@ -52,6 +57,10 @@ def parse(
         if stop.code in (0, None):
             raise
         raise ConfigError(f"{_one_line(stderr.getvalue())} See {prog} --help.") from None
+    except ConfigError as error:
+        # The one setting that stands in no section.
+        text = str(error).replace("PipelineConfig: expected chunk_size", "expected --chunk-size")
+        raise ConfigError(text) from None
     return parsed
 
 
@@ -68,29 +77,89 @@ def _one_line(boxed: str) -> str:
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
-def settings_asked_for(argv: list[str]) -> PipelineConfig:
-    """Return the settings of the preset or the file that is asked for: defaults of other flags.
+@dataclass(frozen=True)
+class PlaneSettings:
+    """How planes are found: what the preset or the file says, where no flag says otherwise."""
 
-    Raises:
-        ConfigError: If there is no such preset or file, or it is wrong.
+    preset: str = DEFAULT_PRESET
+    """Settings to start from: classic, detmm, paper, consensus, or those for a kind of data: s3dis,
+    scannet, laser, rgbd."""
+    config: Path | None = None
+    """YAML file with settings that differ from the defaults; replaces the preset."""
+    resolved: Annotated[PipelineConfig, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=PipelineConfig
+    )
 
-    Example:
-        >>> settings_asked_for(["scan.pcd", "--preset=classic"]).normals.method
-        'pca'
+    @classmethod
+    def asked_for(cls, argv: list[str]) -> "PlaneSettings":
+        """Return the settings of the preset or the file in the arguments: defaults of the flags.
+
+        Example:
+            >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
+            'pca'
+        """
+        values = {"--preset": DEFAULT_PRESET, "--config": ""}
+        for argument, following in zip(argv, [*argv[1:], ""], strict=True):
+            name, equals, value = argument.partition("=")
+            if name in values:
+                values[name] = value if equals else following
+        return cls(resolved=load_config(values["--config"] or values["--preset"]))
+
+
+SettingsFlags = Annotated[PlaneSettings, tyro.conf.arg(name="")]
+"""Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
+
+
+def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
+    """Return the four numbers of ``fx,fy,cx,cy``, or say that they are none."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(
+            f"expected --intrinsics fx,fy,cx,cy, four numbers without blanks, got {text!r}."
+        ) from None
+    return fx, fy, cx, cy
+
+
+def use_threads(threads: int | None) -> None:
+    """Let torch use so many threads; None leaves it to torch."""
+    if threads is not None and threads < 1:
+        raise ConfigError(f"expected --threads >= 1, got {threads}.")
+    if threads is not None:
+        torch.set_num_threads(threads)
+
+
+def run_each(
+    write: Callable[..., None],
+    arguments: Any,  # noqa: ANN401
+    *paths: Sequence[Path | None],
+) -> int:
+    """Call ``write`` with the arguments and the paths of each input; return the exit code.
+
+    One that fails stops no other and is told in one line; where it is the only one, its error is
+    that of the command.
     """
-    values = {"--preset": DEFAULT_PRESET, "--config": ""}
-    for position, argument in enumerate(argv):
-        name, equals, value = argument.partition("=")
-        if name in values:
-            values[name] = value if equals else "".join(argv[position + 1 : position + 2])
-    return load_config(values["--config"] or values["--preset"])
+    rows = list(zip(arguments.inputs, *paths, strict=True))
+    num_failed = 0
+    for row in rows:
+        try:
+            write(arguments, *row)
+        except TorchrgError as error:
+            if len(rows) == 1:
+                raise
+            num_failed += 1
+            fail(str(error))
+    if num_failed:
+        message = f"{num_failed} of {len(rows)} inputs failed, the others are written."
+        return fail(message, code=SOME_FAILED)
+    return 0
 
 
 def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -> list[Path]:
     """Return where the result of each input goes.
 
-    One input goes to the file ``out``, or under its own name into an existing directory; several
-    need a directory, which is made.
+    One input goes to the file ``out``, a cloud or of the given suffix, or under its own name into
+    an existing directory; several need a directory, which is made.
 
     Raises:
         FormatError: If there is no input, two results would share a name, or ``out`` cannot be
@@ -98,14 +167,15 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     """
     if not inputs:
         raise FormatError("expected at least one input file, got none.")
+    given = out.suffix.lower()
     if len(inputs) == 1 and not out.is_dir():
-        check_output(out)
+        check_place(out) if given == suffix else check_output(out)
         return [out]
-    if out.suffix.lower() in FORMATS and not out.is_dir():
+    if given in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
-    paths = [out / f"{path.stem}{suffix}" for path in inputs]
-    for path, source in zip(paths, inputs, strict=True):
-        if paths.count(path) > 1:
+    results = [out / f"{path.stem}{suffix}" for path in inputs]
+    for result, source in zip(results, inputs, strict=True):
+        if results.count(result) > 1:
             raise FormatError(f"{source}: another input has the same name; run them one by one.")
     out.mkdir(parents=True, exist_ok=True)
-    return paths
+    return results

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Literal, NoReturn
 
 import tyro
@@ -22,23 +21,9 @@ from torchrg.batch.report import format_plan, format_report
 from torchrg.batch.run import REPORT, DirectoryLock, Ending, Reports, run_plan, write_report
 from torchrg.batch.scans import Job, Source
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
-from torchrg.cli.console import (
-    INTERRUPTED,
-    SOME_FAILED,
-    fail,
-    parse,
-    settings_asked_for,
-    warn,
-)
-from torchrg.config import (
-    DEFAULT_PRESET,
-    GrowingConfig,
-    NormalsConfig,
-    PipelineConfig,
-    PlanesConfig,
-)
+from torchrg.cli import console
+from torchrg.config import DepthConfig
 from torchrg.errors import ConfigError, FormatError
-from torchrg.transforms import DepthConfig
 
 
 @dataclass(frozen=True)
@@ -66,29 +51,18 @@ class Arguments:
     dry_run: bool = False
     """Say what would be done and why, and write nothing."""
 
+    def source(self, root: Path, out: Path) -> Source:
+        """Return the data set, both paths absolute."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class CloudArguments(Arguments):
     """What data sets of clouds have beside."""
 
-    preset: str = DEFAULT_PRESET
-    """Settings to start from: classic, detmm, paper, consensus, or those for a kind of data: s3dis,
-    scannet, laser, rgbd."""
-    config: Path | None = None
-    """YAML file with settings that differ from the defaults; replaces the preset."""
-    normals: NormalsConfig = dataclasses.field(default_factory=NormalsConfig)
-    """How normals and curvature are estimated."""
-    growing: GrowingConfig = dataclasses.field(default_factory=GrowingConfig)
-    """How regions grow."""
-    planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
-    """What the table of planes says."""
-    chunk_size: int = PipelineConfig.chunk_size
-    """Points handled at a time; bounds memory, never changes a result."""
-
-    @property
-    def settings(self) -> PipelineConfig:
-        """How to segment."""
-        return PipelineConfig(self.normals, self.growing, self.chunk_size, self.planes)
+    superpoint: bool = False
+    """Write the planes of scans in Pointcept's layout as superpoint.npy too."""
+    settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 
 @dataclass(frozen=True)
@@ -99,8 +73,9 @@ class FolderArguments(CloudArguments):
     layout; with ROOT for OUT, the latter are completed in place.
     """
 
-    superpoint: bool = False
-    """Write the planes of folders in Pointcept's layout as superpoint.npy too."""
+    def source(self, root: Path, out: Path) -> Source:
+        """Return the folder."""
+        return FolderSource(root, self.settings.resolved, out, self.superpoint)
 
 
 @dataclass(frozen=True)
@@ -111,8 +86,11 @@ class S3DISArguments(CloudArguments):
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
     """What the numbers in segment.npy mean."""
-    superpoint: bool = False
-    """Write the planes as superpoint.npy too."""
+
+    def source(self, root: Path, out: Path) -> Source:
+        """Return the rooms of the areas."""
+        areas = self.areas or find_areas(root)
+        return S3DISSource(root, self.settings.resolved, areas, self.class_order, self.superpoint)
 
 
 @dataclass(frozen=True)
@@ -128,6 +106,11 @@ class RGBDArguments(Arguments):
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
 
+    def source(self, root: Path, out: Path) -> Source:
+        """Return the frames."""
+        intrinsics = None if self.intrinsics is None else console.parse_intrinsics(self.intrinsics)
+        return RGBDSource(root, self.depth, self.layout, intrinsics, self.depth_scale)
+
 
 KINDS: dict[str, type[Arguments]] = {
     "s3dis": S3DISArguments,
@@ -135,65 +118,6 @@ KINDS: dict[str, type[Arguments]] = {
     "rgbd": RGBDArguments,
 }
 """Arguments by the name of the kind of data set."""
-
-
-def starting_point(kind: str, argv: list[str]) -> Arguments:
-    """Return the arguments' defaults: those of the preset or the file that is asked for."""
-    start = KINDS[kind](root=tyro.MISSING, out=tyro.MISSING)
-    if not isinstance(start, CloudArguments):
-        return start
-    asked = settings_asked_for(argv)
-    return dataclasses.replace(
-        start,
-        normals=asked.normals,
-        growing=asked.growing,
-        planes=asked.planes,
-        chunk_size=asked.chunk_size,
-    )
-
-
-def build_source(arguments: Arguments) -> Source:
-    """Return the data set that the arguments mean, its paths absolute."""
-    root, out = arguments.root.resolve(), arguments.out.resolve()
-    match arguments:
-        case S3DISArguments():
-            areas = arguments.areas or find_areas(root)
-            order, superpoint = arguments.class_order, arguments.superpoint
-            return S3DISSource(root, arguments.settings, areas, order, superpoint)
-        case FolderArguments():
-            return FolderSource(root, arguments.settings, out, arguments.superpoint)
-        case RGBDArguments():
-            intrinsics, scale = _parse_intrinsics(arguments.intrinsics), arguments.depth_scale
-            return RGBDSource(root, arguments.depth, arguments.layout, intrinsics, scale)
-    raise TypeError(type(arguments).__name__)
-
-
-def check_arguments(arguments: Arguments) -> None:
-    """Check what their types do not say.
-
-    Raises:
-        ConfigError: If a value is out of range, or two do not go together.
-    """
-    if arguments.workers is not None and arguments.workers < 1:
-        raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
-    if arguments.limit_memory is not None and not arguments.limit_memory > 0:
-        raise ConfigError(f"expected --limit-memory > 0, in GB, got {arguments.limit_memory}.")
-    if isinstance(arguments, CloudArguments) and arguments.chunk_size < 1:
-        raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
-    if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
-
-
-def _parse_intrinsics(text: str | None) -> tuple[float, float, float, float] | None:
-    """Return four numbers between commas."""
-    if text is None:
-        return None
-    try:
-        fx, fy, cx, cy = map(float, text.split(","))
-    except ValueError:
-        raise ConfigError(f"expected --intrinsics as fx,fy,cx,cy, got {text!r}.") from None
-    return fx, fy, cx, cy
-
 
 OVERVIEW = f"""usage: torchrg convert {{{",".join(KINDS)}}} ROOT OUT ...
 
@@ -214,12 +138,14 @@ def run(argv: list[str]) -> int:
     kind, *rest = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
-    start = starting_point(kind, rest)
-    arguments = parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
-    check_arguments(arguments)
-    out = arguments.out.resolve()
+    start = KINDS[kind](root=tyro.MISSING, out=tyro.MISSING)
+    if isinstance(start, CloudArguments):
+        start = dataclasses.replace(start, settings=console.PlaneSettings.asked_for(rest))
+    arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
+    _check(arguments)
+    root, out = arguments.root.resolve(), arguments.out.resolve()
     with _warnings_as_lines():
-        jobs = list_jobs(build_source(arguments), out, only=arguments.only)
+        jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)
     if arguments.dry_run:
         print(format_plan(_look_at(jobs, arguments)))
         return 0
@@ -231,6 +157,16 @@ def run(argv: list[str]) -> int:
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
 
 
+def _check(arguments: Arguments) -> None:
+    """Refuse values that are out of range, or do not go together."""
+    if arguments.workers is not None and arguments.workers < 1:
+        raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
+    if arguments.limit_memory is not None and not arguments.limit_memory > 0:
+        raise ConfigError(f"expected --limit-memory > 0, in GB, got {arguments.limit_memory}.")
+    if arguments.ray_address is not None and arguments.engine != "ray":
+        raise ConfigError("expected --ray-address together with --engine ray.")
+
+
 def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
     """Find out what is to be done, with a progress bar where files are many."""
     with tqdm(total=len(jobs), desc="looking", unit="scan", leave=False, disable=None) as bar:
@@ -240,11 +176,10 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
     check_space(plan)
-    limit = int(SHARE * available_memory())
-    if arguments.limit_memory is not None:
-        limit = int(arguments.limit_memory * 1e9)
+    given = arguments.limit_memory
+    limit = int(SHARE * available_memory() if given is None else given * 1e9)
     for job in too_large(plan, limit):
-        warn(
+        console.warn(
             f"{job.scan.name}: about {job.scan.num_points:,} points may need more memory than "
             f"{limit / 1e9:.1f} GB; it runs alone."
         )
@@ -259,10 +194,8 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     total = sum(job.scan.num_points for job in jobs)
     # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
     with tqdm(total=total, unit="pt", unit_scale=True, smoothing=0, disable=None) as bar:
-        progress = _Progress(bar, plan)
-        ending = run_plan(
-            plan, reports, engine=arguments.engine, workers=workers, on_report=progress
-        )
+        shown, engine = _Progress(bar, plan), arguments.engine
+        ending = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
     return _finish(ending, out)
 
 
@@ -289,7 +222,7 @@ def _finish(ending: Ending, out: Path) -> int:
     report = ending.report
     print(format_report(report))
     for scan in report.with_status("failed"):
-        fail(f"{scan.name}: {scan.reason}")
+        console.fail(f"{scan.name}: {scan.reason}")
     num_done = len(report.with_status("converted")) + len(report.with_status("kept"))
     state = f"{num_done:,} of {len(report.scans):,} scans are complete"
     try:
@@ -297,16 +230,17 @@ def _finish(ending: Ending, out: Path) -> int:
     except FormatError as error:
         if not ending.disk_full:
             raise
-        warn(str(error))
+        console.warn(str(error))
+    again = "same command goes on from here."
     if ending.disk_full:
-        return fail(
-            f"{out}: the disk is full; {state}. Make room, and the same command goes on from here.",
-            code=SOME_FAILED,
-        )
+        message = f"{out}: the disk is full; {state}. Make room, and the {again}"
+        return console.fail(message, code=console.SOME_FAILED)
     if ending.interrupted:
-        return fail(f"interrupted; {state}. The same command goes on from here.", code=INTERRUPTED)
+        message = f"interrupted; {state}. The {again}"
+        return console.fail(message, code=console.INTERRUPTED)
     if num_done < len(report.scans):
-        return fail(f"{state}, {out / REPORT} says more.", code=SOME_FAILED)
+        message = f"{state}, {out / REPORT} says more."
+        return console.fail(message, code=console.SOME_FAILED)
     print(f"{state} -> {out}")
     return 0
 
@@ -323,17 +257,13 @@ def _warnings_as_lines() -> Iterator[None]:
         warnings.simplefilter("always", UserWarning)
         yield
     for warning in caught:
-        warn(str(warning.message))
+        console.warn(str(warning.message))
 
 
 @contextmanager
 def _terminate_as_interrupt() -> Iterator[None]:
     """Let SIGTERM, which batch systems send, end the command as Ctrl-C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:

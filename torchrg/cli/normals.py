@@ -11,13 +11,13 @@ import torch
 import tyro
 
 from torchrg.batch.records import describe_run
-from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, warn
+from torchrg.batch.scans import check_finite
+from torchrg.cli import console
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
-from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import Orientation
-from torchrg.structures import Cloud, NormalFit
 
 
 @dataclass(frozen=True)
@@ -45,80 +45,43 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, estimate the normals of each input and write them."""
-    arguments = parse(Arguments, argv, prog="torchrg normals")
-    _check(arguments)
-    if arguments.method is not None:
-        arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
-    if arguments.threads is not None:
-        torch.set_num_threads(arguments.threads)
-    outputs = output_paths(arguments.inputs, arguments.out)
-    failed = 0
-    for source, target in zip(arguments.inputs, outputs, strict=True):
-        try:
-            _estimate_file(source, target, arguments)
-        except TorchrgError as error:
-            if len(outputs) == 1:
-                raise
-            failed += 1
-            fail(str(error))
-    if failed:
-        return fail(
-            f"{failed} of {len(outputs)} inputs failed, the others are written.", code=SOME_FAILED
-        )
-    return 0
-
-
-def _check(arguments: Arguments) -> None:
-    """Refuse settings out of range, before any work.
-
-    Raises:
-        ConfigError: If there is one.
-    """
-    if arguments.threads is not None and arguments.threads < 1:
-        raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
+    arguments = console.parse(Arguments, argv, prog="torchrg normals")
     if arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
     if (arguments.orient == "viewpoint") != (arguments.viewpoint is not None):
         raise ConfigError("expected --viewpoint X Y Z and --orient viewpoint together.")
+    console.use_threads(arguments.threads)
+    if arguments.method is not None:
+        arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
+    outputs = console.output_paths(arguments.inputs, arguments.out)
+    return console.run_each(_estimate_file, arguments, outputs)
 
 
-def _estimate_file(source: Path, target: Path, arguments: Arguments) -> None:
+def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
-    if not cloud.finite.any():
-        raise FormatError(f"{source}: expected finite points, got none in {len(cloud):,} points.")
+    check_finite(cloud)
     check_output(target, cloud)
     fit = estimate_normals(cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size)
-    if arguments.orient != "none":
+    if (way := arguments.orient) != "none":
         place = arguments.viewpoint
-        towards = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
-        turned = orient_normals(
-            cloud.points, fit.normals, towards=arguments.orient, viewpoint=towards
-        )
+        viewpoint = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
+        turned = orient_normals(cloud.points, fit.normals, towards=way, viewpoint=viewpoint)
         fit = fit._replace(normals=turned)
     settings = describe_run(source, arguments.normals)
     settings |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
+    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
+    found = {"normals": fit.normals, "curvature": fit.curvature, "sharp": sharp, "valid": fit.valid}
     # As with segmentations, .npz holds the results alone, other formats the cloud's fields too.
     kept = {} if target.suffix.lower() == ".npz" else cloud.fields
-    result = _with_normals(replace(cloud, fields=kept), fit)
-    write_cloud(target, result, provenance=settings)
+    fields = {name: values for name, values in kept.items() if name not in found}
+    fields |= {name: values.numpy() for name, values in found.items()}
+    write_cloud(target, replace(cloud, fields=fields), provenance=settings)
     num_valid = int(fit.valid.sum())
     if num_valid < len(cloud):
-        warn(f"{source}: {len(cloud) - num_valid:,} of {len(cloud):,} points have no normal.")
-    sharp = "" if fit.sharp is None else f"{int(fit.sharp.sum()):,} sharp, "
+        num_bad = len(cloud) - num_valid
+        console.warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
+    counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    print(f"{source}: {len(cloud):,} points, {sharp}{seconds:.1f} s -> {target}")
-
-
-def _with_normals(cloud: Cloud, fit: NormalFit) -> Cloud:
-    """Return a cloud with normals, curvature and masks beside its own fields."""
-    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    found = {
-        "normals": fit.normals.numpy(),
-        "curvature": fit.curvature.numpy(),
-        "sharp": sharp.numpy(),
-        "valid": fit.valid.numpy(),
-    }
-    kept = {name: values for name, values in cloud.fields.items() if name not in found}
-    return replace(cloud, fields={**kept, **found})
+    print(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}")

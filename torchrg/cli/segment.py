@@ -6,28 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 from tqdm import tqdm
 
 from torchrg.batch.records import describe_run
-from torchrg.cli import depth
-from torchrg.cli.console import SOME_FAILED, fail, output_paths, parse, settings_asked_for, warn
+from torchrg.batch.scans import check_finite
+from torchrg.cli import console
 from torchrg.cli.picture import draw_segmentation, picture_paths
-from torchrg.config import (
-    DEFAULT_PRESET,
-    GrowingConfig,
-    NormalsConfig,
-    PipelineConfig,
-    PlanesConfig,
-)
-from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Cloud, Segmentation
 from torchrg.transforms import segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
+IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
+"""Flags of depth images, which have a command of their own."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +32,8 @@ class Arguments:
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt. Depth images (.png) and
-    organised clouds with --image have flags of their own: see segment --image --help."""
+    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt. Depth images and organised
+    clouds taken as such: see torchrg depth --help."""
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
@@ -47,74 +41,46 @@ class Arguments:
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
-    preset: str = DEFAULT_PRESET
-    """Settings to start from: classic, detmm, paper, consensus, or those for a kind of data: s3dis,
-    scannet, laser, rgbd."""
-    config: Path | None = None
-    """YAML file with settings that differ from the defaults; replaces the preset."""
-    normals: NormalsConfig = dataclasses.field(default_factory=NormalsConfig)
-    """How normals and curvature are estimated."""
-    growing: GrowingConfig = dataclasses.field(default_factory=GrowingConfig)
-    """How regions grow."""
-    planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
-    """What the table of planes says."""
-    chunk_size: int = PipelineConfig.chunk_size
-    """Points handled at a time; bounds memory, never changes a result."""
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
+    settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
-    if depth.asks_for_images(argv):
-        return depth.run(argv)
-    arguments = parse(Arguments, argv, prog="torchrg segment", default=_starting_point(argv))
-    settings = PipelineConfig(
-        arguments.normals, arguments.growing, arguments.chunk_size, arguments.planes
+    _refuse_images(argv)
+    start = Arguments(
+        inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
     )
-    if arguments.threads is not None:
-        if arguments.threads < 1:
-            raise ConfigError(f"expected --threads >= 1, got {arguments.threads}.")
-        torch.set_num_threads(arguments.threads)
-    outputs = output_paths(arguments.inputs, arguments.out)
+    arguments = console.parse(Arguments, argv, prog="torchrg segment", default=start)
+    console.use_threads(arguments.threads)
+    outputs = console.output_paths(arguments.inputs, arguments.out)
     pictures = picture_paths(outputs, arguments.picture)
-    failed = 0
-    for source, target, picture in zip(arguments.inputs, outputs, pictures, strict=True):
-        try:
-            _segment_file(source, target, picture, settings, arguments.voxel)
-        except TorchrgError as error:
-            if len(outputs) == 1:
-                raise
-            failed += 1
-            fail(str(error))
-    if failed:
-        return fail(
-            f"{failed} of {len(outputs)} inputs failed, the others are written.", code=SOME_FAILED
-        )
-    return 0
+    return console.run_each(_segment_file, arguments, outputs, pictures)
 
 
-def _starting_point(argv: list[str]) -> Arguments:
-    """Return the arguments' defaults: those of the preset or the file that is asked for."""
-    settings = settings_asked_for(argv)
-    return Arguments(
-        inputs=tyro.MISSING,
-        out=tyro.MISSING,
-        normals=settings.normals,
-        growing=settings.growing,
-        planes=settings.planes,
-        chunk_size=settings.chunk_size,
-    )
+def _refuse_images(argv: list[str]) -> None:
+    """Say where depth images went, if the arguments are about them."""
+    for last, argument in zip(["", *argv], argv, strict=False):
+        is_flag = argument.partition("=")[0] in IMAGE_FLAGS
+        is_value = last.startswith("--") and "=" not in last
+        is_input = not argument.startswith("-") and not is_value
+        if is_flag or (is_input and argument.lower().endswith(".png")):
+            what, name = ("", "IMAGES...") if is_flag else ("the image ", argument)
+            raise ConfigError(
+                f"segment: expected point clouds, got {what}{argument}; use: torchrg depth {name} "
+                "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
+            )
 
 
-def _segment_file(
-    source: Path, target: Path, picture: Path | None, settings: PipelineConfig, voxel: float | None
-) -> None:
+def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
     """Segment one file, with a progress bar on a terminal."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
-    _check_points(cloud)
+    for note in check_finite(cloud):
+        console.warn(f"{source}: {note}.")
     check_output(target, cloud)
+    settings, voxel = arguments.settings.resolved, arguments.voxel
     with tqdm(total=len(STAGES), desc=source.name, unit="stage", leave=False, disable=None) as bar:
 
         def advance(stage: str) -> None:
@@ -132,38 +98,15 @@ def _segment_file(
     _report(source, target, cloud, seg, time.perf_counter() - begin)
 
 
-def _check_points(cloud: Cloud) -> None:
-    """Warn of points that cannot be used.
-
-    Raises:
-        FormatError: If no point can be used.
-    """
-    num_bad = len(cloud) - int(cloud.finite.sum())
-    if num_bad == len(cloud):
-        raise FormatError(
-            f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
-        )
-    if num_bad:
-        warn(
-            f"{cloud.source}: {num_bad:,} of {len(cloud):,} points are not finite; they stay in "
-            "place, unlabelled."
-        )
-
-
 def _report(source: Path, target: Path, cloud: Cloud, seg: Segmentation, seconds: float) -> None:
     """Print one line about a result, and a warning if it is empty."""
     num_planes = len(seg.planes.count)
     if num_planes == 0:
-        places = "all points are equal" if _is_one_place(cloud) else "no region is large enough"
-        warn(f"{source}: no plane found: {places}.")
+        kept = cloud.coordinates[cloud.finite]
+        reason = "all points are equal" if (kept == kept[0]).all() else "no region is large enough"
+        console.warn(f"{source}: no plane found: {reason}.")
     share = float((seg.labels >= 0).double().mean()) * 100
     print(
         f"{source}: {len(cloud):,} points, {num_planes:,} planes, {share:.1f} % of the points "
         f"labelled, {seconds:.1f} s -> {target}"
     )
-
-
-def _is_one_place(cloud: Cloud) -> bool:
-    """Return whether all finite points are the same."""
-    kept = cloud.coordinates[cloud.finite]
-    return bool((kept == kept[0]).all())

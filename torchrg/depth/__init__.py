@@ -1,7 +1,7 @@
 """Planes of depth images, found from pixel to pixel."""
 
+from torchrg.config import DepthConfig
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
-from torchrg.depth.config import DepthConfig
 from torchrg.depth.segment import segment_depth
 
 __all__ = [

@@ -42,12 +42,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 def has_depth(depth: Tensor) -> Tensor:
-    """Return which pixels have a depth: finite and positive, the shape of ``depth``.
-
-    Example:
-        >>> has_depth(torch.tensor([1.0, 0, -1, torch.nan, torch.inf]))
-        tensor([ True, False, False, False, False])
-    """
+    """Return which pixels have a depth: finite and positive, the shape of ``depth``."""
     return depth.isfinite() & (depth > 0)
 
 

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.config import GrowingConfig
-from torchrg.depth.config import DepthConfig
+from torchrg.config import DepthConfig, GrowingConfig
 from torchrg.depth.normals import PixelPlanes
 from torchrg.depth.refine import InverseCloud, refine_pixels
 from torchrg.depth.windows import moved

@@ -5,16 +5,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.depth.noise import noise_by_radius
-from torchrg.depth.windows import WindowPlanes, fit_windows, least_in_windows, moved
+from torchrg.depth.windows import (
+    WindowPlanes,
+    fit_windows,
+    least_in_windows,
+    moved,
+    noise_by_radius,
+)
 
 RADII = (16, 8, 4, 2)
 """Radii of the windows, the largest first."""
-
 _FLAT = 1.35
+"""A flat window deviates from its plane by at most this many times the noise."""
 _OWN_REACH = 3.5
+"""A pixel is on the plane of a window within this many times the noise."""
 _SAME_NOISE = 2.0
+"""A flat window deviates by at most this over its side in pixels more than its quarters do."""
 _LEAST_QUARTERS = 0.7
+"""Quarters count as if they deviated by this many times the noise at least."""
 
 
 class PixelPlanes(NamedTuple):
@@ -49,22 +57,19 @@ def fit_pixels(
     In inverse depth ``w = 1 / z`` a plane of space is a plane over the image [1],
     ``w = (n_x x + n_y y + n_z) / d`` with the ray ``(x, y, 1)``, and the noise of a triangulating
     sensor is the same everywhere, so that plain least squares is right. A window is flat when it
-    deviates from its plane by at most 1.35 times the noise, and hardly more than its four quarters
-    do from planes of their own; one across a step or an edge is not. For each radius, the largest
-    first, a pixel takes the window around itself if that is flat; else the flattest window that
-    holds it [2]; in both cases only if the pixel itself is within 3.5 times the noise of the plane.
-    Pixels in no flat window take the smallest around them.
+    deviates from its plane by hardly more than the noise, and than its four quarters do from planes
+    of their own; one across a step or an edge is not. For each radius, the largest first, a pixel
+    takes the window around itself if that is flat; else the flattest window that holds it [2]; in
+    both cases only if the pixel itself is on the plane. Pixels in no flat window take the smallest
+    around them.
 
     Args:
         inverse: Inverse depth, shape ``(H, W)``, float64; anything finite where not seen.
         seen: Pixels with depth, shape ``(H, W)``, bool.
         u: Columns from the optical axis, shape ``(W,)``.
         v: Rows from the optical axis, shape ``(H, 1)``.
-        noise: See :class:`torchrg.transforms.DepthConfig`.
+        noise: See :class:`torchrg.config.DepthConfig`.
         dtype: Dtype of the depth.
-
-    Returns:
-        The planes.
 
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.depth.config import DepthConfig
+from torchrg.config import DepthConfig
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors
 from torchrg.regions.growth import number_by_size

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.config import DepthConfig
 from torchrg.depth.camera import depth_to_points, has_depth
-from torchrg.depth.config import DepthConfig
 from torchrg.depth.growth import grow_pixels
 from torchrg.depth.normals import PixelPlanes, fit_pixels
 from torchrg.depth.refine import InverseCloud
@@ -70,20 +70,21 @@ def segment_depth(
     seen = has_depth(depth)
     inverse = torch.where(seen, 1 / depth.double(), 0.0)
     fx, fy, cx, cy = (float(intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    focal = (fx, fy)
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double()[:, None] - cy
+    x, y = (u / fx).expand_as(inverse), (v / fy).expand_as(inverse)
     pixels = fit_pixels(inverse, seen, u, v, noise=config.noise, dtype=depth.dtype)
-    normals, distance = _normals(pixels, fx, fy)
+    normals, distance = _normals(pixels, focal)
     valid = seen & (pixels.radius > 0)
-    cloud = _inverse_cloud(inverse, seen, pixels, u / fx, v / fy, (fx, fy))
-    regions = grow_pixels(cloud, pixels, normals, u, v, config)
-    labels = regions.labels
-    curvature = torch.where(valid, _curvature(pixels, inverse, distance, u, v, (fx, fy)), 0.0)
+    cloud = _inverse_cloud(inverse, seen, pixels, x, y, focal)
+    labels, plane_normals, curved = grow_pixels(cloud, pixels, normals, u, v, config)
+    curvature = torch.where(valid, _curvature(pixels, inverse, distance, x, y, focal), 0.0)
     normals = torch.where(valid[..., None], normals, 0.0).view(-1, 3)
     # A window at a border that is not flat has no normal of its own; the region has.
     borders = (~pixels.flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
-    borders = borders[~regions.curved[labels[borders]]]
-    normals[borders] = regions.normals[labels[borders]]
+    borders = borders[~curved[labels[borders]]]
+    normals[borders] = plane_normals[labels[borders]]
     valid.view(-1)[borders] = True
 
     points = depth_to_points(depth[None].double(), intrinsics[None].double())[0]
@@ -99,13 +100,13 @@ def segment_depth(
         curvature.to(depth.dtype),
         pixels.edge,
         valid,
-        planes._replace(curved=regions.curved),
+        planes._replace(curved=curved),
     )
 
 
-def _normals(pixels: PixelPlanes, fx: float, fy: float) -> tuple[Tensor, Tensor]:
+def _normals(pixels: PixelPlanes, focal: tuple[float, float]) -> tuple[Tensor, Tensor]:
     """Return unit normals towards the camera ``(H, W, 3)``, and the planes' distance from it."""
-    planes = pixels.planes
+    planes, (fx, fy) = pixels.planes, focal
     away = torch.stack([planes.u_slope * fx, planes.v_slope * fy, planes.origin], dim=-1)
     length = away.norm(dim=-1)
     length = torch.where(length > 0, length, 1.0)
@@ -120,27 +121,23 @@ def _inverse_cloud(
     y: Tensor,
     focal: tuple[float, float],
 ) -> InverseCloud:
-    """Return the image as the cloud that regions grow in."""
+    """Return the image as the cloud that regions grow in, from the rays ``(x, y, 1)``."""
     unit = inverse[seen].median() if bool(seen.any()) else inverse.new_ones(())
-    points = torch.stack([x.expand_as(inverse), y.expand_as(inverse), inverse / unit], dim=-1)
+    points = torch.stack([x, y, inverse / unit], dim=-1)
     fx, fy = focal
     slopes = [pixels.planes.u_slope * (fx / unit), pixels.planes.v_slope * (fy / unit)]
     normals = torch.stack([*slopes, -torch.ones_like(inverse)], dim=-1)
-    normals = normals / normals.norm(dim=-1, keepdim=True)
-    return InverseCloud(
-        points.view(-1, 3),
-        normals.view(-1, 3),
-        (pixels.noise / unit).flatten(),
-        seen.flatten(),
-    )
+    normals = (normals / normals.norm(dim=-1, keepdim=True)).view(-1, 3)
+    noise = (pixels.noise / unit).flatten()
+    return InverseCloud(points.view(-1, 3), normals, noise, seen.flatten())
 
 
 def _curvature(
     pixels: PixelPlanes,
     inverse: Tensor,
     distance: Tensor,
-    u: Tensor,
-    v: Tensor,
+    x: Tensor,
+    y: Tensor,
     focal: tuple[float, float],
 ) -> Tensor:
     """Return the surface variation of the windows: their variance across the plane, of all.
@@ -150,8 +147,7 @@ def _curvature(
     """
     z = 1 / torch.where(inverse > 0, inverse, 1.0)
     across = distance * z * torch.where(pixels.radius > 0, pixels.planes.deviation, 0.0)
-    fx, fy = focal
-    ray = torch.stack([(u / fx).expand_as(z), (v / fy).expand_as(z), torch.ones_like(z)], dim=-1)
+    ray = torch.stack([x, y, torch.ones_like(z)], dim=-1)
     spread = pixels.radius.double() * (pixels.radius + 1) / 3
     along = torch.zeros_like(z)
     slopes = (pixels.planes.u_slope, pixels.planes.v_slope)

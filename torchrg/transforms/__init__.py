@@ -1,7 +1,5 @@
 """Modules for data pipelines: a dict of tensors (or a PyG ``Data``) in, a new one out."""
 
-from torchrg.depth.config import DepthConfig
-from torchrg.depth.segment import segment_depth
 from torchrg.neighbors.voxels import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth
 from torchrg.transforms.fusion import fuse_depth
@@ -11,7 +9,6 @@ from torchrg.transforms.voxels import SampleVoxels, segment_voxels
 
 __all__ = [
     "CenterCloud",
-    "DepthConfig",
     "DepthToCloud",
     "EstimateNormals",
     "GrowRegions",
@@ -22,6 +19,5 @@ __all__ = [
     "fuse_depth",
     "restore_points",
     "sample_voxels",
-    "segment_depth",
     "segment_voxels",
 ]

@@ -4,96 +4,66 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchrg._checks import as_tensor
-from torchrg.depth.camera import depth_to_points
-from torchrg.depth.config import DepthConfig
-from torchrg.depth.segment import segment_depth
-from torchrg.errors import ConfigError, ShapeError
-
-DEPTH_KEYS = {
-    name: name
-    for name in (
-        "depth",
-        "intrinsics",
-        "pose",
-        "color",
-        "coord",
-        "pixel",
-        "offset",
-        "plane",
-        "normal",
-        "curvature",
-        "planes",
-    )
-}
-"""Names of the keys in a sample of depth images."""
+from torchrg.depth import DepthConfig, depth_to_points, segment_depth
+from torchrg.errors import ShapeError
+from torchrg.transforms.sample import SampleTransform
 
 
-class DepthTransform(nn.Module):
-    """Base of the transforms of depth images: names of keys, and images one by one.
+class DepthTransform(SampleTransform):
+    """Base of the transforms of depth images: reads them one by one.
 
     Args:
-        keys: Other names for some of :data:`DEPTH_KEYS`.
+        keys: Other names for some of ``names``.
         world: Whether results are in world coordinates where a sample has a pose; otherwise they
             are in camera coordinates.
     """
 
-    def __init__(self, *, keys: Mapping[str, str] | None, world: bool) -> None:
-        super().__init__()
-        unknown = set(keys or {}) - set(DEPTH_KEYS)
-        if unknown:
-            raise ConfigError(
-                f"{type(self).__name__}: expected keys to rename {', '.join(DEPTH_KEYS)}, got "
-                f"{', '.join(sorted(unknown))}."
-            )
-        self.keys = {**DEPTH_KEYS, **(keys or {})}
+    names = (
+        *("depth", "intrinsics", "pose", "color", "coord", "pixel", "offset"),
+        *("plane", "normal", "curvature", "planes"),
+    )
+
+    def __init__(self, *, world: bool = True, keys: Mapping[str, str] | None = None) -> None:
+        super().__init__(keys=keys)
         self.world = world
 
-    def read(self, sample: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor | None]:
+    def read_images(self, sample: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None.
 
         Raises:
             ConfigError: If the sample lacks depth or intrinsics.
             ShapeError: If their shapes are not as in :class:`SegmentDepth`.
         """
-        caller = type(self).__name__
-        for name in ("depth", "intrinsics"):
-            if self.keys[name] not in sample:
-                raise ConfigError(
-                    f"{caller}: expected a sample with {self.keys[name]!r}, got "
-                    f"{', '.join(map(str, sample))}; rename it with keys={{{name!r}: ...}}."
-                )
-        depth = as_tensor(caller, "depth", sample[self.keys["depth"]])
+        depth, intrinsics = self.read(sample, "depth"), self.read(sample, "intrinsics")
         if depth.ndim not in (2, 3, 4) or (depth.ndim > 2 and depth.shape[-3] != 1):
             raise ShapeError(
-                f"{caller}: expected depth of shape (H, W), (1, H, W) or (B, 1, H, W), got "
-                f"{tuple(depth.shape)}."
+                f"{type(self).__name__}: expected depth of shape (H, W), (1, H, W) or "
+                f"(B, 1, H, W), got {tuple(depth.shape)}."
             )
         depth = depth.reshape(-1, *depth.shape[-2:])
-        intrinsics = as_tensor(caller, "intrinsics", sample[self.keys["intrinsics"]])
-        pose = sample.get(self.keys["pose"]) if self.world else None
-        poses = None if pose is None else as_tensor(caller, "pose", pose)
+        has_pose = self.world and sample.get(self.key(sample, "pose")) is not None
+        poses = self.read(sample, "pose") if has_pose else None
         return (
             depth,
-            _one_each(caller, "intrinsics", intrinsics, (len(depth), 3, 3)),
-            None if poses is None else _one_each(caller, "pose", poses, (len(depth), 4, 4)),
+            self._one_each("intrinsics", intrinsics, (len(depth), 3, 3)),
+            None if poses is None else self._one_each("pose", poses, (len(depth), 4, 4)),
         )
 
     def is_batch(self, sample: Mapping[str, Any]) -> bool:
         """Return whether the depth of a sample is a batch, ``(B, 1, H, W)``."""
-        return bool(sample[self.keys["depth"]].ndim == 4)
+        return self.read(sample, "depth").ndim == 4
 
-
-def _one_each(caller: str, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """Return a matrix for each image; one of shape ``(n, n)`` serves all."""
-    given = values.expand(shape) if values.ndim == 2 and values.shape == shape[1:] else values
-    if given.shape != shape:
-        raise ShapeError(
-            f"{caller}: expected {name} of shape {shape[1:]} or {shape}, got {tuple(values.shape)}."
-        )
-    return given
+    def _one_each(self, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
+        """Return a matrix for each image; one of shape ``(n, n)`` serves all."""
+        given = values.expand(shape) if values.ndim == 2 and values.shape == shape[1:] else values
+        if given.shape != shape:
+            raise ShapeError(
+                f"{type(self).__name__}: expected {name} of shape {shape[1:]} or {shape}, got "
+                f"{tuple(values.shape)}."
+            )
+        return given
 
 
 class DepthToCloud(DepthTransform):
@@ -120,12 +90,9 @@ class DepthToCloud(DepthTransform):
         ([[0.0, 0.0, 2.0], [0.0, 2.0, 2.0], [2.0, 2.0, 2.0]], [0, 2, 3])
     """
 
-    def __init__(self, *, world: bool = True, keys: Mapping[str, str] | None = None) -> None:
-        super().__init__(keys=keys, world=world)
-
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with the cloud."""
-        depth, intrinsics, poses = self.read(sample)
+        depth, intrinsics, poses = self.read_images(sample)
         images = depth_to_points(depth, intrinsics)
         if poses is not None:
             poses = poses.to(depth.device)
@@ -135,14 +102,14 @@ class DepthToCloud(DepthTransform):
         pixel = torch.arange(depth[0].numel(), device=depth.device).view(depth.shape[1:])
         result = {
             **sample,
-            self.keys["coord"]: images[seen],
-            self.keys["pixel"]: pixel.expand_as(seen)[seen],
+            self.key(sample, "coord"): images[seen],
+            self.key(sample, "pixel"): pixel.expand_as(seen)[seen],
         }
         if self.is_batch(sample):
-            result[self.keys["offset"]] = seen.flatten(1).sum(dim=1).cumsum(dim=0)
-        if self.keys["color"] in sample:
-            color = as_tensor("DepthToCloud", "color", sample[self.keys["color"]])
-            result[self.keys["color"]] = _colors(color, seen)
+            result[self.key(sample, "offset")] = seen.flatten(1).sum(dim=1).cumsum(dim=0)
+        color = self.key(sample, "color")
+        if color in sample:
+            result[color] = _colors(self.read(sample, "color"), seen)
         return result
 
 
@@ -203,25 +170,19 @@ class SegmentDepth(DepthTransform):
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with labels, normals and curvature as images."""
-        depth, intrinsics, poses = self.read(sample)
+        depth, intrinsics, poses = self.read_images(sample)
         found = [
             segment_depth(image, camera, self.config, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
-        batch = self.is_batch(sample)
-        images = {
-            "plane": [seg.labels for seg in found],
-            "normal": [seg.normals for seg in found],
-            "curvature": [seg.curvature for seg in found],
-        }
-        result = {
-            **sample,
-            **{self.keys[k]: torch.stack(v) if batch else v[0] for k, v in images.items()},
-        }
+        batch, added = self.is_batch(sample), dict[str, Any](sample)
+        for name, part in (("plane", "labels"), ("normal", "normals"), ("curvature", "curvature")):
+            images = [getattr(seg, part) for seg in found]
+            added[self.key(sample, name)] = torch.stack(images) if batch else images[0]
         if self.planes:
             tables = [seg.planes for seg in found]
-            result[self.keys["planes"]] = tables if batch else tables[0]
-        return result
+            added[self.key(sample, "planes")] = tables if batch else tables[0]
+        return added
 
     def extra_repr(self) -> str:
         """Return the settings."""

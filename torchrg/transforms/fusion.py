@@ -52,12 +52,10 @@ class FusedFrames(NamedTuple):
                 f"to_frames: expected values of {len(self.coord)} points, got {len(values)}."
             )
         each = restore_points(values, self.inverse)
+        images = [values.new_full((*seen.shape, *values.shape[1:]), fill) for seen in self.seen]
         parts = torch.split(each, [int(seen.sum()) for seen in self.seen])
-        images = []
-        for seen, part in zip(self.seen, parts, strict=True):
-            image = values.new_full((*seen.shape, *values.shape[1:]), fill)
+        for image, seen, part in zip(images, self.seen, parts, strict=True):
             image[seen] = part
-            images.append(image)
         return images
 
 
@@ -108,8 +106,7 @@ def fuse_depth(
         mask = torch.zeros(depth.shape[-2:], dtype=torch.bool, device=depth.device)
         mask.view(-1)[cloud["pixel"]] = True
         seen.append(mask)
-    coord = torch.cat([cloud["coord"] for cloud in clouds])
-    pixel = torch.cat([cloud["pixel"] for cloud in clouds])
+    coord, pixel = (torch.cat([cloud[key] for cloud in clouds]) for key in ("coord", "pixel"))
     counts = torch.tensor([len(cloud["coord"]) for cloud in clouds], device=coord.device)
     frame = torch.arange(len(clouds), device=coord.device).repeat_interleave(counts)
     has_color = all("color" in cloud for cloud in clouds)

@@ -52,10 +52,6 @@ class EstimateNormals(CloudTransform):
         found = {"normal": fit.normals, "curvature": fit.curvature}
         return {**found, "residual": fit.residual_rms} if self.residual else found
 
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
-
 
 class GrowRegions(CloudTransform):
     """Add plane labels grown on the normals that a sample has; see :func:`torchrg.grow_regions`.
@@ -94,21 +90,19 @@ class GrowRegions(CloudTransform):
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the plane labels of a cloud."""
         points = cloud["coord"]
-        normals = cloud["normal"].to(points.dtype)
-        curvature = cloud["curvature"].to(points.dtype)
         rows = finite_rows(points)
         finite = points[rows]
         if len(finite) == 0:
             return {"plane": torch.full((len(points),), UNLABELED, device=points.device)}
-        residual = cloud["residual"].to(points.dtype)[rows] if "residual" in cloud else None
+        read = {name: values[rows].to(points.dtype) for name, values in cloud.items()}
         grown = grow_regions(
             finite,
-            normals[rows],
-            curvature[rows],
+            read["normal"],
+            read["curvature"],
             search_knn(finite, min(self.k, len(finite)), canonical=True),
             self.config,
-            valid=(normals[rows] != 0).any(dim=-1),
-            residual_rms=residual,
+            valid=(read["normal"] != 0).any(dim=-1),
+            residual_rms=read.get("residual"),
             canonical=True,
         )
         return {"plane": restore_rows(grown, rows, len(points), fill=UNLABELED)}
@@ -147,7 +141,3 @@ class SegmentPlanes(CloudTransform):
         """Return plane labels, normals and curvature of a cloud."""
         seg = segment_planes(cloud["coord"], self.config)
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)

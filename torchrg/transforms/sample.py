@@ -6,6 +6,7 @@ treat each cloud by itself.
 """
 
 import copy
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,18 +17,12 @@ from torch import Tensor, nn
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
 
-KEYS = {
-    "coord": "coord",
-    "normal": "normal",
-    "curvature": "curvature",
-    "residual": "residual",
-    "plane": "plane",
-    "inverse": "inverse",
-    "origin": "origin",
-}
-"""Names of the keys in a sample (Pointcept's, and ours)."""
+KEYS = ("coord", "normal", "curvature", "residual", "plane", "inverse", "origin")
+"""Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos"}
-"""Names that a PyG ``Data`` has instead, unless others are given."""
+"""Names that a PyG ``Data`` has instead of ours, unless others are given."""
+NOT_PER_POINT = ("offset", "origin", "pose", "inverse")
+"""Entries that have no row for each point that is there, however long they are."""
 
 
 class SampleTransform(nn.Module):
@@ -41,20 +36,22 @@ class SampleTransform(nn.Module):
         keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
     """
 
+    names: Sequence[str] = KEYS
+
     def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
         super().__init__()
-        unknown = set(keys or {}) - set(KEYS)
+        self.renamed = dict(keys or {})
+        unknown = self.renamed.keys() - set(self.names)
         if unknown:
             raise ConfigError(
-                f"{type(self).__name__}: expected keys to rename {', '.join(KEYS)}, got "
+                f"{type(self).__name__}: expected keys to rename {', '.join(self.names)}, got "
                 f"{', '.join(sorted(unknown))}."
             )
-        self.renamed = dict(keys or {})
 
     def key(self, sample: Any, name: str) -> str:  # noqa: ANN401
         """Return what an entry is called in a sample."""
-        usual = KEYS if isinstance(sample, Mapping) else {**KEYS, **PYG_KEYS}
-        return self.renamed.get(name, usual[name])
+        usual = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
+        return self.renamed.get(name, usual)
 
     def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
         """Return an entry of a sample as a tensor.
@@ -64,7 +61,7 @@ class SampleTransform(nn.Module):
             ShapeError: If it is no array, or coordinates that are not of shape ``(N, 3)``.
         """
         key, caller = self.key(sample, name), type(self).__name__
-        entries = entries_of(sample)
+        entries = _entries_of(sample)
         if key not in entries:
             raise ConfigError(
                 f"{caller}: expected a sample with {key!r}, got {', '.join(map(str, entries))}; "
@@ -82,14 +79,11 @@ class SampleTransform(nn.Module):
         *,
         per_point: Sequence[str] = (),
     ) -> Any:  # noqa: ANN401
-        """Return a new sample of the same kind with other values.
+        """Return a new sample of the same kind with other values by key.
 
-        Args:
-            sample: The sample; it is not changed.
-            values: New values by key.
-            per_point: Those keys that have a row for each point.
+        Those in ``per_point`` have a row for each point.
         """
-        entries = entries_of(sample)
+        entries = _entries_of(sample)
         is_numpy = isinstance(entries.get(self.key(sample, "coord")), np.ndarray)
         new: dict[str, Any] = {
             key: value.numpy() if is_numpy else value for key, value in values.items()
@@ -109,6 +103,7 @@ class CloudTransform(SampleTransform):
     """Base of the transforms that add a row for each point, cloud by cloud."""
 
     reads: tuple[str, ...] = ("coord",)
+    config: Any
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return new entries of one cloud, from those that are read."""
@@ -117,107 +112,18 @@ class CloudTransform(SampleTransform):
     def forward(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample with the new entries; the given one is not changed."""
         values = {name: self.read(sample, name) for name in self.reads}
-        ends = cloud_ends(sample, len(values["coord"]))
         parts = [
-            self.add({name: value[begin:end] for name, value in values.items()})
-            for begin, end in zip([0, *ends], ends, strict=False)
+            self.add({name: value[rows] for name, value in values.items()})
+            for rows in rows_of_clouds(sample, len(values["coord"]))
         ]
         added = {
             self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
         }
         return self.changed(sample, added, per_point=list(added))
 
-
-def entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
-    """Return what a sample holds by key.
-
-    Raises:
-        ConfigError: If it is neither a mapping nor like a PyG ``Data``.
-    """
-    if isinstance(sample, Mapping):
-        return sample
-    if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
-        entries: dict[str, Any] = sample.to_dict()
-        return entries
-    raise ConfigError(
-        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
-    )
-
-
-def cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
-    """Return the row that each cloud of a sample ends before; one cloud ends at the last.
-
-    Raises:
-        ConfigError: If ``offset`` or ``batch`` does not fit the points.
-
-    Example:
-        >>> cloud_ends({"batch": torch.tensor([0, 0, 1, 1, 1])}, 5)
-        [2, 5]
-    """
-    entries = entries_of(sample)
-    if entries.get("offset") is not None:
-        ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
-        if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
-            raise ConfigError(
-                f"expected offset to ascend to the number of points ({num_points}), got {ends}."
-            )
-        return ends
-    if entries.get("batch") is not None:
-        batch = torch.as_tensor(entries["batch"])
-        if len(batch) != num_points or bool((batch.diff() < 0).any()):
-            raise ConfigError(
-                f"expected batch to ascend over {num_points} points, got {len(batch)} numbers; "
-                "sort the points by cloud."
-            )
-        counts: list[int] = torch.bincount(batch).cumsum(0).tolist()
-        return counts or [0]
-    return [num_points]
-
-
-NOT_PER_POINT = ("offset", "origin", "pose", "inverse")
-"""Entries that have no row for each point that is there, however long they are."""
-
-
-def select_points(
-    sample: Any,  # noqa: ANN401
-    rows: Tensor,
-    *,
-    num_points: int,
-) -> dict[str, Tensor]:
-    """Return the entries of a sample that change when it is reduced to some of its points.
-
-    Args:
-        sample: The sample. Which entries have a row for each point, ``index_valid_keys`` says as
-            Pointcept does, or else their length.
-        rows: The points to keep, ascending, shape ``(n,)``.
-        num_points: Number of points of the sample.
-
-    Returns:
-        The changed entries, ``offset`` among them where the sample has it.
-
-    Raises:
-        ConfigError: If the sample has edges, or is a batch that can be taken apart again.
-    """
-    entries = entries_of(sample)
-    for key, repair in (("edge_index", "before edges are made"), ("ptr", "before batching")):
-        if key in entries:
-            raise ConfigError(
-                f"expected a sample without {key} to take points out of, got one; apply the "
-                f"transform {repair}."
-            )
-    named = entries.get("index_valid_keys")
-    chosen = {}
-    for key, value in entries.items():
-        if not isinstance(value, Tensor | np.ndarray) or key in NOT_PER_POINT:
-            continue
-        if value.ndim and len(value) == num_points and (named is None or key in named):
-            tensor = as_tensor("select_points", key, value)
-            chosen[key] = tensor[rows.to(tensor.device)]
-    if "offset" in entries:
-        offset = torch.as_tensor(entries["offset"])
-        ends = torch.tensor(cloud_ends(sample, num_points), device=rows.device)
-        chosen["offset"] = torch.searchsorted(rows, ends).to(offset)
-    return chosen
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return repr(self.config)
 
 
 class CenterCloud(SampleTransform):
@@ -237,8 +143,7 @@ class CenterCloud(SampleTransform):
     def forward(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample with moved coordinates."""
         coord = self.read(sample, "coord")
-        ends = cloud_ends(sample, len(coord))
-        clouds = [coord[begin:end] for begin, end in zip([0, *ends], ends, strict=False)]
+        clouds = [coord[rows] for rows in rows_of_clouds(sample, len(coord))]
         middles = torch.stack([_middle(cloud) for cloud in clouds])
         moved = [
             (cloud.double() - middle).to(cloud.dtype)
@@ -264,6 +169,88 @@ class KeepFinite(SampleTransform):
         coord = self.read(sample, "coord")
         rows = coord.isfinite().all(dim=-1).nonzero().squeeze(-1)
         return self.changed(sample, select_points(sample, rows, num_points=len(coord)))
+
+
+def rows_of_clouds(sample: Any, num_points: int) -> list[slice]:  # noqa: ANN401
+    """Return the rows of each cloud of a sample.
+
+    Raises:
+        ConfigError: If ``offset`` or ``batch`` does not fit the points.
+
+    Example:
+        >>> rows_of_clouds({"batch": torch.tensor([0, 0, 1, 1, 1])}, 5)
+        [slice(0, 2, None), slice(2, 5, None)]
+    """
+    return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
+
+
+def select_points(sample: Any, rows: Tensor, *, num_points: int) -> dict[str, Tensor]:  # noqa: ANN401
+    """Return the entries of a sample that change when only some rows are kept, given ascending.
+
+    Which entries have a row for each point, ``index_valid_keys`` says as Pointcept does, or else
+    their length. ``offset`` is among them where the sample has it.
+
+    Raises:
+        ConfigError: If the sample has edges, or is a batch that can be taken apart again.
+    """
+    entries = _entries_of(sample)
+    for key, repair in (("edge_index", "before edges are made"), ("ptr", "before batching")):
+        if key in entries:
+            raise ConfigError(
+                f"expected a sample without {key} to take points out of, got one; apply the "
+                f"transform {repair}."
+            )
+    named = entries.get("index_valid_keys")
+    chosen = {}
+    for key, value in entries.items():
+        if not isinstance(value, Tensor | np.ndarray) or key in NOT_PER_POINT:
+            continue
+        if value.ndim and len(value) == num_points and (named is None or key in named):
+            tensor = as_tensor("select_points", key, value)
+            chosen[key] = tensor[rows.to(tensor.device)]
+    if "offset" in entries:
+        offset = torch.as_tensor(entries["offset"])
+        ends = torch.tensor(_cloud_ends(sample, num_points), device=rows.device)
+        chosen["offset"] = torch.searchsorted(rows, ends).to(offset)
+    return chosen
+
+
+def _entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
+    """Return what a sample holds by key.
+
+    Raises:
+        ConfigError: If it is neither a mapping nor like a PyG ``Data``.
+    """
+    if isinstance(sample, Mapping):
+        return sample
+    if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
+        entries: dict[str, Any] = sample.to_dict()
+        return entries
+    raise ConfigError(
+        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
+    )
+
+
+def _cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
+    """Return the row that each cloud of a sample ends before; one cloud ends at the last."""
+    entries = _entries_of(sample)
+    if entries.get("offset") is not None:
+        ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
+        if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
+            raise ConfigError(
+                f"expected offset to ascend to the number of points ({num_points}), got {ends}."
+            )
+        return ends
+    if entries.get("batch") is not None:
+        batch = torch.as_tensor(entries["batch"])
+        if len(batch) != num_points or bool((batch.diff() < 0).any()):
+            raise ConfigError(
+                f"expected batch to ascend over {num_points} points, got {len(batch)} numbers; "
+                "sort the points by cloud."
+            )
+        counts: list[int] = torch.bincount(batch).cumsum(0).tolist()
+        return counts or [0]
+    return [num_points]
 
 
 def _middle(cloud: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchrg.neighbors.voxels import restore_points, sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
 from torchrg.structures import UNLABELED, PlaneAdjacency, Segmentation
-from torchrg.transforms.sample import SampleTransform, cloud_ends, select_points
+from torchrg.transforms.sample import SampleTransform, rows_of_clouds, select_points
 
 
 class SampleVoxels(SampleTransform):
@@ -46,11 +46,10 @@ class SampleVoxels(SampleTransform):
     def forward(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample of voxels."""
         coord = self.read(sample, "coord")
-        ends = cloud_ends(sample, len(coord))
         rows, inverse, num_voxels = [], [], 0
-        for begin, end in zip([0, *ends], ends, strict=False):
-            voxels = sample_voxels(coord[begin:end], self.size)
-            rows.append(voxels.rows + begin)
+        for cloud in rows_of_clouds(sample, len(coord)):
+            voxels = sample_voxels(coord[cloud], self.size)
+            rows.append(voxels.rows + cloud.start)
             inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
             num_voxels += len(voxels.rows)
         selected = select_points(sample, torch.cat(rows), num_points=len(coord))
@@ -100,21 +99,12 @@ def segment_voxels(
     place = counts.argsort(descending=True, stable=True).argsort()
     labels = torch.where(labels >= 0, place[labels], labels) if len(place) else labels
     normals, curvature, sharp, valid = (
-        restore_points(values, voxels.inverse)
-        for values in (seg.normals, seg.curvature, seg.sharp, seg.valid)
+        restore_points(values, voxels.inverse) for values in seg[1:5]
     )
-    rows = finite_rows(tensor)
-    planes = summarize_planes(
-        tensor[rows],
-        normals[rows],
-        labels[rows],
-        up=config.planes.up_direction,
-        outline=config.planes.outline,
-    )
-    adjacency = _renumbered(seg.planes.adjacency, place)
-    return Segmentation(
-        labels, normals, curvature, sharp, valid, planes._replace(adjacency=adjacency)
-    )
+    rows, up, outline = finite_rows(tensor), config.planes.up_direction, config.planes.outline
+    planes = summarize_planes(tensor[rows], normals[rows], labels[rows], up=up, outline=outline)
+    planes = planes._replace(adjacency=_renumbered(seg.planes.adjacency, place))
+    return Segmentation(labels, normals, curvature, sharp, valid, planes)
 
 
 def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:
