@@ -2,7 +2,7 @@
 
 from torchrg.depth.config import DepthConfig
 from torchrg.depth.segment import segment_depth
-from torchrg.neighbors.voxels import restore_points, sample_voxels
+from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth
 from torchrg.transforms.fusion import fuse_depth
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
