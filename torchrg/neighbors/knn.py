@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.errors import ShapeError
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
-_QUERY_CHUNK = 65536
 _SAMPLE_SIZE = 400
 
 
@@ -145,9 +145,8 @@ def _search_cloud(
     if len(places) >= MIN_FOR_CELLS:
         sample = places[:: -(-len(places) // _SAMPLE_SIZE)]
         left = search_cells(places, k, tree.query(sample, [k])[0][:, 0], store)
-    for begin in range(0, len(left), _QUERY_CHUNK):
-        rows = left[begin : begin + _QUERY_CHUNK]
-        store(rows, *_query(tree, places[rows], width))
+    for chunk in chunks_of(len(left), ROWS_AT_ONCE):
+        store(left[chunk], *_query(tree, places[left[chunk]], width))
 
 
 def _query(

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchrg._checks import check_floating, check_shapes
-from torchrg._parallel import fair_chunks, map_chunks
+from torchrg._parallel import map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg.eigen import principal_frame
@@ -434,5 +434,4 @@ def estimate_irls(
             resolution=coordinate_resolution(points[chunk]),
         )
 
-    chunks = fair_chunks(len(points), chunk_size)
-    return join_fits(map_chunks(fit_chunk, chunks, points.device))
+    return join_fits(map_chunks(fit_chunk, len(points), chunk_size, points.device))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, gather_patches, search_knn
 from torchrg.structures import Neighbors
@@ -24,7 +25,7 @@ _OPEN = 1 << 24
 
 
 def vote_free_side(
-    points: Tensor, normals: Tensor, neighbors: Neighbors, *, chunk_size: int = 16384
+    points: Tensor, normals: Tensor, neighbors: Neighbors, *, chunk_size: int = CHUNK_SIZE
 ) -> Tensor:
     r"""Return how much more free space lies in front of each point than behind it.
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchrg._parallel import fair_chunks, map_chunks
+from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.linalg.moments import coordinate_resolution
 from torchrg.neighbors import gather_patches
@@ -21,7 +21,7 @@ def fit_points(
     fit: FitPatches,
     *,
     rows: Tensor | None = None,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
 ) -> NormalFit:
     """Fit the neighbourhoods of some points of a cloud, with bounded memory.
 
@@ -50,8 +50,8 @@ def fit_points(
         patches = gather_patches(points, neighbors.indices[block])
         return fit(patches, mask, coordinate_resolution(points[block]))
 
-    chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
-    return join_fits(map_chunks(fit_chunk, chunks, points.device))
+    num_rows = len(points) if rows is None else len(rows)
+    return join_fits(map_chunks(fit_chunk, num_rows, chunk_size, points.device))
 
 
 def join_fits(parts: Sequence[NormalFit]) -> NormalFit:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import chunks_of, places_of, run_chunks
+from torchrg._parallel import chunks_of, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import gather_patches
@@ -91,16 +91,9 @@ def pack_edges(
     chunks = chunks_of(num_points, chunk_size)
     at_once = _BLOCKS_A_THREAD * max(torch.get_num_threads(), 1)
     used = 0
-    found: dict[int, EdgeBlock] = {}
-
-    def find(rows: slice) -> None:
-        found[rows.start] = edges_of(rows)
-
     for first in range(0, len(chunks), at_once):
         group = chunks[first : first + at_once]
-        run_chunks(find, group, device)
-        for rows in group:
-            block = found.pop(rows.start)
+        for rows, block in zip(group, map_tasks(edges_of, group, device), strict=True):
             targets[used : used + len(block.targets)] = block.targets
             starts[rows.start + 1 : rows.stop + 1] = used + np.cumsum(block.counts)
             used += len(block.targets)

@@ -10,13 +10,8 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import chunks_of
-from torchrg.robust.lanes import (
-    covariance_entries,
-    eigenvectors,
-    sum_points,
-    sum_squares,
-    take_lanes,
-)
+from torchrg.robust.lanes import covariance_entries, eigenvectors, sum_squares, take_lanes
+from torchrg.robust.scale import sum_points
 
 NUM_SIMPLICES = 128
 """Sets of P + 1 points looked at; 27 of 50 points on a plane escape all of them once in 25,000."""

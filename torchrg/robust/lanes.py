@@ -1,17 +1,16 @@
 """Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches (lanes).
 
 Every lane is computed by the same operations in the same order wherever it stands, so a result
-does not depend, to the last bit, on the chunk it was computed in. ``torch.sum`` does not promise
-that: it adds the last lanes of a tensor in another order than the first.
+does not depend, to the last bit, on the chunk it was computed in.
 """
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg.linalg import at_most, eigh3
+from torchrg.robust.scale import median_of_sorted, sort_rows, sum_points
 
 
 def split_columns(patches: Tensor) -> list[Tensor]:
@@ -29,22 +28,6 @@ def take_lanes(columns: list[Tensor], lanes: Tensor) -> list[Tensor]:
     return [column.index_select(1, lanes) for column in columns]
 
 
-def sum_points(values: Tensor) -> Tensor:
-    """Sum each lane of ``(K, *)`` over its points, in the same order for every lane."""
-    if values.device.type == "cpu":
-        # NumPy adds row by row only where rows are contiguous and longer than one.
-        flat = values.reshape(len(values), -1).contiguous()
-        if flat.shape[1] == 1:
-            flat = flat.expand(-1, 2).contiguous()
-        total = torch.from_numpy(np.add.reduce(flat.numpy(), axis=0))
-        return total[: values[0].numel()].reshape(values.shape[1:])
-    while len(values) > 1:
-        half = len(values) // 2
-        folded = values[:half] + values[half : 2 * half]
-        values = torch.cat([folded, values[2 * half :]]) if len(values) % 2 else folded
-    return values[0]
-
-
 def sorted_points(values: Tensor) -> Tensor:
     """Sort each lane of ``(K, M)`` and return the lanes as rows ``(M, K)``."""
     return sort_rows(values.t().contiguous())
@@ -53,13 +36,6 @@ def sorted_points(values: Tensor) -> Tensor:
 def median_points(values: Tensor) -> Tensor:
     """Median of each lane of ``(K, M)``, shape ``(M,)``."""
     return median_of_sorted(sorted_points(values))
-
-
-def median_of_sorted(rows: Tensor) -> Tensor:
-    """Median of each sorted row of ``(M, K)``: the mean of the middle two for an even K."""
-    count = rows.shape[1]
-    low, high = rows[:, (count - 1) // 2], rows[:, count // 2]
-    return low if count % 2 else low + (high - low) / 2
 
 
 def smallest_points(distances: Tensor, size: int) -> Tensor:
@@ -102,13 +78,6 @@ def eigenvectors(matrices: Tensor) -> Tensor:
         return eigh3(matrices)[1]
     vectors: Tensor = torch.linalg.eigh(matrices)[1]
     return vectors
-
-
-def sort_rows(rows: Tensor) -> Tensor:
-    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
-    if rows.device.type == "cpu":
-        return torch.from_numpy(np.sort(rows.numpy(), axis=1))
-    return rows.sort(dim=1).values
 
 
 class Ellipsoid(NamedTuple):

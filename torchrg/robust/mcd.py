@@ -14,10 +14,10 @@ from torchrg.robust.lanes import (
     join_columns,
     smallest_points,
     sq_distances,
-    sum_points,
     take_lanes,
 )
 from torchrg.robust.patches import CHUNK_SIZE, RobustFit, fit_patchwise
+from torchrg.robust.scale import sum_points
 from torchrg.robust.starts import (
     deterministic_starts,
     draw_seed,

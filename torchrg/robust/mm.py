@@ -18,12 +18,11 @@ from torchrg.robust.lanes import (
     median_points,
     smallest_points,
     sq_distances,
-    sum_points,
     take_lanes,
 )
 from torchrg.robust.mcd import Starts, check_starts, initial_sets
 from torchrg.robust.patches import RobustFit, fit_patchwise
-from torchrg.robust.scale import half_size
+from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]

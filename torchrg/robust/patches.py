@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import chunks_of, run_chunks
+from torchrg._parallel import map_chunks
 from torchrg.errors import ConfigError
 from torchrg.robust.exact import find_flats, flatness_tolerance, refine_flat
 from torchrg.robust.lanes import (
@@ -16,9 +16,9 @@ from torchrg.robust.lanes import (
     join_columns,
     median_points,
     split_columns,
-    sum_points,
     take_lanes,
 )
+from torchrg.robust.scale import sum_points
 from torchrg.robust.weights import Estimate, subset_size
 
 
@@ -126,7 +126,8 @@ Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
 CHUNK_SIZE = 4096
 """Patches worked on together; what they need has to fit the processor's cache."""
 
-_MIN_SHARE = 64
+_LEAST_PATCHES = 64
+"""Patches that are worth a thread's start."""
 
 
 def fit_patchwise(
@@ -179,7 +180,6 @@ def _fit_groups(
         if count == 0:
             continue
         rows = torch.nonzero(counts == count).squeeze(1)
-        share = min(chunk_size, max(_MIN_SHARE, -(-len(rows) // torch.get_num_threads())))
 
         def work(
             chunk: slice, rows: Tensor = rows, whole: bool = count == num_points, count: int = count
@@ -195,7 +195,7 @@ def _fit_groups(
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
 
-        run_chunks(work, chunks_of(len(rows), share), patches.device)
+        map_chunks(work, len(rows), chunk_size, patches.device, least=_LEAST_PATCHES)
     return out
 
 

@@ -12,18 +12,16 @@ from torch import Tensor
 from torchrg.robust.lanes import (
     covariance_entries,
     eigenvectors,
-    median_of_sorted,
     median_points,
     smallest_points,
-    sort_rows,
     sorted_points,
-    sum_points,
     sum_squares,
 )
 from torchrg.robust.scale import (
-    QN_REVISED_FACTOR,
-    majority_difference,
-    qn_sample_factor,
+    median_of_sorted,
+    qn_of_sorted,
+    sort_rows,
+    sum_points,
     tau_of_sorted,
 )
 
@@ -64,10 +62,9 @@ def _standardize(column: Tensor) -> Tensor:
 
 def _scale(rows: Tensor) -> Tensor:
     """Qn of sorted rows with its finite-sample factor; tau of long ones, as robustbase has it."""
-    count = rows.shape[1]
-    if count >= _LONG:
+    if rows.shape[1] >= _LONG:
         return tau_of_sorted(rows)
-    return QN_REVISED_FACTOR * qn_sample_factor(count) * majority_difference(rows)
+    return qn_of_sorted(rows, finite_sample=True)
 
 
 def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:

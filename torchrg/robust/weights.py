@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most
-from torchrg.robust.lanes import covariance_entries, join_columns, sum_points
+from torchrg.robust.lanes import covariance_entries, join_columns
+from torchrg.robust.scale import sum_points
 
 
 def subset_size(num_points: int, num_coordinates: int, support_fraction: float) -> int:
