@@ -4,6 +4,7 @@ Every lane is computed by the same operations in the same order wherever it stan
 does not depend, to the last bit, on the chunk it was computed in.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -41,12 +42,7 @@ def median_points(values: Tensor) -> Tensor:
 def smallest_points(distances: Tensor, size: int) -> Tensor:
     """Mark exactly ``size`` smallest values of each lane; of equal ones the first points win.
 
-    Args:
-        distances: Values, shape ``(K, M)``, without NaN.
-        size: How many to mark, from 1 to K.
-
-    Returns:
-        1 for a marked point, 0 for another, shape ``(K, M)`` and dtype of ``distances``.
+    The values ``(K, M)`` hold no NaN. Returns 1 for a marked point and 0 for another.
     """
     num_points = len(distances)
     if size == num_points:
@@ -64,12 +60,17 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
     return marked
 
 
-def sum_squares(parts: list[Tensor]) -> Tensor:
-    """Sum of the squares of P tensors of one shape: squared lengths from coordinates."""
-    total = parts[0] * parts[0]
-    for part in parts[1:]:
-        total = total + part * part
+def dot(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
+    """Sum of the products of P tensors and P others that fit them."""
+    total = parts[0] * factors[0]
+    for part, factor in zip(parts[1:], factors[1:], strict=True):
+        total += part * factor
     return total
+
+
+def sum_squares(parts: Sequence[Tensor]) -> Tensor:
+    """Sum of the squares of P tensors of one shape: squared lengths from coordinates."""
+    return dot(parts, parts)
 
 
 def eigenvectors(matrices: Tensor) -> Tensor:

@@ -123,7 +123,7 @@ def no_fit(batch: torch.Size, num_points: int, num_coordinates: int, like: Tenso
 Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
 """Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
 
-CHUNK_SIZE = 4096
+PATCHES_IN_CACHE = 4096
 """Patches worked on together; what they need has to fit the processor's cache."""
 
 _LEAST_PATCHES = 64
@@ -255,7 +255,7 @@ def _fit_chunk(
         fit = _fit_groups(
             patches[lower],
             rest,
-            CHUNK_SIZE,
+            PATCHES_IN_CACHE,
             lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
         )
         _store(out, lower, fit)
