@@ -4,10 +4,12 @@ Every lane is computed by the same operations in the same order wherever it stan
 does not depend, to the last bit, on the chunk it was computed in.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.linalg import at_most, eigh3
@@ -79,6 +81,18 @@ def eigenvectors(matrices: Tensor) -> Tensor:
         return eigh3(matrices)[1]
     vectors: Tensor = torch.linalg.eigh(matrices)[1]
     return vectors
+
+
+def map_values(
+    on_cpu: Callable[..., NDArray[np.floating]],
+    elsewhere: Callable[..., Tensor],
+    values: Tensor,
+    *more: float,
+) -> Tensor:
+    """Apply NumPy's function on a CPU: the same for a value wherever it stands; torch's is not."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(on_cpu(values.numpy(), *more))
+    return elsewhere(values, *more)
 
 
 class Ellipsoid(NamedTuple):

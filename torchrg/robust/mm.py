@@ -16,6 +16,7 @@ from torchrg.robust.lanes import (
     determinant,
     fit_ellipsoid,
     join_columns,
+    map_values,
     median_points,
     smallest_points,
     sq_distances,
@@ -275,13 +276,9 @@ def _shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
 
 def _volume(ellipsoid: Ellipsoid) -> Tensor:
     """The P-th root of the determinant of each lane's sums of squares."""
-    product = determinant(ellipsoid, 1.0)
-    root = 1 / len(ellipsoid.squares)
-    if product.device.type == "cpu":
-        # NumPy's power is the same for a value wherever it stands; torch's is not.
-        product = torch.from_numpy(np.power(product.numpy(), root))
-    else:
-        product = product**root
+    product = map_values(
+        np.power, torch.pow, determinant(ellipsoid, 1.0), 1 / len(ellipsoid.squares)
+    )
     return product.to(ellipsoid.squares[0].dtype)
 
 

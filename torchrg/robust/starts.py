@@ -15,6 +15,7 @@ from torchrg.robust.lanes import (
     covariance_entries,
     dot,
     eigenvectors,
+    map_values,
     median_points,
     smallest_points,
     sorted_points,
@@ -132,7 +133,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     inner = [sum_points(half * column) / sum_points(half) for column in columns]
     return torch.stack(
         [
-            _correlation([_tanh(column) for column in columns]),
+            _correlation([map_values(np.tanh, torch.tanh, column) for column in columns]),
             _correlation([rank.to(norms.dtype) for rank in ranks]),
             _correlation([torch.take(scores, rank) for rank in ranks]),
             covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
@@ -222,13 +223,6 @@ def _score_table(count: int) -> tuple[float, ...]:
 
 def _normal_scores(count: int, like: Tensor) -> Tensor:
     return torch.tensor(_score_table(count), dtype=like.dtype, device=like.device)
-
-
-def _tanh(values: Tensor) -> Tensor:
-    """Hyperbolic tangent, the same for a value wherever it stands; torch's on a CPU is not."""
-    if values.device.type == "cpu":
-        return torch.from_numpy(np.tanh(values.numpy()))
-    return values.tanh()
 
 
 def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
