@@ -287,12 +287,19 @@ def _sort_by_distance(
     order += (np.arange(num_rows) * count)[:, None]
     distances, rows = _take(distances.reshape(-1), order), _take(rows.reshape(-1), order)
     keys &= ~position
-    if (keys[:, 1:] == keys[:, :-1]).any():
-        tied = np.flatnonzero((keys[:, 1:] == keys[:, :-1]).any(axis=1))
+    sort_ties(distances, rows, keys[:, 1:] == keys[:, :-1])
+    return distances[:, :k], rows[:, :k]
+
+
+def sort_ties(
+    distances: NDArray[np.float64], rows: NDArray[np.integer], is_tie: NDArray[np.bool_]
+) -> None:
+    """Sort lists ``(n, k)`` that have a tie ``(n, k - 1)`` by (distance, row), in place."""
+    if is_tie.any():
+        tied = np.flatnonzero(is_tie.any(axis=1))
         by_both = np.lexsort((rows[tied], distances[tied]))
         distances[tied] = np.take_along_axis(distances[tied], by_both, axis=1)
         rows[tied] = np.take_along_axis(rows[tied], by_both, axis=1)
-    return distances[:, :k], rows[:, :k]
 
 
 def _take(values: NDArray[Scalar], places: NDArray[np.integer]) -> NDArray[Scalar]:

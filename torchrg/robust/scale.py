@@ -116,17 +116,10 @@ def qn(
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
 
-    Args:
-        x: Values, floating point, any shape.
-        threshold: The bound, at least 0, in the unit of ``x``.
-        dim: Axis to reduce.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
+    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`.
 
     Returns:
         The same as ``qn(x, dim=dim, mask=mask) > threshold``, bool; False where Qn is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
 
     Example:
         >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
