@@ -39,6 +39,9 @@ _EFFICIENCY = 0.95
 _MAX_STEPS = 300
 """Reweightings after which weights that have not settled are left as they are."""
 
+_SETTLED = {torch.float32: 16, torch.float64: 4096}
+"""Relative change of a reweighting, in roundings, at which weights have settled."""
+
 _CHECK_EVERY = 4
 """Reweightings between two looks at what has settled."""
 
@@ -153,12 +156,12 @@ def fit_detmm(
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         first, scale = _best_s_estimate(columns, floor, size, starts)
         cutoff = efficiency_constant(len(columns), tuned_for)
-        final, _ = _reweight_shape(columns, first, scale, floor, cutoff, adapt_scale=False)
+        weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
+        final = _shape_of(columns, weights, floor)
         sq_unit = cutoff * cutoff * scale * scale
         before = sum_points(_bisquare_loss(first.distances / sq_unit))
         after = sum_points(_bisquare_loss(final.distances / sq_unit))
-        weights = torch.where(after <= before, final.weights, first.weights)
-        final = _shape_of(columns, weights, floor)
+        final = _shape_of(columns, torch.where(after <= before, weights, first.weights), floor)
         return _estimate(columns, first, final, scale, quantile)
 
     return fit_patchwise(
@@ -172,7 +175,7 @@ def _best_s_estimate(
     """Iterate every start of each lane to an S-estimate, and keep that of the smallest scale."""
     num_points, num_lanes = columns[0].shape
     cutoff = breakdown_constant(len(columns))
-    shapes, scales = [], []
+    weights, scales = [], []
     for initial, count in initial_sets(columns, size, starts):
         num_starts = initial.shape[1]
         points = [column.repeat(1, num_starts) for column in columns]
@@ -182,18 +185,13 @@ def _best_s_estimate(
         members = smallest_points(sq_distances(ellipsoid, count), size)
         shape = _shape_of(points, members, floors)
         scale = _m_scale(shape.distances, cutoff)
-        shape, scale = _reweight_shape(points, shape, scale, floors, cutoff, adapt_scale=True)
-        shapes.append(shape)
+        settled, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
+        weights.append(settled.reshape(num_points, num_starts, num_lanes))
         scales.append(scale.reshape(num_starts, num_lanes))
     scale = torch.cat(scales)
     best = scale.argmin(dim=0)
-    lane = torch.arange(num_lanes, device=best.device)
-    weights = torch.cat(
-        [shape.weights.reshape(num_points, -1, num_lanes) for shape in shapes], dim=1
-    )
-    return _shape_of(
-        columns, weights.gather(1, best.expand(num_points, 1, -1)).squeeze(1), floor
-    ), scale[best, lane]
+    chosen = torch.cat(weights, dim=1).gather(1, best.expand(num_points, 1, -1)).squeeze(1)
+    return _shape_of(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
 
 
 def _estimate(
@@ -222,7 +220,7 @@ def _estimate(
     )
 
 
-def _reweight_shape(
+def _reweight(
     columns: list[Tensor],
     start: _Shape,
     scale: Tensor,
@@ -230,14 +228,14 @@ def _reweight_shape(
     cutoff: float,
     *,
     adapt_scale: bool,
-) -> tuple[_Shape, Tensor]:
-    """Reweight until the weights settle; lanes that have settled leave the batch.
+) -> tuple[Tensor, Tensor]:
+    """Reweight until the weights settle, and return them and the scale.
 
-    With ``adapt_scale`` the scale takes one step to the M-scale before each reweighting: solving
-    for it fully can lead to another local minimum.
+    Lanes that have settled leave the batch. With ``adapt_scale`` the scale takes one step to the
+    M-scale before each reweighting: solving for it fully can lead to another local minimum.
     """
     eps = torch.finfo(scale.dtype).eps
-    enough = 16 * eps if scale.dtype == torch.float32 else 4096 * eps
+    enough = _SETTLED[scale.dtype] * eps
     weights, scales = start.weights.clone(), scale.clone()
     places = torch.arange(len(scale), device=scale.device)
     points, floors = columns, floor
@@ -264,7 +262,7 @@ def _reweight_shape(
             places, scale, floors = places[moving], scale[moving], floors[moving]
             distances, current = take_lanes([distances, current], moving)
         previous = current
-    return _shape_of(columns, weights, floor), scales
+    return weights, scales
 
 
 def _shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
