@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
 
 Settings = TypeVar("Settings")
@@ -160,7 +161,7 @@ class PipelineConfig:
     """How normals and curvature are estimated."""
     growing: GrowingConfig = field(default_factory=GrowingConfig)
     """How regions grow."""
-    chunk_size: int = 16384
+    chunk_size: int = CHUNK_SIZE
     """Points handled at a time; bounds the memory of each stage, never changes a result."""
     planes: PlanesConfig = field(default_factory=PlanesConfig)
     """What the table of planes says."""

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance, eigh3
 from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, qn
-from torchrg.robust.mcd import Starts
 from torchrg.robust.mm import Target
+from torchrg.robust.starts import Starts
 
 
 class _Function(nn.Module):

@@ -41,7 +41,7 @@ def test_neighbors_do_not_depend_on_the_order(rng):
 def test_chunks_and_threads_change_nothing(rng, monkeypatch):
     points = torch.rand(3000, 3, generator=rng)
     whole = search_knn(points, 9).indices
-    monkeypatch.setattr(knn_module, "_QUERY_CHUNK", 117)
+    monkeypatch.setattr(knn_module, "ROWS_AT_ONCE", 117)
     assert torch.equal(search_knn(points, 9).indices, whole)
     threads = torch.get_num_threads()
     torch.set_num_threads(1 if threads > 1 else 2)

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError, ShapeError
+from torchrg.neighbors.order import gather_bits
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.colors import oklab_to_rgb, rgb_to_oklab, touching_planes
-from torchrg.render.grid import build_grid, gather_bits
+from torchrg.render.grid import build_grid
 from torchrg.scenes import make_room
 
 CLEARLY = 0.08  # in OKLab; neighbouring tones of a good screen differ by about 0.02

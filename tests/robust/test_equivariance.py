@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
-from torchrg.robust.lanes import smallest_points, sum_points
+from torchrg.robust.lanes import smallest_points
+from torchrg.robust.scale import sum_points
 
 ESTIMATORS = {
     "paper": fit_detmcd,

@@ -5,7 +5,7 @@ import torch
 from tests.robust.oracle_cases import FRACTIONS, fit_all, load_oracles, local_float32, points_of
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_fastmcd
-from torchrg.robust.mcd import Concentrated, _distinct_best
+from torchrg.robust.mcd import _Concentrated, _distinct_best
 
 
 def gaps(folder, convert, chosen):
@@ -90,7 +90,7 @@ def test_more_starts_never_lose_on_average(rng):
 def test_equal_sets_are_kept_once():
     determinants = torch.tensor([[3.0], [1.0], [2.0], [1.0], [2.0]], dtype=torch.float64)
     members = torch.arange(5.0).reshape(1, 5, 1)
-    kept = _distinct_best(Concentrated(members, determinants, 1), 3)
+    kept = _distinct_best(_Concentrated(members, determinants), 3)
     assert kept.flatten().tolist() == [1, 2, 0]
 
 

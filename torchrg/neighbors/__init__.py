@@ -1,6 +1,16 @@
-"""Neighbourhoods: exact search, canonical order, patches."""
+"""Neighbourhoods: exact search, canonical order, patches, voxels."""
 
 from torchrg.neighbors.knn import gather_patches, search_knn
 from torchrg.neighbors.order import canonical_order, finite_rows, restore_rows
+from torchrg.neighbors.voxels import Voxels, restore_points, sample_voxels
 
-__all__ = ["canonical_order", "finite_rows", "gather_patches", "restore_rows", "search_knn"]
+__all__ = [
+    "Voxels",
+    "canonical_order",
+    "finite_rows",
+    "gather_patches",
+    "restore_points",
+    "restore_rows",
+    "sample_voxels",
+    "search_knn",
+]

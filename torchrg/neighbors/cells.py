@@ -6,161 +6,33 @@ only if no point outside the cells can be nearer; the tree answers for the other
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrg._parallel import run_chunks, take
-
-_FAR = 1e6
-"""Distance of what fills up rows of candidates, in extents of the cloud."""
-
-WIDTH_STEP = 64
-"""Rows of candidates are filled up to a multiple of this."""
-
-
-class CellGrid(NamedTuple):
-    """A cloud sorted by cells; places are positions in that order.
-
-    Attributes:
-        columns: Coordinates by place, and a last one far away, each shape ``(N + 1,)``.
-        rows: Row of each place, shape ``(N + 1,)``.
-        asked: Places to answer for, ascending, shape ``(n,)``.
-        first_asked: First of each asked cell in ``asked``, shape ``(C,)``.
-        num_asked: Number of them, shape ``(C,)``.
-        centers: Centres of the asked cells, shape ``(3, C)``.
-        starts: First place of each of the nine columns of three cells about a cell, ``(C, 9)``.
-        lengths: Number of points in each, shape ``(C, 9)``.
-        size: Side of a cell.
-    """
-
-    columns: list[NDArray[np.float64]]
-    rows: NDArray[np.int32]
-    asked: NDArray[np.int64]
-    first_asked: NDArray[np.int64]
-    num_asked: NDArray[np.int64]
-    centers: NDArray[np.float64]
-    starts: NDArray[np.int64]
-    lengths: NDArray[np.int64]
-    size: float
-
-
-def make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64]) -> CellGrid:
-    """Sort a cloud by cells, and list those around each cell that holds an asked row."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    far = low + _FAR * (high - low).max()
-    cell = np.floor((points - low) / size).astype(np.int64) + 1
-    _, width, height = (int(count) + 2 for count in cell.max(axis=0))
-    keys = (cell[:, 0] * width + cell[:, 1]) * height + cell[:, 2]
-    order = np.argsort(keys)
-    keys = keys[order]
-    first = run_starts(keys)
-    cell_keys, ends = keys[first], np.append(first, len(points))
-    is_asked = np.zeros(len(points), dtype=bool)
-    is_asked[rows] = True
-    asked = np.flatnonzero(is_asked[order])
-    first_asked = run_starts(keys[asked])
-    own = asked[first_asked]
-    # Cells that differ in z alone have consecutive keys: three of them are one range.
-    around = np.array([x * width + y for x in (-1, 0, 1) for y in (-1, 0, 1)]) * height
-    starts = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around - 1))]
-    stops = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around + 2))]
-    return CellGrid(
-        columns=[np.append(points[order, axis], far[axis]) for axis in range(3)],
-        rows=np.append(order, -1).astype(np.int32),
-        asked=asked,
-        first_asked=first_asked,
-        num_asked=np.diff(first_asked, append=len(asked)),
-        centers=(low + (cell[order[own]] - 0.5) * size).T.copy(),
-        starts=starts,
-        lengths=stops - starts,
-        size=size,
-    )
-
-
-def run_starts(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return where runs of equal values begin."""
-    return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else values
-
-
-def list_candidates(grid: CellGrid, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the places of all points about each cell, the rest of a row the place far away."""
-    starts, lengths = grid.starts[cells].ravel(), grid.lengths[cells].ravel()
-    total = grid.lengths[cells].sum(axis=1)
-    before = np.cumsum(lengths) - lengths
-    width = -(-int(total.max()) // WIDTH_STEP) * WIDTH_STEP
-    places = np.full((len(cells), width), len(grid.rows) - 1)
-    places[np.arange(width) < total[:, None]] = np.arange(total.sum()) + np.repeat(
-        starts - before, lengths
-    )
-    return places
-
-
-MAX_CANDIDATES = 512
-"""What NumPy sorts without a branch (AVX-512)."""
-
-_POSITION = MAX_CANDIDATES - 1
-
-
-def sq_distances_between(
-    queries: NDArray[np.float32], candidates: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return squared distances from ``(C, Q, 3)`` to ``(C, 3, W)``, shape ``(C, Q, W)``."""
-    lengths = (candidates * candidates).sum(axis=1, keepdims=True)
-    product = torch.baddbmm(
-        torch.from_numpy(lengths), torch.from_numpy(queries), torch.from_numpy(candidates), alpha=-2
-    )
-    result: NDArray[np.float32] = product.numpy()
-    result += (queries * queries).sum(axis=2)[:, :, None]
-    return result
-
-
-def select_smallest(
-    sq_distances: NDArray[np.float32], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return where the smallest values of each row are, and what the others are not below.
-
-    The last bits of a value give way to its position: one sort does for both.
-    """
-    keys = sq_distances.view(np.int32)
-    keys &= ~_POSITION
-    keys |= np.arange(keys.shape[1], dtype=np.int32)
-    keys.sort(axis=1)
-    bound = (keys[:, count] & ~_POSITION).view(np.float32)
-    return (keys[:, :count] & _POSITION).astype(np.int64), bound.astype(np.float64)
-
-
-def sort_by_distance(
-    distances: NDArray[np.float64], rows: NDArray[np.int32], k: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Return the k nearest by (distance, row)."""
-    num_rows, count = distances.shape
-    position = np.int64(2 ** (count - 1).bit_length() - 1)
-    keys = distances.view(np.int64) & ~position
-    keys |= np.arange(count)
-    keys.sort(axis=1)
-    order = keys & position
-    order += (np.arange(num_rows) * count)[:, None]
-    distances, rows = take(distances.reshape(-1), order), take(rows.reshape(-1), order)
-    keys &= ~position
-    if (keys[:, 1:] == keys[:, :-1]).any():
-        tied = np.flatnonzero((keys[:, 1:] == keys[:, :-1]).any(axis=1))
-        by_both = np.lexsort((rows[tied], distances[tied]))
-        distances[tied] = np.take_along_axis(distances[tied], by_both, axis=1)
-        rows[tied] = np.take_along_axis(rows[tied], by_both, axis=1)
-    return distances[:, :k], rows[:, :k]
-
+from torchrg._parallel import CACHE_BYTES, chunks_of, map_tasks
 
 Store = Callable[[NDArray[np.integer], NDArray[np.float64], NDArray[np.integer]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""
 
+Scalar = TypeVar("Scalar", bound=np.generic)
+
 MIN_FOR_CELLS = 2000
 """Points below which a tree is as fast as cells."""
 
+_MAX_CANDIDATES = 512
+"""Candidates of a point at most: what NumPy sorts without a branch (AVX-512)."""
+
 _MIN_CANDIDATES = 2.4
 """Candidates for a neighbour wanted; with fewer, most results would not count."""
+
+_WIDTH_STEP = 64
+"""Rows of candidates are filled up to a multiple of this."""
+
+_POSITION = _MAX_CANDIDATES - 1
+"""The bits of a sorted distance that hold the place of its candidate."""
 
 _SPARE = 6
 """Neighbours selected beyond k, for the bits that the selection does not see."""
@@ -171,8 +43,11 @@ _SIZE_STEP = 1.5
 _MIN_SHARE = 0.03
 """Share of the points for which another size of cells is worth its sort."""
 
+_FAR = 1e6
+"""Distance of what fills up rows of candidates, in extents of the cloud."""
+
 _MAX_KEY = 2.0**62
-_CHUNK_BYTES = 2**22
+"""Cells of a grid that int64 still numbers."""
 
 
 def search_cells(
@@ -200,7 +75,7 @@ def search_cells(
         (2500, 1.4142135623730951)
     """
     left = np.arange(len(points))
-    if _MIN_CANDIDATES * (k + _SPARE) <= MAX_CANDIDATES:
+    if _MIN_CANDIDATES * (k + _SPARE) <= _MAX_CANDIDATES:
         for size in _cell_sizes(reach):
             if len(left) >= MIN_FOR_CELLS:
                 left = _search_level(points, k, size, left, store)
@@ -224,70 +99,213 @@ def _search_level(
     """Answer for the rows that cells of one size can answer for, and return the others."""
     if (np.ptp(points, axis=0) / size + 4).prod() > _MAX_KEY:
         return rows
-    grid = make_grid(points, size, rows)
-    tasks = _make_tasks(grid, k)
+    grid = _make_grid(points, size, rows)
     settled = np.zeros(len(points), dtype=bool)
 
-    def work(chunk: slice) -> None:
-        for cells in tasks[chunk]:
-            found = _search_task(grid, cells, k)
-            settled[found[0]] = True
-            store(*found)
+    def work(cells: NDArray[np.int64]) -> None:
+        found = _search_task(grid, cells, k)
+        settled[found[0]] = True
+        store(*found)
 
-    run_chunks(work, [slice(i, i + 1) for i in range(len(tasks))], torch.device("cpu"))
+    map_tasks(work, _make_tasks(grid, k), torch.device("cpu"))
     return rows[~settled[rows]]
 
 
-def _make_tasks(grid: CellGrid, k: int) -> list[NDArray[np.int64]]:
+class _CellGrid(NamedTuple):
+    """A cloud sorted by cells; places are positions in that order.
+
+    Attributes:
+        columns: Coordinates by place, and a last one far away, each shape ``(N + 1,)``.
+        rows: Row of each place, shape ``(N + 1,)``.
+        asked: Places to answer for, ascending, shape ``(n,)``.
+        first_asked: First of each asked cell in ``asked``, shape ``(C,)``.
+        num_asked: Number of them, shape ``(C,)``.
+        centers: Centres of the asked cells, shape ``(3, C)``.
+        starts: First place of each of the nine columns of three cells about a cell, ``(C, 9)``.
+        lengths: Number of points in each, shape ``(C, 9)``.
+        size: Side of a cell.
+    """
+
+    columns: list[NDArray[np.float64]]
+    rows: NDArray[np.int32]
+    asked: NDArray[np.int64]
+    first_asked: NDArray[np.int64]
+    num_asked: NDArray[np.int64]
+    centers: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    size: float
+
+
+def _make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64]) -> _CellGrid:
+    """Sort a cloud by cells, and list those around each cell that holds an asked row."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    far = low + _FAR * (high - low).max()
+    cell = np.floor((points - low) / size).astype(np.int64) + 1
+    _, width, height = (int(count) + 2 for count in cell.max(axis=0))
+    keys = (cell[:, 0] * width + cell[:, 1]) * height + cell[:, 2]
+    order = np.argsort(keys)
+    keys = keys[order]
+    first = _run_starts(keys)
+    cell_keys, ends = keys[first], np.append(first, len(points))
+    is_asked = np.zeros(len(points), dtype=bool)
+    is_asked[rows] = True
+    asked = np.flatnonzero(is_asked[order])
+    first_asked = _run_starts(keys[asked])
+    own = asked[first_asked]
+    # Cells that differ in z alone have consecutive keys: three of them are one range.
+    around = np.array([x * width + y for x in (-1, 0, 1) for y in (-1, 0, 1)]) * height
+    starts = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around - 1))]
+    stops = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around + 2))]
+    return _CellGrid(
+        columns=[np.append(points[order, axis], far[axis]) for axis in range(3)],
+        rows=np.append(order, -1).astype(np.int32),
+        asked=asked,
+        first_asked=first_asked,
+        num_asked=np.diff(first_asked, append=len(asked)),
+        centers=(low + (cell[order[own]] - 0.5) * size).T.copy(),
+        starts=starts,
+        lengths=stops - starts,
+        size=size,
+    )
+
+
+def _make_tasks(grid: _CellGrid, k: int) -> list[NDArray[np.int64]]:
     """Group cells with enough candidates, and not too many, by the shape of their matrix."""
     total = grid.lengths.sum(axis=1)
-    enough = (total <= MAX_CANDIDATES) & (total >= _MIN_CANDIDATES * (k + _SPARE))
+    enough = (total <= _MAX_CANDIDATES) & (total >= _MIN_CANDIDATES * (k + _SPARE))
     cells = np.flatnonzero(enough)
-    width, height = -(-total[cells] // WIDTH_STEP) * WIDTH_STEP, -(-grid.num_asked[cells] // 8) * 8
-    shape = width * (MAX_CANDIDATES + 1) + height
+    width, height = (
+        -(-total[cells] // _WIDTH_STEP) * _WIDTH_STEP,
+        -(-grid.num_asked[cells] // 8) * 8,
+    )
+    shape = width * (_MAX_CANDIDATES + 1) + height
     by_shape = np.argsort(shape, kind="stable")
     tasks = []
-    for same in np.split(by_shape, run_starts(shape[by_shape])[1:]):
+    for same in np.split(by_shape, _run_starts(shape[by_shape])[1:]):
         if len(same):
-            step = max(1, _CHUNK_BYTES // int(width[same[0]] * height[same[0]] * 4))
-            tasks += [cells[same[i : i + step]] for i in range(0, len(same), step)]
+            step = max(1, CACHE_BYTES // int(width[same[0]] * height[same[0]] * 4))
+            tasks += [cells[same[chunk]] for chunk in chunks_of(len(same), step)]
     return tasks
 
 
+def _run_starts(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where runs of equal values begin."""
+    return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else values
+
+
 def _search_task(
-    grid: CellGrid, cells: NDArray[np.int64], k: int
+    grid: _CellGrid, cells: NDArray[np.int64], k: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
     """Return those rows of some cells whose neighbours are certain, distances and neighbours."""
-    places = list_candidates(grid, cells)
+    places = _list_candidates(grid, cells)
     width = places.shape[1]
-    candidates = [take(column, places) for column in grid.columns]
+    candidates = [_take(column, places) for column in grid.columns]
     counts = grid.num_asked[cells]
     lanes = np.repeat(np.arange(len(cells)), counts)
     slots = np.arange(len(lanes)) - np.repeat(np.cumsum(counts) - counts, counts)
-    own = take(grid.asked, grid.first_asked[cells][lanes] + slots)
-    points = [take(column, own) for column in grid.columns]
+    own = _take(grid.asked, grid.first_asked[cells][lanes] + slots)
+    points = [_take(column, own) for column in grid.columns]
 
     centers = grid.centers[:, cells]
     about = np.stack([c - m[:, None] for c, m in zip(candidates, centers, strict=True)], axis=1)
     offsets = np.stack([p - m[lanes] for p, m in zip(points, centers, strict=True)], axis=1)
     queries = np.zeros((len(cells), int(counts.max()), 3), np.float32)
     queries[lanes, slots] = offsets
-    sq_distances = sq_distances_between(queries, about.astype(np.float32)).reshape(-1, width)
+    sq_distances = _sq_distances_between(queries, about.astype(np.float32)).reshape(-1, width)
     asked = lanes * queries.shape[1] + slots
-    selected, sq_beyond = select_smallest(take(sq_distances, asked), k + _SPARE)
+    selected, sq_beyond = _select_smallest(_take(sq_distances, asked), k + _SPARE)
 
     selected += (lanes * width)[:, None]
     exact = np.zeros(selected.shape)
     for candidate, point in zip(candidates, points, strict=True):
-        difference = take(candidate.reshape(-1), selected)
+        difference = _take(candidate.reshape(-1), selected)
         difference -= point[:, None]
         exact += np.multiply(difference, difference, out=difference)
-    rows = take(grid.rows, take(places.reshape(-1), selected))
-    distances, rows = sort_by_distance(np.sqrt(exact, out=exact), rows, k)
+    rows = _take(grid.rows, _take(places.reshape(-1), selected))
+    distances, rows = _sort_by_distance(np.sqrt(exact, out=exact), rows, k)
 
     # Rounding of the matrix product, and of which cell a point on a border is in.
     sq_beyond -= 64 * np.finfo(np.float32).eps * grid.size**2
     border = (1.5 * grid.size - np.abs(offsets).max(axis=1)) * (1 - 1e-6)
     certain = (distances[:, -1] < border) & (distances[:, -1] ** 2 < sq_beyond)
     kept = np.flatnonzero(certain)
-    return grid.rows[own[kept]], take(distances, kept), take(rows, kept)
+    return grid.rows[own[kept]], _take(distances, kept), _take(rows, kept)
+
+
+def _list_candidates(grid: _CellGrid, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the places of all points about each cell, the rest of a row the place far away."""
+    starts, lengths = grid.starts[cells].ravel(), grid.lengths[cells].ravel()
+    total = grid.lengths[cells].sum(axis=1)
+    before = np.cumsum(lengths) - lengths
+    width = -(-int(total.max()) // _WIDTH_STEP) * _WIDTH_STEP
+    places = np.full((len(cells), width), len(grid.rows) - 1)
+    places[np.arange(width) < total[:, None]] = np.arange(total.sum()) + np.repeat(
+        starts - before, lengths
+    )
+    return places
+
+
+def _sq_distances_between(
+    queries: NDArray[np.float32], candidates: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return squared distances from ``(C, Q, 3)`` to ``(C, 3, W)``, shape ``(C, Q, W)``."""
+    lengths = (candidates * candidates).sum(axis=1, keepdims=True)
+    product = torch.baddbmm(
+        torch.from_numpy(lengths), torch.from_numpy(queries), torch.from_numpy(candidates), alpha=-2
+    )
+    result: NDArray[np.float32] = product.numpy()
+    result += (queries * queries).sum(axis=2)[:, :, None]
+    return result
+
+
+def _select_smallest(
+    sq_distances: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return where the smallest values of each row are, and what the others are not below.
+
+    The last bits of a value give way to its position: one sort does for both.
+    """
+    keys = sq_distances.view(np.int32)
+    keys &= ~_POSITION
+    keys |= np.arange(keys.shape[1], dtype=np.int32)
+    keys.sort(axis=1)
+    bound = (keys[:, count] & ~_POSITION).view(np.float32)
+    return (keys[:, :count] & _POSITION).astype(np.int64), bound.astype(np.float64)
+
+
+def _sort_by_distance(
+    distances: NDArray[np.float64], rows: NDArray[np.int32], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the k nearest by (distance, row)."""
+    num_rows, count = distances.shape
+    position = np.int64(2 ** (count - 1).bit_length() - 1)
+    keys = distances.view(np.int64) & ~position
+    keys |= np.arange(count)
+    keys.sort(axis=1)
+    order = keys & position
+    order += (np.arange(num_rows) * count)[:, None]
+    distances, rows = _take(distances.reshape(-1), order), _take(rows.reshape(-1), order)
+    keys &= ~position
+    sort_ties(distances, rows, keys[:, 1:] == keys[:, :-1])
+    return distances[:, :k], rows[:, :k]
+
+
+def sort_ties(
+    distances: NDArray[np.float64], rows: NDArray[np.integer], is_tie: NDArray[np.bool_]
+) -> None:
+    """Sort lists ``(n, k)`` that have a tie ``(n, k - 1)`` by (distance, row), in place."""
+    if is_tie.any():
+        tied = np.flatnonzero(is_tie.any(axis=1))
+        by_both = np.lexsort((rows[tied], distances[tied]))
+        distances[tied] = np.take_along_axis(distances[tied], by_both, axis=1)
+        rows[tied] = np.take_along_axis(rows[tied], by_both, axis=1)
+
+
+def _take(values: NDArray[Scalar], places: NDArray[np.integer]) -> NDArray[Scalar]:
+    """Return ``values[places]``, rows of ``values`` at places of any shape.
+
+    NumPy's indexing and ``take`` hold the interpreter's lock, and keep other threads waiting.
+    """
+    rows = torch.from_numpy(values).index_select(0, torch.from_numpy(places.reshape(-1)))
+    return rows.numpy().reshape(places.shape + values.shape[1:])

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.errors import ShapeError
-from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells
+from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
-_QUERY_CHUNK = 65536
 _SAMPLE_SIZE = 400
+"""Points that tell how far the k-th neighbour is."""
 
 
 def search_knn(
@@ -145,9 +146,8 @@ def _search_cloud(
     if len(places) >= MIN_FOR_CELLS:
         sample = places[:: -(-len(places) // _SAMPLE_SIZE)]
         left = search_cells(places, k, tree.query(sample, [k])[0][:, 0], store)
-    for begin in range(0, len(left), _QUERY_CHUNK):
-        rows = left[begin : begin + _QUERY_CHUNK]
-        store(rows, *_query(tree, places[rows], width))
+    for chunk in chunks_of(len(left), ROWS_AT_ONCE):
+        store(left[chunk], *_query(tree, places[left[chunk]], width))
 
 
 def _query(
@@ -156,32 +156,17 @@ def _query(
     k: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the k nearest of distinct points by (distance, row), ties at the last place too."""
-    workers = torch.get_num_threads()
-    width = min(k + 1, tree.n)
-    distances, rows = tree.query(queries, np.arange(1, width + 1), workers=workers)
-    _sort_ties(distances, rows, np.arange(len(queries)))
-    open_end = np.flatnonzero((distances[:, k - 1] == distances[:, -1]) & (width > k))
-    distances, rows = distances[:, :k], rows[:, :k]
-    while len(open_end):
-        width = min(2 * width, tree.n)
-        far, more = tree.query(queries[open_end], np.arange(1, width + 1), workers=workers)
-        _sort_ties(far, more, np.arange(len(open_end)))
-        distances[open_end], rows[open_end] = far[:, :k], more[:, :k]
-        still = (far[:, k - 1] == far[:, -1]) if width < tree.n else np.zeros(len(far), dtype=bool)
-        open_end = open_end[still]
+    distances = np.empty((len(queries), k))
+    rows = np.empty((len(queries), k), dtype=np.int64)
+    left, width = np.arange(len(queries)), k + 1
+    while len(left):
+        ranks = np.arange(1, min(width, tree.n) + 1)
+        near, found = tree.query(queries[left], ranks, workers=torch.get_num_threads())
+        sort_ties(near, found, near[:, 1:] == near[:, :-1])
+        distances[left], rows[left] = near[:, :k], found[:, :k]
+        is_open = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
+        left, width = left[is_open], 2 * width
     return distances, rows
-
-
-def _sort_ties(
-    distances: NDArray[np.float64], rows: NDArray[np.int64], queries: NDArray[np.int64]
-) -> None:
-    """Sort equal distances by row number, in place."""
-    tied = queries[(distances[:, 1:] == distances[:, :-1]).any(axis=1)]
-    if len(tied):
-        by_row = np.argsort(rows[tied], axis=1)
-        near = np.take_along_axis(distances[tied], by_row, axis=1)
-        by_both = np.take_along_axis(by_row, np.argsort(near, axis=1, kind="stable"), axis=1)
-        rows[tied] = np.take_along_axis(rows[tied], by_both, axis=1)
 
 
 def _restore_duplicates(

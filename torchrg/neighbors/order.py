@@ -1,4 +1,4 @@
-"""The canonical order of points, which makes every result independent of the input order."""
+"""The canonical order of points, along a Morton curve: no result depends on the input order."""
 
 import numpy as np
 import torch
@@ -8,6 +8,16 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 
 _MORTON_BITS = 21
+"""Bits of a number in a Morton code: three of them fit an int64."""
+
+_SPREADS = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts that halve the runs of neighbouring bits, and where the bits then are."""
 
 
 def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
@@ -54,35 +64,6 @@ def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
     return torch.from_numpy(order).to(tensor.device)
 
 
-def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """Return the Morton code of each point in the cube about the cloud."""
-    low = coordinates.min(axis=0).astype(np.float64)
-    extent = float((coordinates.max(axis=0) - low).max())
-    codes = np.zeros(len(coordinates), dtype=np.uint64)
-    if extent == 0:
-        return codes
-    for axis in range(3):
-        relative = (coordinates[:, axis] - low[axis]) / extent
-        codes |= _spread_bits((relative * (2**_MORTON_BITS - 1)).astype(np.uint64)) << np.uint64(
-            axis
-        )
-    return codes
-
-
-def _spread_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Put two zero bits between the bits of 21-bit numbers."""
-    result = values
-    for shift, pattern in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        result = (result | result << np.uint64(shift)) & np.uint64(pattern)
-    return result
-
-
 def finite_rows(points: Tensor) -> Tensor:
     """Return the rows of the finite points, in canonical order.
 
@@ -118,3 +99,55 @@ def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0
     """
     result = values.new_full((num_points, *values.shape[1:]), fill)
     return result.index_copy_(0, rows, values)
+
+
+def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the Morton code of each point in the cube about the cloud."""
+    low = coordinates.min(axis=0).astype(np.float64)
+    extent = float((coordinates.max(axis=0) - low).max())
+    codes = torch.zeros(len(coordinates), dtype=torch.int64)
+    if extent == 0:
+        return codes.numpy()
+    for axis in range(3):
+        relative = (coordinates[:, axis] - low[axis]) / extent
+        steps = (relative * (2**_MORTON_BITS - 1)).astype(np.int64)
+        codes |= spread_bits(torch.from_numpy(steps)) << axis
+    return codes.numpy()
+
+
+def spread_bits(values: Tensor) -> Tensor:
+    """Put two zero bits between the bits of numbers below 2**21, int64.
+
+    Example:
+        >>> spread_bits(torch.tensor([0b111])).tolist() == [0b1001001]
+        True
+    """
+    for shift, pattern in _SPREADS:
+        values = (values | values << shift) & pattern
+    return values
+
+
+def gather_bits(codes: Tensor) -> Tensor:
+    """Return every third bit of codes, the inverse of :func:`spread_bits`.
+
+    Example:
+        >>> gather_bits(spread_bits(torch.tensor([54321])) | 0b110).tolist()
+        [54321]
+    """
+    codes = codes & _SPREADS[-1][1]
+    patterns = [pattern for _, pattern in _SPREADS[-2::-1]] + [2**_MORTON_BITS - 1]
+    for (shift, _), pattern in zip(reversed(_SPREADS), patterns, strict=True):
+        codes = (codes | codes >> shift) & pattern
+    return codes
+
+
+def shift_codes(codes: Tensor, axis: int) -> Tensor:
+    """Return the codes of the cubes one further along an axis; past the last one comes the first.
+
+    Example:
+        >>> shift_codes(torch.tensor([0b000, 0b010, 0b101]), 0).tolist()
+        [1, 3, 12]
+    """
+    mask = _SPREADS[-1][1] << axis
+    moved = ((codes | ~mask) + (1 << axis)) & mask
+    return (codes & ~mask) | moved

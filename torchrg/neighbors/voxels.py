@@ -9,10 +9,10 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows
+from torchrg.neighbors.order import finite_rows
 from torchrg.structures import UNLABELED
 
-MOST_VOXELS = 2**53
+_MOST_VOXELS = 2**53
 """Along one axis: float64 counts no further."""
 
 
@@ -62,7 +62,7 @@ def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
     if len(order) == 0:
         return Voxels(order, inverse)
     scaled = (tensor.detach()[order].double() - tensor[order].double().amin(dim=0)) / size
-    if float(scaled.max()) >= MOST_VOXELS:
+    if float(scaled.max()) >= _MOST_VOXELS:
         raise ConfigError(
             f"sample_voxels: expected size to divide the cloud's extent into less than 2^53 "
             f"cells, got {size!r}; choose a larger one."

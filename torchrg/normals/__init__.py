@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
@@ -66,7 +67,7 @@ def estimate_normals(
     neighbors: Neighbors | None = None,
     max_distance: float | None = None,
     config: NormalsConfig | None = None,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
 ) -> NormalFit:
     """Estimate normal and curvature of every point of a cloud.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import fair_chunks, map_chunks
+from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, gather_patches, search_knn
 from torchrg.structures import Neighbors
@@ -23,8 +23,6 @@ ORIENTATIONS: tuple[str, ...] = get_args(Orientation)
 _NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""
 
-_CHUNK_SIZE = 16384
-"""Neighbourhoods in memory at a time."""
 
 _NUM_LINKS = 12
 """Nearest neighbours over which signs spread: enough to cross from face to face of a thin plate."""
@@ -348,7 +346,7 @@ def _near_obstacles(points: Tensor, normals: Tensor, neighbors: Neighbors) -> tu
         behind = torch.where(steep & (height < 0), -height, torch.inf).amin(dim=-1)
         return ahead, behind
 
-    parts = map_chunks(measure, fair_chunks(len(points), _CHUNK_SIZE), points.device)
+    parts = map_chunks(measure, len(points), CHUNK_SIZE, points.device)
     front, back = (torch.cat(part) for part in zip(*parts, strict=True))
     return front, back
 

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchrg._parallel import fair_chunks, run_chunks
+from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
@@ -24,7 +24,7 @@ def find_sharp_points(
     valid: Tensor | None = None,
     rule: Literal["qn", "percentile"] = "qn",
     angle_deg: float = 5.0,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
 ) -> Tensor:
     r"""Tell sharp feature points from regular ones by the angles to their neighbours' normals.
 
@@ -72,7 +72,7 @@ def find_sharp_points(
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
         sharp[block] = exceeds(chords, counted, angle_deg)
 
-    run_chunks(classify, fair_chunks(len(sharp), chunk_size), normals.device)
+    map_chunks(classify, len(sharp), chunk_size, normals.device)
     return sharp if valid is None else sharp | ~valid
 
 

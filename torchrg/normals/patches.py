@@ -6,7 +6,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchrg._parallel import fair_chunks, map_chunks
+from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.linalg import coordinate_resolution
 from torchrg.neighbors import gather_patches
@@ -22,7 +22,7 @@ def fit_points(
     fit: FitPatches,
     *,
     rows: Tensor | None = None,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
     **of_points: Tensor,
 ) -> NormalFit:
     """Fit the neighbourhoods of some points of a cloud, with bounded memory.
@@ -46,8 +46,8 @@ def fit_points(
         own = {name: values[chosen] for name, values in of_points.items()}
         return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **own)
 
-    chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
-    parts = list(zip(*map_chunks(fit_chunk, chunks, points.device), strict=True))
+    num_rows = len(points) if rows is None else len(rows)
+    parts = list(zip(*map_chunks(fit_chunk, num_rows, chunk_size, points.device), strict=True))
     return NormalFit(*(torch.cat(part) for part in parts[:4]))
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import places_of
+from torchrg._parallel import ROWS_AT_ONCE, places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency
 
@@ -23,9 +23,6 @@ _REACH = 4.0
 _MAX_STEEPNESS = 0.25
 """An edge that leads farther across the planes than this many times their thickness, and than a
 quarter of the way to the 8th neighbour, leads to a parallel surface."""
-
-_CHUNK_SIZE = 65536
-"""Points handled at a time; bounds the memory."""
 
 
 def find_adjacency(
@@ -140,8 +137,8 @@ def _find_contacts(
     num_regions = int(labels.max()) + 1 if len(labels) else 0
     narrow = labels.to(torch.int32)
     found = []
-    for start in range(0, max(len(labels), 1), _CHUNK_SIZE):
-        rows = slice(start, start + _CHUNK_SIZE)
+    for start in range(0, max(len(labels), 1), ROWS_AT_ONCE):
+        rows = slice(start, start + ROWS_AT_ONCE)
         target, own = targets[rows].reshape(-1), narrow[rows]
         other = narrow.index_select(0, target).view(targets[rows].shape)
         touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import chunks_of, map_chunks, places_of
+from torchrg._parallel import chunks_of, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.regions.criteria import (
@@ -157,7 +157,7 @@ def _pack(
     used = 0
     for first in range(0, len(chunks), at_once):
         group = chunks[first : first + at_once]
-        for rows, edges in zip(group, map_chunks(find, group, cloud.points.device), strict=True):
+        for rows, edges in zip(group, map_tasks(find, group, cloud.points.device), strict=True):
             targets[used : used + len(edges.targets)] = edges.targets
             starts[rows.start + 1 : rows.stop + 1] = used + np.cumsum(edges.counts)
             used += len(edges.targets)

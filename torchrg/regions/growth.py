@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import canonical_order
 from torchrg.regions.criteria import GrowingCloud
@@ -35,7 +36,7 @@ def grow_regions(
     colors: Tensor | NDArray[np.generic] | None = None,
     residual_rms: Tensor | NDArray[np.floating] | None = None,
     canonical: bool = False,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
 ) -> Tensor:
     """Grow regions of similar normals, in the order of ascending curvature (Algorithm 2) [1].
 

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._parallel import chunks_of, run_chunks
+from torchrg._parallel import chunks_of, map_tasks
 from torchrg.structures import Neighbors
 
 _BITS_IN_LINE = 512
@@ -85,7 +85,7 @@ class SharedNeighbors:
                 counts = self._count(first, first + len(result[block]))
                 result[block] &= counts >= self._min_shared
 
-        run_chunks(test, chunks_of(len(result), _PATCH_SIZE), torch.device("cpu"))
+        map_tasks(test, chunks_of(len(result), _PATCH_SIZE), torch.device("cpu"))
         return torch.from_numpy(result).to(asked.device)
 
     def _count(self, start: int, stop: int) -> NDArray[np.unsignedinteger]:

@@ -12,7 +12,8 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics.contingency import check_labels, contingency_table, number_labels
 from torchrg.metrics.labels import match_regions
-from torchrg.render.grid import CloudGrid, build_grid, shift_codes
+from torchrg.neighbors.order import shift_codes
+from torchrg.render.grid import CloudGrid, build_grid
 
 _TO_CONES = (
     (0.4122214708, 0.5363325363, 0.0514459929),

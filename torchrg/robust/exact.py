@@ -10,21 +10,20 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import chunks_of
-from torchrg.robust.lanes import (
-    covariance_entries,
-    eigenvectors,
-    sum_points,
-    sum_squares,
-    take_lanes,
-)
+from torchrg.robust.lanes import covariance_entries, dot, eigenvectors, sum_squares, take_lanes
+from torchrg.robust.scale import sum_points
 
-NUM_SIMPLICES = 128
+_NUM_SIMPLICES = 128
 """Sets of P + 1 points looked at; 27 of 50 points on a plane escape all of them once in 25,000."""
 
 _MAX_CANDIDATES = 16
+"""Flats of a lane whose points are counted: of exact planes nearly every simplex gives one."""
+
 _LANES = 1024
 """Patches looked at together: what they need fits the cache."""
+
 _MIN_EDGE = 0.01
+"""Height, in extents of a patch, below which an edge is too short to span the next dimension."""
 
 
 class Flats(NamedTuple):
@@ -50,9 +49,6 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         columns: P coordinates of shape ``(K, M)``, about the middle of each lane.
         tolerance: Largest distance that counts as on the flat, shape ``(M,)``.
         size: Number of points that make a majority.
-
-    Returns:
-        The flats found.
     """
     parts = [
         _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
@@ -138,14 +134,7 @@ def _majorities(
 def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimension: int) -> Tensor:
     """Fit a flat to the chosen points of each lane, and mark the points that lie on it.
 
-    Args:
-        columns: P coordinates of shape ``(K, M)``.
-        chosen: Points to fit to, shape ``(K, M)``, bool.
-        tolerance: Largest distance that counts as on the flat, shape ``(M,)``.
-        dimension: Of the flat.
-
-    Returns:
-        The points on it, shape ``(K, M)``, bool.
+    Points ``(K, M)`` within a tolerance ``(M,)`` of the flat of some dimension lie on it.
     """
     columns = [column.double() for column in columns]
     weights = chosen.double()
@@ -153,21 +142,15 @@ def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimens
     means = [sum_points(weights * column) / count for column in columns]
     vectors = eigenvectors(covariance_entries(columns, means, weights, count))
     centered = [column - mean for column, mean in zip(columns, means, strict=True)]
-    across = torch.zeros_like(weights)
-    for j in range(len(columns) - dimension):
-        height = torch.zeros_like(weights)
-        for i, column in enumerate(centered):
-            height += column * vectors[:, i, j]
-        across += height * height
+    normals = vectors[..., : len(columns) - dimension].unbind(dim=2)
+    across = sum_squares([dot(centered, normal.unbind(dim=1)) for normal in normals])
     return across <= tolerance.double() ** 2
 
 
 def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tensor]:
     """Part of vectors, given by their coordinates, across orthonormal directions."""
     for direction in directions:
-        along = torch.zeros_like(vectors[0])
-        for part, axis in zip(vectors, direction, strict=True):
-            along = along + part * axis
+        along = dot(vectors, direction)
         vectors = [part - along * axis for part, axis in zip(vectors, direction, strict=True)]
     return vectors
 
@@ -176,7 +159,7 @@ def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tenso
 def _simplices(num_points: int, num_edges: int) -> list[list[int]]:
     """Vertices of the simplices looked at: ``num_edges + 1`` lists of point indices."""
     corners = num_edges + 1
-    if comb(num_points, corners) <= NUM_SIMPLICES:
+    if comb(num_points, corners) <= _NUM_SIMPLICES:
         # In every cyclic order: where the first vertices coincide, they span nothing.
         chosen = [
             (*vertices[turn:], *vertices[:turn])
@@ -185,5 +168,5 @@ def _simplices(num_points: int, num_edges: int) -> list[list[int]]:
         ]
     else:
         draw = random.Random(num_points)  # noqa: S311 - a fixed list, not a secret
-        chosen = [tuple(draw.sample(range(num_points), corners)) for _ in range(NUM_SIMPLICES)]
+        chosen = [tuple(draw.sample(range(num_points), corners)) for _ in range(_NUM_SIMPLICES)]
     return [list(vertex) for vertex in zip(*chosen, strict=True)]

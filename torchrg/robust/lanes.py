@@ -1,17 +1,19 @@
 """Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches (lanes).
 
 Every lane is computed by the same operations in the same order wherever it stands, so a result
-does not depend, to the last bit, on the chunk it was computed in. ``torch.sum`` does not promise
-that: it adds the last lanes of a tensor in another order than the first.
+does not depend, to the last bit, on the chunk it was computed in.
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.linalg import at_most, eigh3, second_moments
+from torchrg.robust.scale import median_of_sorted, sort_rows, sum_points
 
 
 def split_columns(patches: Tensor) -> list[Tensor]:
@@ -29,22 +31,6 @@ def take_lanes(columns: list[Tensor], lanes: Tensor) -> list[Tensor]:
     return [column.index_select(1, lanes) for column in columns]
 
 
-def sum_points(values: Tensor) -> Tensor:
-    """Sum each lane of ``(K, *)`` over its points, in the same order for every lane."""
-    if values.device.type == "cpu":
-        # NumPy adds row by row only where rows are contiguous and longer than one.
-        flat = values.reshape(len(values), -1).contiguous()
-        if flat.shape[1] == 1:
-            flat = flat.expand(-1, 2).contiguous()
-        total = torch.from_numpy(np.add.reduce(flat.numpy(), axis=0))
-        return total[: values[0].numel()].reshape(values.shape[1:])
-    while len(values) > 1:
-        half = len(values) // 2
-        folded = values[:half] + values[half : 2 * half]
-        values = torch.cat([folded, values[2 * half :]]) if len(values) % 2 else folded
-    return values[0]
-
-
 def sorted_points(values: Tensor) -> Tensor:
     """Sort each lane of ``(K, M)`` and return the lanes as rows ``(M, K)``."""
     return sort_rows(values.t().contiguous())
@@ -55,22 +41,10 @@ def median_points(values: Tensor) -> Tensor:
     return median_of_sorted(sorted_points(values))
 
 
-def median_of_sorted(rows: Tensor) -> Tensor:
-    """Median of each sorted row of ``(M, K)``: the mean of the middle two for an even K."""
-    count = rows.shape[1]
-    low, high = rows[:, (count - 1) // 2], rows[:, count // 2]
-    return low if count % 2 else low + (high - low) / 2
-
-
 def smallest_points(distances: Tensor, size: int) -> Tensor:
     """Mark exactly ``size`` smallest values of each lane; of equal ones the first points win.
 
-    Args:
-        distances: Values, shape ``(K, M)``, without NaN.
-        size: How many to mark, from 1 to K.
-
-    Returns:
-        1 for a marked point, 0 for another, shape ``(K, M)`` and dtype of ``distances``.
+    The values ``(K, M)`` hold no NaN. Returns 1 for a marked point and 0 for another.
     """
     num_points = len(distances)
     if size == num_points:
@@ -88,12 +62,17 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
     return marked
 
 
-def sum_squares(parts: list[Tensor]) -> Tensor:
-    """Sum of the squares of P tensors of one shape: squared lengths from coordinates."""
-    total = parts[0] * parts[0]
-    for part in parts[1:]:
-        total = total + part * part
+def dot(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
+    """Sum of the products of P tensors and P others that fit them."""
+    total = parts[0] * factors[0]
+    for part, factor in zip(parts[1:], factors[1:], strict=True):
+        total += part * factor
     return total
+
+
+def sum_squares(parts: Sequence[Tensor]) -> Tensor:
+    """Sum of the squares of P tensors of one shape: squared lengths from coordinates."""
+    return dot(parts, parts)
 
 
 def eigenvectors(matrices: Tensor) -> Tensor:
@@ -104,11 +83,16 @@ def eigenvectors(matrices: Tensor) -> Tensor:
     return vectors
 
 
-def sort_rows(rows: Tensor) -> Tensor:
-    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
-    if rows.device.type == "cpu":
-        return torch.from_numpy(np.sort(rows.numpy(), axis=1))
-    return rows.sort(dim=1).values
+def map_values(
+    on_cpu: Callable[..., NDArray[np.floating]],
+    elsewhere: Callable[..., Tensor],
+    values: Tensor,
+    *more: float,
+) -> Tensor:
+    """Apply NumPy's function on a CPU: the same for a value wherever it stands; torch's is not."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(on_cpu(values.numpy(), *more))
+    return elsewhere(values, *more)
 
 
 class Ellipsoid(NamedTuple):

@@ -14,104 +14,40 @@ from torchrg.linalg import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,
+    determinant,
     fit_ellipsoid,
     join_columns,
+    map_values,
     median_points,
     smallest_points,
     sq_distances,
-    sum_points,
     take_lanes,
 )
-from torchrg.robust.mcd import Starts, check_starts, initial_sets
 from torchrg.robust.patches import RobustFit, fit_patchwise
-from torchrg.robust.scale import half_size
+from torchrg.robust.scale import half_size, sum_points
+from torchrg.robust.starts import Starts, check_starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
 """What the efficiency of 95 % at the normal distribution refers to."""
 
-BREAKDOWN = 0.5
-EFFICIENCY = 0.95
+_BREAKDOWN = 0.5
+"""Share of the points that may be arbitrary."""
 
+_EFFICIENCY = 0.95
+"""Of the MM-estimate for normal data."""
 
-def bisquare_weights(sq_ratios: Tensor) -> Tensor:
-    """Weights ``(1 - t)^2`` of squared distances in units of the cut-off, 0 beyond it."""
-    inside = 1 - sq_ratios.clamp(max=1)
-    return inside * inside
+_MAX_STEPS = 300
+"""Reweightings after which weights that have not settled are left as they are."""
 
+_SETTLED = {torch.float32: 16, torch.float64: 4096}
+"""Relative change of a reweighting, in roundings, at which weights have settled."""
 
-def bisquare_loss(sq_ratios: Tensor) -> Tensor:
-    """Loss ``1 - (1 - t)^3`` of squared distances in units of the cut-off, 1 beyond it."""
-    inside = 1 - sq_ratios.clamp(max=1)
-    return 1 - inside * inside * inside
-
-
-@lru_cache(maxsize=64)
-def breakdown_constant(num_coordinates: int) -> float:
-    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal.
-
-    Example:
-        >>> round(breakdown_constant(3), 6)
-        3.452882
-    """
-
-    def excess(cutoff: float) -> float:
-        moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
-        inside = 3 * moments[1] - 3 * moments[2] + moments[3]
-        return inside + 1 - moments[0] - BREAKDOWN
-
-    return _root(excess)
-
-
-@lru_cache(maxsize=64)
-def efficiency_constant(num_coordinates: int, target: Target) -> float:
-    """Cut-off with 95 % efficiency at the normal distribution.
-
-    For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
-
-    Example:
-        >>> round(efficiency_constant(3, "shape"), 5), round(efficiency_constant(3, "location"), 5)
-        (6.09627, 5.49025)
-    """
-    p = num_coordinates
-
-    def excess(cutoff: float) -> float:
-        def mean(coefficients: dict[int, float]) -> float:
-            """Mean of a polynomial in d / cutoff over d < cutoff."""
-            return sum(a * _moment(m, p, cutoff) / cutoff**m for m, a in coefficients.items())
-
-        # With u = d / cutoff: psi(d) = d (1 - u^2)^2 and psi'(d) = (1 - u^2) (1 - 5 u^2).
-        if target == "location":
-            spread = cutoff**2 * mean({2: 1, 4: -4, 6: 6, 8: -4, 10: 1}) / p
-            slope = mean({0: 1, 2: -2 - 4 / p, 4: 1 + 4 / p})
-        else:
-            spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
-            slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
-        return slope**2 / spread - EFFICIENCY
-
-    return _root(excess)
-
-
-def _moment(power: int, num_coordinates: int, cutoff: float) -> float:
-    """Mean of d^power where d, the length of a standard normal vector, is below the cut-off."""
-    from scipy.special import gammainc
-
-    half = num_coordinates / 2
-    factor = exp(lgamma(half + power / 2) - lgamma(half) + power / 2 * log(2))
-    return factor * float(gammainc(half + power / 2, cutoff * cutoff / 2))
-
-
-def _root(excess: Callable[[float], float]) -> float:
-    from scipy.optimize import brentq
-
-    return float(brentq(excess, 0.1, 100.0, xtol=1e-13))
-
-
-MAX_STEPS = 300
 _CHECK_EVERY = 4
+"""Reweightings between two looks at what has settled."""
 
 
-class Shape(NamedTuple):
+class _Shape(NamedTuple):
     """A weighted fit of each lane, its scatter scaled to determinant one.
 
     Attributes:
@@ -123,103 +59,6 @@ class Shape(NamedTuple):
     weights: Tensor
     ellipsoid: Ellipsoid
     distances: Tensor
-
-
-def reweight_shape(
-    columns: list[Tensor],
-    start: Shape,
-    scale: Tensor,
-    floor: Tensor,
-    cutoff: float,
-    *,
-    adapt_scale: bool,
-) -> tuple[Shape, Tensor]:
-    """Reweight until the weights settle; lanes that have settled leave the batch.
-
-    With ``adapt_scale`` the scale takes one step to the M-scale before each reweighting: solving
-    for it fully can lead to another local minimum.
-    """
-    eps = machine_epsilon(scale.dtype)
-    enough = 16 * eps if scale.dtype == torch.float32 else 4096 * eps
-    weights, scales = start.weights.clone(), scale.clone()
-    places = torch.arange(len(scale), device=scale.device)
-    points, floors = columns, floor
-    distances, previous = start.distances, start.weights
-    for step in range(1, MAX_STEPS + 1):
-        if adapt_scale:
-            scale = _m_scale_step(distances, scale, cutoff)
-        current = bisquare_weights(distances / (cutoff * scale) ** 2)
-        distances = shape_of(points, current, floors).distances
-        if step % _CHECK_EVERY and step != MAX_STEPS:
-            previous = current
-            continue
-        change = sum_points((current - previous).abs())
-        settled = change <= enough * sum_points(current)
-        if step == MAX_STEPS:
-            settled |= True
-        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
-        if len(done):
-            weights.index_copy_(1, places[done], current.index_select(1, done))
-            scales[places[done]] = scale[done]
-            if len(moving) == 0:
-                break
-            points = take_lanes(points, moving)
-            places, scale, floors = places[moving], scale[moving], floors[moving]
-            distances, current = take_lanes([distances, current], moving)
-        previous = current
-    return shape_of(columns, weights, floor), scales
-
-
-def shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> Shape:
-    """Fit the weighted points of each lane, and scale the scatter to determinant one."""
-    total = sum_points(weights)
-    ellipsoid = fit_ellipsoid(columns, weights, total, floor)
-    return Shape(weights, ellipsoid, sq_distances(ellipsoid, volume(ellipsoid)))
-
-
-def volume(ellipsoid: Ellipsoid) -> Tensor:
-    """The P-th root of the determinant of each lane's sums of squares."""
-    product = torch.ones_like(ellipsoid.squares[0], dtype=torch.float64)
-    for square in ellipsoid.squares:
-        product = product * square.double()
-    root = 1 / len(ellipsoid.squares)
-    if product.device.type == "cpu":
-        # NumPy's power is the same for a value wherever it stands; torch's is not.
-        product = torch.from_numpy(np.power(product.numpy(), root))
-    else:
-        product = product**root
-    return product.to(ellipsoid.squares[0].dtype)
-
-
-def m_scale(distances: Tensor, cutoff: float) -> Tensor:
-    """Scale at which the mean loss of each lane's distances is half of its maximum."""
-    scale = (median_points(distances) / chi2_quantile(0.5, 1)).sqrt()
-    scale = scale.clamp(min=smallest_normal(scale.dtype))
-    for _ in range(50):
-        scale = _m_scale_step(distances, scale, cutoff)
-    return scale
-
-
-def _m_scale_step(distances: Tensor, scale: Tensor, cutoff: float) -> Tensor:
-    loss = sum_points(bisquare_loss(distances / (cutoff * scale) ** 2)) / len(distances)
-    return scale * (loss / BREAKDOWN).sqrt()
-
-
-def choose_shape(condition: Tensor, a: Shape, b: Shape) -> Shape:
-    """Shape a where the condition holds, otherwise b."""
-    return Shape(
-        torch.where(condition, a.weights, b.weights),
-        Ellipsoid(
-            [torch.where(condition, x, y) for x, y in zip(a[1].means, b[1].means, strict=True)],
-            [
-                torch.where(condition, x, y)
-                for x, y in zip(a[1].residuals, b[1].residuals, strict=True)
-            ],
-            [torch.where(condition, x, y) for x, y in zip(a[1].squares, b[1].squares, strict=True)],
-            a[1].singular | b[1].singular,
-        ),
-        torch.where(condition, a.distances, b.distances),
-    )
 
 
 def fit_dets(
@@ -237,21 +76,16 @@ def fit_dets(
     iterated to a local minimum, and the smallest wins [1].
 
     Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``, floating point.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all. Points with a non-finite
-            coordinate never count.
-        quantile: Points within this quantile of the chi-square distribution are inliers.
+        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all.
+        quantile: Level of the chi-square distribution within which points are inliers.
         starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
-        chunk_size: Patches worked on together; bounds the memory, never changes the result.
+        chunk_size: Patches worked on together.
 
     Returns:
         The fits. Location and covariance are the estimate itself, not reweighted, and the same as
         the raw ones; ``raw_support`` are the points with a weight above zero; ``log_det`` is that
         of the covariance. More than half of the points on one plane are an exact fit.
-
-    Raises:
-        ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If a setting is out of range.
 
     References:
         [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
@@ -290,23 +124,18 @@ def fit_detmm(
     bisquare that is 95 % efficient for normal data [1].
 
     Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``, floating point.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all. Points with a non-finite
-            coordinate never count.
-        quantile: Points within this quantile of the chi-square distribution are inliers.
+        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all.
+        quantile: Level of the chi-square distribution within which points are inliers.
         tuned_for: Whether the efficiency is that of the ``"shape"`` (cut-off 6.0963 for P = 3),
             as normals want and R's rrcov has it, or of the ``"location"`` (5.4902).
         starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
-        chunk_size: Patches worked on together; bounds the memory, never changes the result.
+        chunk_size: Patches worked on together.
 
     Returns:
         The fits. Location and covariance are the MM-estimate, ``raw_*`` the S-estimate it started
         from; distances and ``support`` belong to the MM-estimate; ``log_det`` is that of its
         covariance. More than half of the points on one plane are an exact fit.
-
-    Raises:
-        ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If a setting is out of range.
 
     References:
         [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
@@ -328,11 +157,12 @@ def fit_detmm(
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         first, scale = _best_s_estimate(columns, floor, size, starts)
         cutoff = efficiency_constant(len(columns), tuned_for)
-        final, _ = reweight_shape(columns, first, scale, floor, cutoff, adapt_scale=False)
+        weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
+        final = _shape_of(columns, weights, floor)
         sq_unit = cutoff * cutoff * scale * scale
-        before = sum_points(bisquare_loss(first.distances / sq_unit))
-        after = sum_points(bisquare_loss(final.distances / sq_unit))
-        final = choose_shape(after <= before, final, first)
+        before = sum_points(_bisquare_loss(first.distances / sq_unit))
+        after = sum_points(_bisquare_loss(final.distances / sq_unit))
+        final = _shape_of(columns, torch.where(after <= before, weights, first.weights), floor)
         return _estimate(columns, first, final, scale, quantile)
 
     return fit_patchwise(
@@ -342,11 +172,11 @@ def fit_detmm(
 
 def _best_s_estimate(
     columns: list[Tensor], floor: Tensor, size: int, starts: Starts
-) -> tuple[Shape, Tensor]:
+) -> tuple[_Shape, Tensor]:
     """Iterate every start of each lane to an S-estimate, and keep that of the smallest scale."""
     num_points, num_lanes = columns[0].shape
     cutoff = breakdown_constant(len(columns))
-    shapes, scales = [], []
+    weights, scales = [], []
     for initial, count in initial_sets(columns, size, starts):
         num_starts = initial.shape[1]
         points = [column.repeat(1, num_starts) for column in columns]
@@ -354,24 +184,19 @@ def _best_s_estimate(
         members = initial.reshape(num_points, -1)
         ellipsoid = fit_ellipsoid(points, members, count, floors)
         members = smallest_points(sq_distances(ellipsoid, count), size)
-        shape = shape_of(points, members, floors)
-        scale = m_scale(shape.distances, cutoff)
-        shape, scale = reweight_shape(points, shape, scale, floors, cutoff, adapt_scale=True)
-        shapes.append(shape)
+        shape = _shape_of(points, members, floors)
+        scale = _m_scale(shape.distances, cutoff)
+        settled, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
+        weights.append(settled.reshape(num_points, num_starts, num_lanes))
         scales.append(scale.reshape(num_starts, num_lanes))
     scale = torch.cat(scales)
     best = scale.argmin(dim=0)
-    lane = torch.arange(num_lanes, device=best.device)
-    weights = torch.cat(
-        [shape.weights.reshape(num_points, -1, num_lanes) for shape in shapes], dim=1
-    )
-    return shape_of(
-        columns, weights.gather(1, best.expand(num_points, 1, -1)).squeeze(1), floor
-    ), scale[best, lane]
+    chosen = torch.cat(weights, dim=1).gather(1, best.expand(num_points, 1, -1)).squeeze(1)
+    return _shape_of(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
 
 
 def _estimate(
-    columns: list[Tensor], raw: Shape, final: Shape, scale: Tensor, quantile: float
+    columns: list[Tensor], raw: _Shape, final: _Shape, scale: Tensor, quantile: float
 ) -> Estimate:
     """Location, covariance, distances and inliers of a shape at a scale."""
     size = len(columns)
@@ -379,8 +204,8 @@ def _estimate(
     distances = final.distances / sq_scale
     bound = distances.new_tensor([chi2_quantile(quantile, size)])
 
-    def scatter(shape: Shape) -> Tensor:
-        denominator = volume(shape.ellipsoid) / sq_scale
+    def scatter(shape: _Shape) -> Tensor:
+        denominator = _volume(shape.ellipsoid) / sq_scale
         return covariance_entries(columns, shape.ellipsoid.means, shape.weights, denominator)
 
     return Estimate(
@@ -394,3 +219,150 @@ def _estimate(
         objective=sq_scale.double() ** size,
         singular=raw.ellipsoid.singular,
     )
+
+
+def _reweight(
+    columns: list[Tensor],
+    start: _Shape,
+    scale: Tensor,
+    floor: Tensor,
+    cutoff: float,
+    *,
+    adapt_scale: bool,
+) -> tuple[Tensor, Tensor]:
+    """Reweight until the weights settle, and return them and the scale.
+
+    Lanes that have settled leave the batch. With ``adapt_scale`` the scale takes one step to the
+    M-scale before each reweighting: solving for it fully can lead to another local minimum.
+    """
+    eps = machine_epsilon(scale.dtype)
+    enough = _SETTLED[scale.dtype] * eps
+    weights, scales = start.weights.clone(), scale.clone()
+    places = torch.arange(len(scale), device=scale.device)
+    points, floors = columns, floor
+    distances, previous = start.distances, start.weights
+    for step in range(1, _MAX_STEPS + 1):
+        if adapt_scale:
+            scale = _m_scale_step(distances, scale, cutoff)
+        current = _bisquare_weights(distances / (cutoff * scale) ** 2)
+        distances = _shape_of(points, current, floors).distances
+        if step % _CHECK_EVERY and step != _MAX_STEPS:
+            previous = current
+            continue
+        change = sum_points((current - previous).abs())
+        settled = change <= enough * sum_points(current)
+        if step == _MAX_STEPS:
+            settled |= True
+        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+        if len(done):
+            weights.index_copy_(1, places[done], current.index_select(1, done))
+            scales[places[done]] = scale[done]
+            if len(moving) == 0:
+                break
+            points = take_lanes(points, moving)
+            places, scale, floors = places[moving], scale[moving], floors[moving]
+            distances, current = take_lanes([distances, current], moving)
+        previous = current
+    return weights, scales
+
+
+def _shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
+    """Fit the weighted points of each lane, and scale the scatter to determinant one."""
+    total = sum_points(weights)
+    ellipsoid = fit_ellipsoid(columns, weights, total, floor)
+    return _Shape(weights, ellipsoid, sq_distances(ellipsoid, _volume(ellipsoid)))
+
+
+def _volume(ellipsoid: Ellipsoid) -> Tensor:
+    """The P-th root of the determinant of each lane's sums of squares."""
+    product = map_values(
+        np.power, torch.pow, determinant(ellipsoid, 1.0), 1 / len(ellipsoid.squares)
+    )
+    return product.to(ellipsoid.squares[0].dtype)
+
+
+def _m_scale(distances: Tensor, cutoff: float) -> Tensor:
+    """Scale at which the mean loss of each lane's distances is half of its maximum."""
+    scale = (median_points(distances) / chi2_quantile(0.5, 1)).sqrt()
+    scale = scale.clamp(min=smallest_normal(scale.dtype))
+    for _ in range(50):
+        scale = _m_scale_step(distances, scale, cutoff)
+    return scale
+
+
+def _m_scale_step(distances: Tensor, scale: Tensor, cutoff: float) -> Tensor:
+    loss = sum_points(_bisquare_loss(distances / (cutoff * scale) ** 2)) / len(distances)
+    return scale * (loss / _BREAKDOWN).sqrt()
+
+
+def _bisquare_weights(sq_ratios: Tensor) -> Tensor:
+    """Weights ``(1 - t)^2`` of squared distances in units of the cut-off, 0 beyond it."""
+    inside = 1 - sq_ratios.clamp(max=1)
+    return inside * inside
+
+
+def _bisquare_loss(sq_ratios: Tensor) -> Tensor:
+    """Loss ``1 - (1 - t)^3`` of squared distances in units of the cut-off, 1 beyond it."""
+    inside = 1 - sq_ratios.clamp(max=1)
+    return 1 - inside * inside * inside
+
+
+@lru_cache(maxsize=64)
+def breakdown_constant(num_coordinates: int) -> float:
+    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal.
+
+    Example:
+        >>> round(breakdown_constant(3), 6)
+        3.452882
+    """
+
+    def excess(cutoff: float) -> float:
+        moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
+        inside = 3 * moments[1] - 3 * moments[2] + moments[3]
+        return inside + 1 - moments[0] - _BREAKDOWN
+
+    return _root(excess)
+
+
+@lru_cache(maxsize=64)
+def efficiency_constant(num_coordinates: int, target: Target) -> float:
+    """Cut-off with 95 % efficiency at the normal distribution.
+
+    For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
+
+    Example:
+        >>> round(efficiency_constant(3, "shape"), 5), round(efficiency_constant(3, "location"), 5)
+        (6.09627, 5.49025)
+    """
+    p = num_coordinates
+
+    def excess(cutoff: float) -> float:
+        def mean(coefficients: dict[int, float]) -> float:
+            """Mean of a polynomial in d / cutoff over d < cutoff."""
+            return sum(a * _moment(m, p, cutoff) / cutoff**m for m, a in coefficients.items())
+
+        # With u = d / cutoff: psi(d) = d (1 - u^2)^2 and psi'(d) = (1 - u^2) (1 - 5 u^2).
+        if target == "location":
+            spread = cutoff**2 * mean({2: 1, 4: -4, 6: 6, 8: -4, 10: 1}) / p
+            slope = mean({0: 1, 2: -2 - 4 / p, 4: 1 + 4 / p})
+        else:
+            spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
+            slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
+        return slope**2 / spread - _EFFICIENCY
+
+    return _root(excess)
+
+
+def _moment(power: int, num_coordinates: int, cutoff: float) -> float:
+    """Mean of d^power where d, the length of a standard normal vector, is below the cut-off."""
+    from scipy.special import gammainc
+
+    half = num_coordinates / 2
+    factor = exp(lgamma(half + power / 2) - lgamma(half) + power / 2 * log(2))
+    return factor * float(gammainc(half + power / 2, cutoff * cutoff / 2))
+
+
+def _root(excess: Callable[[float], float]) -> float:
+    from scipy.optimize import brentq
+
+    return float(brentq(excess, 0.1, 100.0, xtol=1e-13))

@@ -20,6 +20,7 @@ from torchrg.robust.starts import draw_seed, elemental_sets
 from torchrg.robust.weights import Estimate, chi2_quantile, reweight
 
 _LANES_AT_ONCE = 1024
+"""Sets times patches worked on together: what they need fits the cache."""
 
 
 def fit_mve(
@@ -39,25 +40,20 @@ def fit_mve(
     it covers h points, and the smallest wins [1].
 
     Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``, floating point.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all. Points with a non-finite
-            coordinate never count.
+        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all.
         support_fraction: Share of the points to cover, from 0.5 to 1.
-        quantile: Points within this quantile of the chi-square distribution are inliers.
+        quantile: Level of the chi-square distribution within which points are inliers.
         num_starts: Random sets; all sets are taken where there are no more than five times as
             many. Random sets nearly always miss the least volume by a little.
         exhaustive: Take all sets: 230,300 of 50 points, a tenth of a second for each patch.
         generator: Source of the random sets. Default: always the same sets. Every patch gets the
             same ones.
-        chunk_size: Patches worked on together; bounds the memory, never changes the result.
+        chunk_size: Patches worked on together.
 
     Returns:
         The fits; ``log_det`` is that of the ellipsoid that just covers h points, and
         ``raw_support`` are these. The raw covariance is scaled to be consistent at the normal.
-
-    Raises:
-        ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If a setting is out of range.
 
     References:
         [1] P. J. Rousseeuw, A. M. Leroy. Robust Regression and Outlier Detection, chapter 7.
@@ -93,9 +89,7 @@ def fit_mve(
         final = reweight(columns, distances, quantile)
         covariance = covariance_entries(columns, ellipsoid.means, weights, num_coordinates)
         return Estimate(
-            location=final.location,
-            covariance=final.covariance,
-            support=final.support,
+            *final,
             sq_distances=distances,
             raw_location=join_columns(ellipsoid.means),
             raw_covariance=covariance * factor[:, None, None],

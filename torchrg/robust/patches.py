@@ -8,67 +8,39 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import chunks_of, run_chunks
+from torchrg._parallel import map_chunks
 from torchrg.errors import ConfigError
 from torchrg.linalg import flatness_tolerance, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     covariance_entries,
     join_columns,
+    map_values,
     median_points,
     split_columns,
-    sum_points,
     take_lanes,
 )
+from torchrg.robust.scale import sum_points
 from torchrg.robust.weights import Estimate, subset_size
 
+Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
+"""Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
 
-class Frame(NamedTuple):
-    """Where lanes lie in their patches: ``point = (lane / zoom + middle) / unit``.
+PATCHES_IN_CACHE = 4096
+"""Patches worked on together; what they need has to fit the processor's cache."""
 
-    The factors are powers of two, which change no digit.
-    """
-
-    middle: Tensor
-    unit: Tensor
-    zoom: Tensor
-
-    def of(self, rows: Tensor) -> "Frame":
-        """The frames of some of the patches."""
-        return Frame(*(field[rows] for field in self))
-
-    def point(self, lanes: Tensor) -> Tensor:
-        """Bring points ``(B, P)`` back to the coordinates of their patches."""
-        return (lanes / self.zoom[:, None] + self.middle) / self.unit[:, None]
-
-    def matrix(self, lanes: Tensor) -> Tensor:
-        """Bring scatter matrices ``(B, P, P)`` back to the unit of their patches."""
-        length = (self.zoom * self.unit)[:, None, None]
-        return lanes / length / length
-
-
-def to_lanes(patches: Tensor) -> tuple[list[Tensor], Frame, Tensor]:
-    """Columns about each patch's median, of size 1/2 to 1, with their frame and tolerance."""
-    unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
-    patches = patches * unit[:, None, None]
-    columns = split_columns(patches)
-    middle = [median_points(column) for column in columns]
-    columns = [column - center for column, center in zip(columns, middle, strict=True)]
-    extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
-    zoom = _power_of_two(extent)
-    tolerance = flatness_tolerance(patches, extent) * zoom
-    columns = [column * zoom for column in columns]
-    return columns, Frame(join_columns(middle), unit, zoom), tolerance
-
-
-def _power_of_two(length: Tensor) -> Tensor:
-    """The power of two that brings a length to between 1/2 and 1; a finite one for zero."""
-    length = length.clamp(min=4 * smallest_normal(length.dtype))
-    return torch.frexp(length).mantissa / length
+_LEAST_PATCHES = 64
+"""Patches that are worth a thread's start."""
 
 
 class RobustFit(NamedTuple):
     """Robust location and scatter of each patch.
+
+    Every estimator takes patches of floating point, and a mask of the points that count; points
+    with a non-finite coordinate never do. ``quantile`` is the level of the chi-square distribution
+    within which points are inliers: 0.975 means a squared distance of 9.3484 for P = 3.
+    ``chunk_size`` bounds the memory and never changes a result. Another shape, dtype or device is a
+    :class:`torchrg.ShapeError`, a setting out of range a :class:`torchrg.ConfigError`.
 
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
@@ -101,33 +73,28 @@ class RobustFit(NamedTuple):
     valid: Tensor
 
 
-def no_fit(batch: torch.Size, num_points: int, num_coordinates: int, like: Tensor) -> RobustFit:
-    """Fits that are not valid, of the dtype and on the device of ``like``."""
-    vector = like.new_zeros(*batch, num_coordinates)
-    matrix = like.new_zeros(*batch, num_coordinates, num_coordinates)
-    points = like.new_zeros(*batch, num_points, dtype=torch.bool)
-    flag = like.new_zeros(batch, dtype=torch.bool)
-    return RobustFit(
-        location=vector,
-        covariance=matrix,
-        support=points,
-        sq_distances=like.new_full((*batch, num_points), torch.inf),
-        raw_location=vector.clone(),
-        raw_covariance=matrix.clone(),
-        raw_support=points.clone(),
-        log_det=like.new_full(batch, torch.nan),
-        exact_fit=flag,
-        valid=flag.clone(),
-    )
+class _Frame(NamedTuple):
+    """Where lanes lie in their patches: ``point = (lane / zoom + middle) / unit``.
 
+    The factors are powers of two, which change no digit.
+    """
 
-Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
-"""Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
+    middle: Tensor
+    unit: Tensor
+    zoom: Tensor
 
-CHUNK_SIZE = 4096
-"""Patches worked on together; what they need has to fit the processor's cache."""
+    def of(self, rows: Tensor) -> "_Frame":
+        """The frames of some of the patches."""
+        return _Frame(*(field[rows] for field in self))
 
-_MIN_SHARE = 64
+    def point(self, lanes: Tensor) -> Tensor:
+        """Bring points ``(B, P)`` back to the coordinates of their patches."""
+        return (lanes / self.zoom[:, None] + self.middle) / self.unit[:, None]
+
+    def matrix(self, lanes: Tensor) -> Tensor:
+        """Bring scatter matrices ``(B, P, P)`` back to the unit of their patches."""
+        length = (self.zoom * self.unit)[:, None, None]
+        return lanes / length / length
 
 
 def fit_patchwise(
@@ -173,14 +140,13 @@ def _fit_groups(
     patches: Tensor, counted: Tensor, chunk_size: int, fit: Callable[[Tensor], RobustFit]
 ) -> RobustFit:
     """Fit patches ``(B, K, P)`` group by group of equally many points that count ``(B, K)``."""
-    num_patches, num_points, size = patches.shape
-    out = no_fit(torch.Size([num_patches]), num_points, size, patches)
+    num_points, size = patches.shape[1:]
+    out = _no_fit(patches)
     counts = counted.sum(dim=1)
     for count in sorted(set(counts.tolist())):
         if count == 0:
             continue
         rows = torch.nonzero(counts == count).squeeze(1)
-        share = min(chunk_size, max(_MIN_SHARE, -(-len(rows) // torch.get_num_threads())))
 
         def work(
             chunk: slice, rows: Tensor = rows, whole: bool = count == num_points, count: int = count
@@ -191,18 +157,12 @@ def _fit_groups(
                 _store(out, chosen, fit(block))
                 return
             # The points that count move to the front, in their order.
-            order = torch.argsort((~counted[chosen]).to(torch.uint8), dim=1, stable=True)
-            order = order[:, :count]
+            order = torch.argsort((~counted[chosen]).to(torch.uint8), dim=1, stable=True)[:, :count]
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
 
-        run_chunks(work, chunks_of(len(rows), share), patches.device)
+        map_chunks(work, len(rows), chunk_size, patches.device, least=_LEAST_PATCHES)
     return out
-
-
-def _store(out: RobustFit, rows: Tensor, fit: RobustFit) -> None:
-    for target, source in zip(out, fit, strict=True):
-        target[rows] = source
 
 
 def _spread(fit: RobustFit, order: Tensor, num_points: int) -> RobustFit:
@@ -217,6 +177,11 @@ def _spread(fit: RobustFit, order: Tensor, num_points: int) -> RobustFit:
     )
 
 
+def _store(out: RobustFit, rows: Tensor, fit: RobustFit) -> None:
+    for target, source in zip(out, fit, strict=True):
+        target[rows] = source
+
+
 def _fit_chunk(
     patches: Tensor,
     support_fraction: float,
@@ -227,12 +192,15 @@ def _fit_chunk(
     num_patches, num_points, size = patches.shape
     subset = subset_size(num_points, size, support_fraction)
     enough = subset if majority is None else majority(num_points)
-    columns, frame, tolerance = to_lanes(patches)
+    columns, frame, tolerance = _to_lanes(patches)
     flats = find_flats(columns, tolerance, enough)
-    out = no_fit(torch.Size([num_patches]), num_points, size, patches)
+    out = _no_fit(patches)
 
     def lanes_of(rows: Tensor) -> list[Tensor]:
         return columns if len(rows) == num_patches else take_lanes(columns, rows)
+
+    def store_exact(rows: Tensor, members: Tensor) -> None:
+        _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
 
     regular = torch.nonzero(flats.dimension == size).squeeze(1)
     if len(regular):
@@ -244,19 +212,17 @@ def _fit_chunk(
             rows, chosen = regular[thin], estimate.raw_support[:, thin]
             members = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
             found = members.sum(dim=0) >= enough
-            rows, members = rows[found], members[:, found]
-            _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
+            store_exact(rows[found], members[:, found])
     exact = torch.nonzero(flats.dimension == size - 1).squeeze(1)
     if len(exact):
-        members = flats.members[:, exact]
-        _store(out, exact, _exact_fit(lanes_of(exact), members, frame.of(exact)))
+        store_exact(exact, flats.members[:, exact])
     lower = torch.nonzero(flats.dimension < size - 1).squeeze(1)
     if len(lower):
         rest = ~flats.members[:, lower].t()
         fit = _fit_groups(
             patches[lower],
             rest,
-            CHUNK_SIZE,
+            PATCHES_IN_CACHE,
             lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
         )
         _store(out, lower, fit)
@@ -265,15 +231,14 @@ def _fit_chunk(
         plane = refine_flat(lanes, every, tolerance[lower], size - 1).all(dim=0)
         line = refine_flat(lanes, every, tolerance[lower], size - 2).all(dim=0)
         rows = lower[plane & ~line]
-        members = flats.members[:, rows] | True
-        _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
+        store_exact(rows, flats.members[:, rows] | True)
     return out
 
 
-def _general_fit(estimate: Estimate, frame: Frame) -> RobustFit:
+def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
     """The fit of lanes in general position, back in the patches' own coordinates."""
     size = estimate.location.shape[1]
-    units = 2 * size * _log(frame.zoom.double() * frame.unit.double())
+    units = 2 * size * map_values(np.log, torch.log, frame.zoom.double() * frame.unit.double())
     valid = torch.ones_like(estimate.singular)
     return RobustFit(
         location=frame.point(estimate.location),
@@ -283,13 +248,15 @@ def _general_fit(estimate: Estimate, frame: Frame) -> RobustFit:
         raw_location=frame.point(estimate.raw_location),
         raw_covariance=frame.matrix(estimate.raw_covariance),
         raw_support=estimate.raw_support.t(),
-        log_det=(_log(estimate.objective) - units).to(estimate.location.dtype),
+        log_det=(map_values(np.log, torch.log, estimate.objective) - units).to(
+            estimate.location.dtype
+        ),
         exact_fit=~valid,
         valid=valid,
     )
 
 
-def _exact_fit(columns: list[Tensor], members: Tensor, frame: Frame) -> RobustFit:
+def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustFit:
     """The fit of lanes whose ``members (K, M)`` lie on a plane; these are the inliers."""
     dtype = columns[0].dtype
     weights = members.double()
@@ -297,8 +264,7 @@ def _exact_fit(columns: list[Tensor], members: Tensor, frame: Frame) -> RobustFi
     wide = [column.double() for column in columns]
     means = [sum_points(weights * column) / count for column in wide]
     covariance = covariance_entries(wide, means, weights, (count - 1).clamp(min=1)).to(dtype)
-    location = frame.point(join_columns(means).to(dtype))
-    covariance = frame.matrix(covariance)
+    location, covariance = frame.point(join_columns(means).to(dtype)), frame.matrix(covariance)
     support = members.t()
     valid = torch.ones(len(support), dtype=torch.bool, device=support.device)
     return RobustFit(
@@ -315,8 +281,40 @@ def _exact_fit(columns: list[Tensor], members: Tensor, frame: Frame) -> RobustFi
     )
 
 
-def _log(values: Tensor) -> Tensor:
-    """Natural logarithm, the same for a value wherever it stands; torch's on a CPU is not."""
-    if values.device.type == "cpu":
-        return torch.from_numpy(np.log(values.numpy()))
-    return values.log()
+def _no_fit(patches: Tensor) -> RobustFit:
+    """Fits of patches ``(B, K, P)`` that are not valid."""
+    num_patches, num_points, size = patches.shape
+    points = patches.new_zeros(num_patches, num_points, dtype=torch.bool)
+    flag = patches.new_zeros(num_patches, dtype=torch.bool)
+    return RobustFit(
+        location=patches.new_zeros(num_patches, size),
+        covariance=patches.new_zeros(num_patches, size, size),
+        support=points,
+        sq_distances=patches.new_full(points.shape, torch.inf),
+        raw_location=patches.new_zeros(num_patches, size),
+        raw_covariance=patches.new_zeros(num_patches, size, size),
+        raw_support=points.clone(),
+        log_det=patches.new_full(flag.shape, torch.nan),
+        exact_fit=flag,
+        valid=flag.clone(),
+    )
+
+
+def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
+    """Columns about each patch's median, of size 1/2 to 1, with their frame and tolerance."""
+    unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
+    patches = patches * unit[:, None, None]
+    columns = split_columns(patches)
+    middle = [median_points(column) for column in columns]
+    columns = [column - center for column, center in zip(columns, middle, strict=True)]
+    extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
+    zoom = _power_of_two(extent)
+    tolerance = flatness_tolerance(patches, extent) * zoom
+    columns = [column * zoom for column in columns]
+    return columns, _Frame(join_columns(middle), unit, zoom), tolerance
+
+
+def _power_of_two(length: Tensor) -> Tensor:
+    """The power of two that brings a length to between 1/2 and 1; a finite one for zero."""
+    length = length.clamp(min=4 * smallest_normal(length.dtype))
+    return torch.frexp(length).mantissa / length

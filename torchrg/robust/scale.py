@@ -1,9 +1,9 @@
-"""Robust scales of many short rows: median absolute deviation, Qn, tau.
+"""Robust scales of many short rows: median absolute deviation, Qn, tau; all from sorted rows.
 
 The constants make the scales consistent for the standard deviation of normal data.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from math import comb
 from statistics import NormalDist
@@ -14,11 +14,334 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import chunks_of, share_chunks
+from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks
 from torchrg.errors import ShapeError
-from torchrg.robust.lanes import median_of_sorted, sort_rows, sum_points
 
-_CHUNK_BYTES = 2**22
+MAD_FACTOR = 1.4826
+"""1 / Phi^-1(3/4), to the digits of the literature."""
+
+QN_FACTOR = 2.2219
+"""Factor of Qn as printed by Rousseeuw and Croux (1993), eq. 3.9, and by the method's eq. 7.
+
+The exact value 1 / (sqrt(2) Phi^-1(5/8)) is 2.219144.
+"""
+
+_QN_REVISED_FACTOR = 2.21914
+"""Factor that goes with the finite-sample factors of :func:`qn_sample_factor`."""
+
+_QN_SMALL: tuple[float, ...] = (0.399356, 0.99365, 0.51321, 0.84401, 0.6122, 0.85877)
+_QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
+"""Finite-sample factors of 2 to 12 values."""
+
+_TAU_WEIGHT_CUT = 4.5
+"""Deviation, in medians of the deviations, from which a value has no weight in the centre."""
+
+_TAU_SCALE_CUT = 3.0
+"""Deviation at which deviations are cut."""
+
+
+def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """Return the median along an axis, the mean of the middle two for an even count.
+
+    Args:
+        x: Values, floating point, any shape.
+        dim: Axis to reduce.
+        mask: Which values count, same shape as ``x``, bool. Default: all.
+
+    Returns:
+        Medians, the shape of ``x`` without ``dim``; NaN where no value counts or one that counts
+        is NaN.
+
+    Raises:
+        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
+
+    Example:
+        >>> median(torch.tensor([4.0, 1.0, 3.0, 2.0])).item()
+        2.5
+    """
+    return _per_count("median", x, dim, mask, _sorted_median)
+
+
+def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """Return the median absolute deviation from the median, times 1.4826.
+
+    Arguments and errors are those of :func:`median`.
+
+    Returns:
+        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
+        NaN where no value counts or one that counts is NaN.
+
+    Example:
+        >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
+        1.4825999736785889
+    """
+    return _per_count("mad", x, dim, mask, lambda rows: MAD_FACTOR * _median_deviation(rows))
+
+
+def qn(
+    x: Tensor, *, dim: int = -1, finite_sample: bool = False, mask: Tensor | None = None
+) -> Tensor:
+    r"""Return the scale Qn of Rousseeuw and Croux, an order statistic of pairwise differences.
+
+    :math:`Q_n = 2.2219 \{|x_i - x_j|;\ i < j\}_{(\kappa)}` with :math:`\kappa = \binom{h}{2}` and
+    :math:`h = \lfloor n/2 \rfloor + 1` [1]. The order statistic is exact, without interpolation.
+
+    Args:
+        x: Values, floating point, any shape.
+        dim: Axis to reduce.
+        finite_sample: Multiply by the revised factor 2.21914 and by :func:`qn_sample_factor`
+            instead of 2.2219, as R's robustbase does by default.
+        mask: Which values count, same shape as ``x``, bool. Default: all.
+
+    Returns:
+        Scales, the shape of ``x`` without ``dim``; 0 where h values or more are equal or only one
+        counts, NaN where none counts or one that counts is NaN.
+
+    Raises:
+        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
+
+    References:
+        [1] P. J. Rousseeuw, C. Croux. Alternatives to the median absolute deviation. Journal of
+        the American Statistical Association 88, 1993.
+
+    Example:
+        >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0]))
+        tensor(6.6657)
+    """
+    return _per_count(
+        "qn", x, dim, mask, lambda rows: qn_of_sorted(rows, finite_sample=finite_sample)
+    )
+
+
+def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
+
+    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`.
+
+    Returns:
+        The same as ``qn(x, dim=dim, mask=mask) > threshold``, bool; False where Qn is NaN.
+
+    Example:
+        >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
+        tensor([False,  True])
+    """
+
+    def of_sorted(rows: Tensor) -> Tensor:
+        n = rows.shape[1]
+        if n < 2:
+            return torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+        bound = _largest_within(threshold, QN_FACTOR, rows.dtype)
+        count = _count_differences(rows, bound)
+        return (count < comb(half_size(n), 2)) & ~rows[:, -1].isnan()
+
+    return _per_count("qn_exceeds", x, dim, mask, of_sorted)
+
+
+def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    r"""Return the tau scale of Maronna and Zamar: a truncated standard deviation.
+
+    With :math:`s_0` the median of the deviations from the median: the centre is the mean with
+    bisquare weights that vanish at :math:`4.5 s_0`, and the scale the root of the mean square
+    about it, each deviation cut at :math:`3 s_0` [1]. Cheaper than Qn for long rows, linear but
+    for a sort. Arguments and errors are those of :func:`median`.
+
+    Returns:
+        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
+        NaN where no value counts or one that counts is NaN.
+
+    References:
+        [1] R. A. Maronna, R. H. Zamar. Robust estimates of location and dispersion for
+        high-dimensional datasets. Technometrics 44, 2002.
+
+    Example:
+        >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
+        tensor(1.7441)
+    """
+    return _per_count("tau", x, dim, mask, tau_of_sorted)
+
+
+def _per_count(
+    caller: str, x: Tensor, dim: int, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Apply a function of sorted rows ``(B, n)`` along ``dim``, once for each number of values.
+
+    Values that do not count become +inf, sort last, and are cut off; a NaN that counts sorts
+    behind them, so rows with one are set apart first.
+    """
+    x = as_tensor(caller, "x", x)
+    check_floating(caller, x=x)
+    check_shapes(caller, x=(x, "*"), mask=(mask, "*"))
+    if not -x.dim() <= dim < x.dim():
+        raise ShapeError(f"{caller}: expected x with an axis {dim}, got shape {tuple(x.shape)}.")
+    rows = x.detach().movedim(dim, -1)
+    shape, n = rows.shape[:-1], rows.shape[-1]
+    rows = rows.reshape(shape.numel(), n)
+    if mask is None:
+        return of_sorted(sort_rows(rows.contiguous())).reshape(shape)
+    counted = mask.movedim(dim, -1).reshape(shape.numel(), n)
+    broken = (rows.isnan() & counted).any(dim=1)
+    ascending = sort_rows(torch.where(counted, rows, torch.inf))
+    counts = counted.sum(dim=1)
+    out = rows.new_full((len(rows),), torch.nan)
+    results: Tensor | None = None
+    for count in sorted(set(counts.tolist())) or [n]:
+        chosen = (counts == count) & ~broken
+        found = of_sorted(ascending[chosen][:, :count].contiguous())
+        results = out.to(found.dtype) if results is None else results
+        results[chosen] = found
+    return (out if results is None else results).reshape(shape)
+
+
+def sort_rows(rows: Tensor) -> Tensor:
+    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
+    if rows.device.type == "cpu":
+        return torch.from_numpy(np.sort(rows.numpy(), axis=1))
+    return rows.sort(dim=1).values
+
+
+def median_of_sorted(rows: Tensor) -> Tensor:
+    """Median of each sorted row of ``(B, n)``: the mean of the middle two for an even n."""
+    count = rows.shape[1]
+    low, high = rows[:, (count - 1) // 2], rows[:, count // 2]
+    return low if count % 2 else low + (high - low) / 2
+
+
+def _sorted_median(rows: Tensor) -> Tensor:
+    """Median of each sorted row; NaN where the row is empty or has a NaN, which sorts last."""
+    if rows.shape[1] == 0:
+        return rows.new_full((len(rows),), torch.nan)
+    return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
+
+
+def _median_deviation(rows: Tensor) -> Tensor:
+    """Median of the absolute deviations of each sorted row from its median."""
+    return _sorted_median(sort_rows((rows - _sorted_median(rows)[:, None]).abs()))
+
+
+def tau_of_sorted(rows: Tensor) -> Tensor:
+    """Tau scale of each sorted row of ``(B, n)``, shape ``(B,)``."""
+    if rows.shape[1] == 0:
+        return rows.new_full((len(rows),), torch.nan)
+    lanes = rows.t().contiguous()
+    spread = _median_deviation(rows)
+    unit = torch.where(spread > 0, spread, 1.0)
+    standard = (lanes - _sorted_median(rows)) / unit
+    weights = (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
+    center = sum_points(weights * standard) / sum_points(weights)
+    squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
+    variance = sum_points(squares) / (len(lanes) * _tau_consistency())
+    return torch.where(spread > 0, unit * variance.sqrt(), spread)
+
+
+def sum_points(values: Tensor) -> Tensor:
+    """Sum each lane of ``(K, *)`` over its points, in the same order for every lane.
+
+    So a sum is the same, to the last bit, wherever its lane stands. ``torch.sum`` does not promise
+    that: it adds the last lanes of a tensor in another order than the first.
+    """
+    if values.device.type == "cpu":
+        # NumPy adds row by row only where rows are contiguous and longer than one.
+        flat = values.reshape(len(values), -1).contiguous()
+        if flat.shape[1] == 1:
+            flat = flat.expand(-1, 2).contiguous()
+        total = torch.from_numpy(np.add.reduce(flat.numpy(), axis=0))
+        return total[: values[0].numel()].reshape(values.shape[1:])
+    while len(values) > 1:
+        half = len(values) // 2
+        folded = values[:half] + values[half : 2 * half]
+        values = torch.cat([folded, values[2 * half :]]) if len(values) % 2 else folded
+    return values[0]
+
+
+def _tau_consistency() -> float:
+    """Mean of the truncated squares where the values are standard normal."""
+    normal = NormalDist()
+    cut = _TAU_SCALE_CUT * normal.inv_cdf(0.75)
+    inside = (1 - cut * cut) * normal.cdf(cut) - cut * normal.pdf(cut) + cut * cut
+    return 2 * inside - 1
+
+
+def qn_of_sorted(rows: Tensor, *, finite_sample: bool) -> Tensor:
+    """Qn of each sorted row of ``(B, n)``, shape ``(B,)``."""
+    n = rows.shape[1]
+    if n < 2:
+        return rows.new_zeros(len(rows)) if n else rows.new_full((len(rows),), torch.nan)
+    factor = _QN_REVISED_FACTOR * qn_sample_factor(n) if finite_sample else QN_FACTOR
+    return factor * _majority_difference(rows)
+
+
+def qn_sample_factor(n: int) -> float:
+    """Return the factor that makes Qn of ``n`` normal values unbiased (robustbase's revision).
+
+    Example:
+        >>> round(qn_sample_factor(50), 6)
+        0.930802
+    """
+    if n < 2:
+        return 1.0
+    if n <= 12:
+        return _QN_SMALL[n - 2]
+    if n % 2:
+        return 1 / (1 + (1.60188 + (-2.1284 - 5.172 / n) / n) / n)
+    return 1 / (1 + (3.67561 + (1.9654 + (6.987 - 77 / n) / n) / n) / n)
+
+
+def half_size(n: int) -> int:
+    """Size of the smallest majority of ``n`` values, the h of Qn: ``floor(n / 2) + 1``."""
+    return n // 2 + 1
+
+
+def _largest_within(threshold: float, factor: float, dtype: torch.dtype) -> float:
+    """Largest x of ``dtype`` with ``factor * x <= threshold`` in the arithmetic of ``dtype``."""
+    kind = np.float32 if dtype == torch.float32 else np.float64
+    limit, scale = kind(threshold), kind(factor)
+    x = limit / scale
+    while scale * x > limit:
+        x = np.nextafter(x, kind(-np.inf))
+    while scale * np.nextafter(x, kind(np.inf)) <= limit < np.inf:
+        x = np.nextafter(x, kind(np.inf))
+    return float(x)
+
+
+def _majority_difference(sorted_rows: Tensor) -> Tensor:
+    """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
+
+    Two values that are h or more places apart enclose at least C(h + 1, 2) pairs that are no
+    further apart than they are, so only lags 1 to h - 1 of the sorted row can hold the answer.
+    """
+    rank = comb(half_size(sorted_rows.shape[1]), 2)
+    out = sorted_rows.new_empty(len(sorted_rows))
+    _with_lags(sorted_rows, out, lambda lagged, rows: lagged.select(rows, rank), sorts=True)
+    out[sorted_rows[:, -1].isnan()] = torch.nan
+    return out
+
+
+def _count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
+    """Count the differences at lags 1 to h - 1 at or below ``bound`` of each row, int32."""
+    out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
+    _with_lags(sorted_rows, out, lambda lagged, rows: lagged.count(rows, bound), sorts=False)
+    return out
+
+
+def _with_lags(
+    sorted_rows: Tensor, out: Tensor, work: Callable[["_Lagged", Tensor], Tensor], *, sorts: bool
+) -> None:
+    """Fill ``out`` with what ``work`` returns for chunks of rows, with one buffer a thread."""
+    n = sorted_rows.shape[1]
+    width = max(2 * _NETWORK, sum(n - lag for lag in range(1, half_size(n))))
+    scale = 1 if sorted_rows.device.type == "cpu" else _GPU_SHARE
+    size = max(1, scale * CACHE_BYTES // (width * sorted_rows.element_size()))
+
+    def fill(share: slice) -> None:
+        rows, into = sorted_rows[share], out[share]
+        lagged = _Lagged(rows, min(size, len(rows)), sorts=sorts)
+        for chunk in chunks_of(len(rows), size):
+            into[chunk] = work(lagged, rows[chunk])
+
+    num_rows = len(sorted_rows)
+    map_chunks(fill, num_rows, max(num_rows, 1), sorted_rows.device, least=size)
+
+
 _NETWORK = 512
 """Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions.
 
@@ -27,57 +350,8 @@ As integers, whose order is that of non-negative floats, they take two thirds of
 _MOST_LAGS = 8
 """Lags in one subtraction. They are all as wide as the first of them."""
 
-
-def half_size(n: int) -> int:
-    """Size of the smallest majority of ``n`` values, the h of Qn: ``floor(n / 2) + 1``."""
-    return n // 2 + 1
-
-
-def majority_difference(sorted_rows: Tensor) -> Tensor:
-    """Return the C(h, 2)-th smallest pairwise difference of each sorted row, h = floor(n/2) + 1.
-
-    Two values that are h or more places apart enclose at least C(h + 1, 2) pairs that are no
-    further apart than they are, so only lags 1 to h - 1 of the sorted row can hold the answer.
-
-    Args:
-        sorted_rows: Ascending values, shape ``(B, n)``, n >= 2; NaN last.
-
-    Returns:
-        The order statistic, shape ``(B,)``, exact; NaN where a row has one.
-    """
-    num_rows, n = sorted_rows.shape
-    rank = comb(half_size(n), 2)
-    out = sorted_rows.new_empty(num_rows)
-
-    def work(chunks: Iterator[slice]) -> None:
-        lagged = _Lagged(sorted_rows, sorts=True)
-        for chunk in chunks:
-            out[chunk] = lagged.select(sorted_rows[chunk], rank)
-
-    share_chunks(work, _chunks(sorted_rows), sorted_rows.device)
-    out[sorted_rows[:, -1].isnan()] = torch.nan
-    return out
-
-
-def count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
-    """Count the pairwise differences at lags 1 to h - 1 that are at or below ``bound``.
-
-    Args:
-        sorted_rows: Ascending values, shape ``(B, n)``, n >= 2; NaN last.
-        bound: The bound, at least 0.
-
-    Returns:
-        Counts, shape ``(B,)``, int32.
-    """
-    out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
-
-    def work(chunks: Iterator[slice]) -> None:
-        lagged = _Lagged(sorted_rows, sorts=False)
-        for chunk in chunks:
-            out[chunk] = lagged.count(sorted_rows[chunk], bound)
-
-    share_chunks(work, _chunks(sorted_rows), sorted_rows.device)
-    return out
+_GPU_SHARE = 256
+"""Times as much at once on a GPU, which has memory for it and is slow to start."""
 
 
 class _Lagged:
@@ -86,9 +360,9 @@ class _Lagged:
     With ``sorts``, differences that fill one or two sorting networks go to these.
     """
 
-    def __init__(self, rows: Tensor, *, sorts: bool) -> None:
+    def __init__(self, rows: Tensor, size: int, *, sorts: bool) -> None:
         n = rows.shape[1]
-        size, pitch = _chunk_size(rows), n + half_size(n)
+        pitch = n + half_size(n)
         self.on_cpu = rows.device.type == "cpu"
         self.finite = bool(rows[:, :: max(n - 1, 1)].isfinite().all())
         runs = _runs_in_networks(n) if sorts and self.on_cpu and rows.element_size() == 4 else []
@@ -196,275 +470,3 @@ def _runs_in_networks(n: int) -> list[_Run]:
         if runs and runs[-1].stop <= 2 * _NETWORK:
             return runs
     return []
-
-
-def _chunk_size(rows: Tensor) -> int:
-    n = rows.shape[1]
-    width = max(2 * _NETWORK, sum(n - lag for lag in range(1, half_size(n))))
-    scale = 1 if rows.device.type == "cpu" else 256
-    return min(len(rows), max(1, scale * _CHUNK_BYTES // (width * rows.element_size()))) or 1
-
-
-def _chunks(rows: Tensor) -> list[slice]:
-    return chunks_of(len(rows), _chunk_size(rows))
-
-
-MAD_FACTOR = 1.4826
-"""1 / Phi^-1(3/4), to the digits of the literature."""
-
-QN_FACTOR = 2.2219
-"""Factor of Qn as printed by Rousseeuw and Croux (1993), eq. 3.9, and by the method's eq. 7.
-
-The exact value 1 / (sqrt(2) Phi^-1(5/8)) is 2.219144.
-"""
-
-QN_REVISED_FACTOR = 2.21914
-"""Factor that goes with the finite-sample factors of :func:`qn_sample_factor`."""
-
-_TAU_WEIGHT_CUT = 4.5
-_TAU_SCALE_CUT = 3.0
-
-_QN_SMALL: tuple[float, ...] = (0.399356, 0.99365, 0.51321, 0.84401, 0.6122, 0.85877)
-_QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
-
-
-def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """Return the median along an axis, the mean of the middle two for an even count.
-
-    Args:
-        x: Values, floating point, any shape.
-        dim: Axis to reduce.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
-
-    Returns:
-        Medians, the shape of ``x`` without ``dim``; NaN where no value counts or one that counts
-        is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
-
-    Example:
-        >>> median(torch.tensor([4.0, 1.0, 3.0, 2.0])).item()
-        2.5
-    """
-    return _per_count("median", x, dim, mask, _sorted_median)
-
-
-def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """Return the median absolute deviation from the median, times 1.4826.
-
-    Args:
-        x: Values, floating point, any shape.
-        dim: Axis to reduce.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
-
-    Returns:
-        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
-        NaN where no value counts or one that counts is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
-
-    Example:
-        >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
-        1.4825999736785889
-    """
-
-    def of_sorted(rows: Tensor) -> Tensor:
-        deviations = (rows - _sorted_median(rows)[:, None]).abs()
-        return MAD_FACTOR * _sorted_median(sort_rows(deviations))
-
-    return _per_count("mad", x, dim, mask, of_sorted)
-
-
-def qn(
-    x: Tensor, *, dim: int = -1, finite_sample: bool = False, mask: Tensor | None = None
-) -> Tensor:
-    r"""Return the scale Qn of Rousseeuw and Croux, an order statistic of pairwise differences.
-
-    :math:`Q_n = 2.2219 \{|x_i - x_j|;\ i < j\}_{(\kappa)}` with :math:`\kappa = \binom{h}{2}` and
-    :math:`h = \lfloor n/2 \rfloor + 1` [1]. The order statistic is exact, without interpolation.
-
-    Args:
-        x: Values, floating point, any shape.
-        dim: Axis to reduce.
-        finite_sample: Multiply by the revised factor 2.21914 and by :func:`qn_sample_factor`
-            instead of 2.2219, as R's robustbase does by default.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
-
-    Returns:
-        Scales, the shape of ``x`` without ``dim``; 0 where h values or more are equal or only one
-        counts, NaN where none counts or one that counts is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
-
-    References:
-        [1] P. J. Rousseeuw, C. Croux. Alternatives to the median absolute deviation. Journal of
-        the American Statistical Association 88, 1993.
-
-    Example:
-        >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0]))
-        tensor(6.6657)
-    """
-
-    def of_sorted(rows: Tensor) -> Tensor:
-        n = rows.shape[1]
-        if n < 2:
-            return rows.new_zeros(len(rows)) if n else rows.new_full((len(rows),), torch.nan)
-        factor = QN_REVISED_FACTOR * qn_sample_factor(n) if finite_sample else QN_FACTOR
-        return factor * majority_difference(rows)
-
-    return _per_count("qn", x, dim, mask, of_sorted)
-
-
-def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
-
-    Args:
-        x: Values, floating point, any shape.
-        threshold: The bound, at least 0, in the unit of ``x``.
-        dim: Axis to reduce.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
-
-    Returns:
-        The same as ``qn(x, dim=dim, mask=mask) > threshold``, bool; False where Qn is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
-
-    Example:
-        >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
-        tensor([False,  True])
-    """
-
-    def of_sorted(rows: Tensor) -> Tensor:
-        n = rows.shape[1]
-        if n < 2:
-            return torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
-        bound = _largest_within(threshold, QN_FACTOR, rows.dtype)
-        count = count_differences(rows, bound)
-        return (count < comb(half_size(n), 2)) & ~rows[:, -1].isnan()
-
-    return _per_count("qn_exceeds", x, dim, mask, of_sorted)
-
-
-def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    r"""Return the tau scale of Maronna and Zamar: a truncated standard deviation.
-
-    With :math:`s_0` the median of the deviations from the median: the centre is the mean with
-    bisquare weights that vanish at :math:`4.5 s_0`, and the scale the root of the mean square
-    about it, each deviation cut at :math:`3 s_0` [1]. Cheaper than Qn for long rows, linear but
-    for a sort.
-
-    Args:
-        x: Values, floating point, any shape.
-        dim: Axis to reduce.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
-
-    Returns:
-        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
-        NaN where no value counts or one that counts is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
-
-    References:
-        [1] R. A. Maronna, R. H. Zamar. Robust estimates of location and dispersion for
-        high-dimensional datasets. Technometrics 44, 2002.
-
-    Example:
-        >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
-        tensor(1.7441)
-    """
-    return _per_count("tau", x, dim, mask, tau_of_sorted)
-
-
-def tau_of_sorted(rows: Tensor) -> Tensor:
-    """Tau scale of each sorted row of ``(B, n)``, shape ``(B,)``."""
-    if rows.shape[1] == 0:
-        return rows.new_full((len(rows),), torch.nan)
-    lanes = rows.t().contiguous()
-    spread = _sorted_median(sort_rows((rows - _sorted_median(rows)[:, None]).abs()))
-    unit = torch.where(spread > 0, spread, 1.0)
-    standard = (lanes - _sorted_median(rows)) / unit
-    weights = (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
-    center = sum_points(weights * standard) / sum_points(weights)
-    squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
-    variance = sum_points(squares) / (len(lanes) * _tau_consistency())
-    return torch.where(spread > 0, unit * variance.sqrt(), spread)
-
-
-def _tau_consistency() -> float:
-    """Mean of the truncated squares where the values are standard normal."""
-    normal = NormalDist()
-    cut = _TAU_SCALE_CUT * normal.inv_cdf(0.75)
-    inside = (1 - cut * cut) * normal.cdf(cut) - cut * normal.pdf(cut) + cut * cut
-    return 2 * inside - 1
-
-
-def qn_sample_factor(n: int) -> float:
-    """Return the factor that makes Qn of ``n`` normal values unbiased (robustbase's revision).
-
-    Example:
-        >>> round(qn_sample_factor(50), 6)
-        0.930802
-    """
-    if n < 2:
-        return 1.0
-    if n <= 12:
-        return _QN_SMALL[n - 2]
-    if n % 2:
-        return 1 / (1 + (1.60188 + (-2.1284 - 5.172 / n) / n) / n)
-    return 1 / (1 + (3.67561 + (1.9654 + (6.987 - 77 / n) / n) / n) / n)
-
-
-def _sorted_median(rows: Tensor) -> Tensor:
-    """Median of each sorted row; NaN where the row is empty or has a NaN, which sorts last."""
-    if rows.shape[1] == 0:
-        return rows.new_full((len(rows),), torch.nan)
-    return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
-
-
-def _per_count(
-    caller: str, x: Tensor, dim: int, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """Apply a function of sorted rows ``(B, n)`` along ``dim``, once for each number of values.
-
-    Values that do not count become +inf, sort last, and are cut off; a NaN that counts sorts
-    behind them, so rows with one are set apart first.
-    """
-    x = as_tensor(caller, "x", x)
-    check_floating(caller, x=x)
-    check_shapes(caller, x=(x, "*"), mask=(mask, "*"))
-    if not -x.dim() <= dim < x.dim():
-        raise ShapeError(f"{caller}: expected x with an axis {dim}, got shape {tuple(x.shape)}.")
-    rows = x.detach().movedim(dim, -1)
-    shape, n = rows.shape[:-1], rows.shape[-1]
-    rows = rows.reshape(shape.numel(), n)
-    if mask is None:
-        return of_sorted(sort_rows(rows.contiguous())).reshape(shape)
-    counted = mask.movedim(dim, -1).reshape(shape.numel(), n)
-    broken = (rows.isnan() & counted).any(dim=1)
-    ascending = sort_rows(torch.where(counted, rows, torch.inf))
-    counts = counted.sum(dim=1)
-    out = rows.new_full((len(rows),), torch.nan)
-    results: Tensor | None = None
-    for count in sorted(set(counts.tolist())) or [n]:
-        chosen = (counts == count) & ~broken
-        found = of_sorted(ascending[chosen][:, :count].contiguous())
-        results = out.to(found.dtype) if results is None else results
-        results[chosen] = found
-    return (out if results is None else results).reshape(shape)
-
-
-def _largest_within(threshold: float, factor: float, dtype: torch.dtype) -> float:
-    """Largest x of ``dtype`` with ``factor * x <= threshold`` in the arithmetic of ``dtype``."""
-    kind = np.float32 if dtype == torch.float32 else np.float64
-    limit, scale = kind(threshold), kind(factor)
-    x = limit / scale
-    while scale * x > limit:
-        x = np.nextafter(x, kind(-np.inf))
-    while scale * np.nextafter(x, kind(np.inf)) <= limit < np.inf:
-        x = np.nextafter(x, kind(np.inf))
-    return float(x)

@@ -4,50 +4,76 @@ from functools import lru_cache
 from itertools import combinations
 from math import comb
 from statistics import NormalDist
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg.errors import ConfigError
 from torchrg.linalg import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
+    dot,
     eigenvectors,
-    median_of_sorted,
+    map_values,
     median_points,
     smallest_points,
-    sort_rows,
     sorted_points,
-    sum_points,
     sum_squares,
 )
 from torchrg.robust.scale import (
-    QN_REVISED_FACTOR,
-    majority_difference,
-    qn_sample_factor,
+    median_of_sorted,
+    qn_of_sorted,
+    sort_rows,
+    sum_points,
     tau_of_sorted,
 )
 
-NUM_STARTS = 6
-"""Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order."""
+Starts = Literal["paper", "robustbase", "planes", "more"]
 
 _LONG = 1000
+"""Values from which tau takes the place of Qn, as in robustbase: Qn needs all their differences."""
+
 _STARTS_AT_ONCE = 3
-"""Starts worked on together."""
+"""Of the six starts, worked on together: what they need fits the cache."""
+
+_NUM_PLANES = 64
+"""Planes of which the best become starts."""
+
+_NUM_PLANE_STARTS = 4
+"""Planes that become starts."""
+
+_PLANES_AT_ONCE = 8
+"""Planes worked on together: what they need fits the cache."""
 
 
-def deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
-    """Choose the six initial sets of each lane (Hubert, Rousseeuw, Verdonck 2012, section 3).
+def check_starts(caller: str, starts: str) -> None:
+    """Raise if there are no such starts."""
+    if starts not in get_args(Starts):
+        known = ", ".join(get_args(Starts))
+        raise ConfigError(f"{caller}: expected starts to be one of {known}, got {starts!r}.")
 
-    Args:
-        columns: P coordinates of shape ``(K, M)``, K >= 2.
-        size: Number of points of an initial set.
 
-    Returns:
-        1 for a point in the set, 0 for another, shape ``(K, 6, M)``.
+def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:
+    """Initial sets ``(K, S, M)`` of the chosen starts, each with the size of its sets.
+
+    1 stands for a point in the set, 0 for another; ``size`` is h.
     """
+    half = -(-len(columns[0]) // 2)
+    if starts == "paper":
+        return [(_deterministic_starts(columns, half), half)]
+    if starts == "robustbase":
+        return [(_deterministic_starts(columns, size), size)]
+    planes = (_plane_starts(columns, size), size)
+    if starts == "planes":
+        return [planes]
+    return [planes, (_deterministic_starts(_rotate_to_axes(columns), half), half)]
+
+
+def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
+    """Choose the six initial sets of each lane (Hubert, Rousseeuw, Verdonck 2012, section 3)."""
     standard = [_standardize(column) for column in columns]
-    # Some starts after the others: what they need fits the cache.
     distances = [
         _sphered_distances(standard, eigenvectors(matrices))
         for matrices in torch.split(_scatter_matrices(standard), _STARTS_AT_ONCE)
@@ -65,10 +91,9 @@ def _standardize(column: Tensor) -> Tensor:
 
 def _scale(rows: Tensor) -> Tensor:
     """Qn of sorted rows with its finite-sample factor; tau of long ones, as robustbase has it."""
-    count = rows.shape[1]
-    if count >= _LONG:
+    if rows.shape[1] >= _LONG:
         return tau_of_sorted(rows)
-    return QN_REVISED_FACTOR * qn_sample_factor(count) * majority_difference(rows)
+    return qn_of_sorted(rows, finite_sample=True)
 
 
 def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
@@ -94,7 +119,10 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
 
 
 def _scatter_matrices(columns: list[Tensor]) -> Tensor:
-    """Stack the six scatter matrices of standardised columns into ``(6, M, P, P)``."""
+    """Stack the six scatter matrices of standardised columns into ``(6, M, P, P)``.
+
+    Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order.
+    """
     ranks = [_double_ranks(column) for column in columns]
     scores = _normal_scores(len(columns[0]), columns[0])
     norms = sum_squares(columns)
@@ -106,7 +134,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     inner = [sum_points(half * column) / sum_points(half) for column in columns]
     return torch.stack(
         [
-            _correlation([_tanh(column) for column in columns]),
+            _correlation([map_values(np.tanh, torch.tanh, column) for column in columns]),
             _correlation([rank.to(norms.dtype) for rank in ranks]),
             _correlation([torch.take(scores, rank) for rank in ranks]),
             covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
@@ -119,15 +147,13 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
 def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
     """Squared distances of the points after sphering by each start's scatter, ``(K, S, M)``.
 
-    Args:
-        columns: P coordinates of shape ``(K, M)``.
-        loadings: Eigenvectors of the scatters, as columns, shape ``(S, M, P, P)``.
+    ``loadings`` are the eigenvectors of the scatters, as columns, shape ``(S, M, P, P)``.
     """
     shape = (len(columns[0]), *loadings.shape[:2])
     sphered: list[Tensor] = []
     for directions in loadings.unbind(dim=3):
         axis = [part.contiguous() for part in directions.unbind(dim=2)]
-        score = _combine(columns, axis).flatten(1)
+        score = dot([column[:, None] for column in columns], axis).flatten(1)
         rows = sorted_points(score)
         score /= _positive_scale(rows, median_of_sorted(rows))
         for i, factor in enumerate(axis):
@@ -137,14 +163,6 @@ def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
             else:
                 sphered[i] += part
     return sum_squares([part - median_points(part) for part in sphered]).view(shape)
-
-
-def _combine(columns: list[Tensor], factors: list[Tensor]) -> Tensor:
-    """Sum of the columns ``(K, M)`` times factors ``(S, M)``, shape ``(K, S, M)``."""
-    total = columns[0][:, None] * factors[0]
-    for column, factor in zip(columns[1:], factors[1:], strict=True):
-        total += column[:, None] * factor
-    return total
 
 
 def _correlation(columns: list[Tensor]) -> Tensor:
@@ -208,71 +226,16 @@ def _normal_scores(count: int, like: Tensor) -> Tensor:
     return torch.tensor(_score_table(count), dtype=like.dtype, device=like.device)
 
 
-def _tanh(values: Tensor) -> Tensor:
-    """Hyperbolic tangent, the same for a value wherever it stands; torch's on a CPU is not."""
-    if values.device.type == "cpu":
-        return torch.from_numpy(np.tanh(values.numpy()))
-    return values.tanh()
-
-
-@lru_cache(maxsize=64)
-def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tensor:
-    """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
-
-    The same sets serve every patch, so a patch's result depends on the seed and on nothing else
-    in its batch.
-
-    Args:
-        num_points: n.
-        size: Points of a set, at most n.
-        num_sets: How many to draw.
-        seed: Of the draw.
-
-    Returns:
-        Point indices, shape ``(S, size)``, int64: all sets in lexicographic order where there are
-        at most ``5 * num_sets``, otherwise ``num_sets`` of them.
-
-    Example:
-        >>> elemental_sets(4, 3, 1, 0).tolist()
-        [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
-    """
-    if comb(num_points, size) <= 5 * num_sets:
-        return torch.tensor(list(combinations(range(num_points), size)))
-    generator = torch.Generator().manual_seed(seed)
-    draws = torch.rand(num_sets, num_points, generator=generator)
-    return draws.argsort(dim=1, stable=True)[:, :size]
-
-
-def draw_seed(generator: torch.Generator | None) -> int:
-    """Take one seed from a generator; without one the seed is 0."""
-    if generator is None:
-        return 0
-    return int(torch.randint(2**62, (), generator=generator, device=generator.device))
-
-
-NUM_PLANES = 64
-NUM_PLANE_STARTS = 4
-_PLANES_AT_ONCE = 8
-
-
-def plane_starts(columns: list[Tensor], size: int) -> Tensor:
+def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
     """Choose the sets nearest to the best of 64 planes through P points each.
 
     The best planes are those with the smallest ``size``-th distance (least median of squares).
     With a minority of outliers some of the planes pass through clean points only, wherever the
     outliers are; six scatter estimates may all be drawn to one cluster of them. There are only
     sums and one sort a plane, against 27 Qn for the published starts.
-
-    Args:
-        columns: P coordinates of shape ``(K, M)``, K >= P.
-        size: h, the number of points of an initial set.
-
-    Returns:
-        1 for a point in the set, 0 for another, shape ``(K, 4, M)``; fewer starts where there are
-        fewer planes.
     """
     num_points, num_lanes = columns[0].shape
-    sets = elemental_sets(num_points, len(columns), NUM_PLANES, seed=0).to(columns[0].device)
+    sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
     scores = []
     for first in range(0, len(sets), _PLANES_AT_ONCE):
         some = sets[first : first + _PLANES_AT_ONCE]
@@ -280,27 +243,12 @@ def plane_starts(columns: list[Tensor], size: int) -> Tensor:
         scores.append(nearest.reshape(len(some), num_lanes))
     score = torch.cat(scores)
     starts = []
-    for _ in range(min(NUM_PLANE_STARTS, len(sets))):
+    for _ in range(min(_NUM_PLANE_STARTS, len(sets))):
         best = score.argmin(dim=0)
         score.scatter_(0, best[None], torch.inf)
         residuals = _sq_residuals(columns, sets[best].t()[None])
         starts.append(smallest_points(residuals, size))
     return torch.stack(starts, dim=1)
-
-
-def rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
-    """Express the points of each lane in the eigenvectors of its covariance."""
-    ones = torch.ones_like(columns[0])
-    means = [sum_points(column) / len(column) for column in columns]
-    vectors = eigenvectors(covariance_entries(columns, means, ones, len(ones)))
-    centered = [column - mean for column, mean in zip(columns, means, strict=True)]
-    rotated = []
-    for j in range(len(columns)):
-        column = centered[0] * vectors[:, 0, j]
-        for i in range(1, len(columns)):
-            column += centered[i] * vectors[:, i, j]
-        rotated.append(column)
-    return rotated
 
 
 def _sq_residuals(columns: list[Tensor], sets: Tensor) -> Tensor:
@@ -312,14 +260,9 @@ def _sq_residuals(columns: list[Tensor], sets: Tensor) -> Tensor:
     ]
     edges = [[a - b for a, b in zip(corner, corners[0], strict=True)] for corner in corners[1:]]
     normal = _across(edges, corners[0])
-    offset = corners[0][0] * normal[0]
-    for corner, part in zip(corners[0][1:], normal[1:], strict=True):
-        offset = offset + corner * part
-    residual = columns[0][:, None] * normal[0]
-    for column, part in zip(columns[1:], normal[1:], strict=True):
-        residual += column[:, None] * part
+    residual = dot([column[:, None] for column in columns], normal)
     # Points that span no hyperplane are infinitely far from it.
-    residual -= torch.where(sum_squares(normal) > 0, offset, torch.inf)
+    residual -= torch.where(sum_squares(normal) > 0, dot(corners[0], normal), torch.inf)
     return (residual * residual).reshape(num_points, -1)
 
 
@@ -343,3 +286,41 @@ def _across(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
     length = sum_squares(normal).sqrt()
     length = torch.where(length > 0, length, 1.0)
     return [part / length for part in normal]
+
+
+def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
+    """Express the points of each lane in the eigenvectors of its covariance."""
+    ones = torch.ones_like(columns[0])
+    means = [sum_points(column) / len(column) for column in columns]
+    vectors = eigenvectors(covariance_entries(columns, means, ones, len(ones)))
+    centered = [column - mean for column, mean in zip(columns, means, strict=True)]
+    return [dot(centered, axis.unbind(dim=1)) for axis in vectors.unbind(dim=2)]
+
+
+@lru_cache(maxsize=64)
+def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tensor:
+    """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
+
+    The same sets serve every patch, so a patch's result depends on the seed and on nothing else
+    in its batch.
+
+    Returns:
+        Point indices, shape ``(S, size)``, int64: all sets in lexicographic order where there are
+        at most ``5 * num_sets``, otherwise ``num_sets`` of them.
+
+    Example:
+        >>> elemental_sets(4, 3, 1, 0).tolist()
+        [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
+    """
+    if comb(num_points, size) <= 5 * num_sets:
+        return torch.tensor(list(combinations(range(num_points), size)))
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.rand(num_sets, num_points, generator=generator)
+    return draws.argsort(dim=1, stable=True)[:, :size]
+
+
+def draw_seed(generator: torch.Generator | None) -> int:
+    """Take one seed from a generator; without one the seed is 0."""
+    if generator is None:
+        return 0
+    return int(torch.randint(2**62, (), generator=generator, device=generator.device))

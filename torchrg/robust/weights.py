@@ -1,4 +1,4 @@
-"""From a raw fit to the final one: sizes, cut-offs, correction factors, reweighting."""
+"""From a raw fit to the final one: h, cut-offs, correction factors, and the reweighted scatter."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -8,22 +8,15 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most
-from torchrg.robust.lanes import covariance_entries, join_columns, sum_points
+from torchrg.robust.lanes import covariance_entries, join_columns
+from torchrg.robust.scale import sum_points
 
 
 def subset_size(num_points: int, num_coordinates: int, support_fraction: float) -> int:
     """Return h, the number of points whose scatter the MCD minimises, as R's ``h.alpha.n``.
 
     Between the smallest size with the highest breakdown point, ``(n + p + 1) // 2``, at a support
-    fraction of 0.5 and all points at 1.
-
-    Args:
-        num_points: n.
-        num_coordinates: p.
-        support_fraction: From 0.5 to 1.
-
-    Returns:
-        h, at most n.
+    fraction of 0.5 and all n points at 1.
 
     Example:
         >>> subset_size(50, 3, 0.5), subset_size(50, 3, 0.75), subset_size(50, 3, 1.0)
@@ -66,6 +59,7 @@ def consistency_factor(fraction: float, num_coordinates: int) -> float:
 
 _RAW_SMALL = (2.12777, 2.718898, 1.993509, 2.220433, 1.820585)
 _FINAL_SMALL = (1.73511, 2.06681, 1.545905, 1.659655, 1.456835)
+"""Factors of 6 to 10 points at a support fraction of 0.5, which the formula does not meet."""
 
 
 def small_sample_factor(
@@ -73,20 +67,11 @@ def small_sample_factor(
 ) -> float:
     """Factor that removes the bias of the MCD scatter of few normal points (Pison et al. 2002).
 
-    Known for three coordinates. Where the published formula has its pole (five points and fewer)
-    or is negative (six), the factor is 1.
-
-    Args:
-        num_points: n.
-        num_coordinates: p; only 3 is known.
-        support_fraction: From 0.5 to 1.
-        reweighted: For the reweighted scatter instead of the raw one.
-
-    Returns:
-        The factor to multiply the scatter with.
+    For the raw scatter or the reweighted one. Where the published formula has its pole (five points
+    and fewer) or is negative (six), the factor is 1.
 
     Raises:
-        ConfigError: If ``num_coordinates`` is not 3.
+        ConfigError: If ``num_coordinates`` is not 3: no others are known.
 
     Example:
         >>> round(small_sample_factor(50, 3, 0.5, reweighted=False), 4)
@@ -114,16 +99,9 @@ def small_sample_factor(
 
 
 class Estimate(NamedTuple):
-    """A fit of each lane; the fields of :class:`torchrg.robust.RobustFit`, points on axis 0.
+    """A fit of each of M lanes; the fields of :class:`torchrg.robust.RobustFit`, points on axis 0.
 
     Attributes:
-        location: Shape ``(M, P)``.
-        covariance: Shape ``(M, P, P)``.
-        support: Shape ``(K, M)``, bool.
-        sq_distances: Shape ``(K, M)``.
-        raw_location: Shape ``(M, P)``.
-        raw_covariance: Shape ``(M, P, P)``.
-        raw_support: Shape ``(K, M)``, bool.
         objective: What was minimised, a determinant, shape ``(M,)``, float64.
         singular: Whether ``raw_support`` lies on a hyperplane, shape ``(M,)``, bool.
     """
@@ -139,30 +117,16 @@ class Estimate(NamedTuple):
     singular: Tensor
 
 
-class Reweighting(NamedTuple):
-    """Mean and covariance of the points within the cut-off."""
-
-    location: Tensor
-    covariance: Tensor
-    support: Tensor
-
-
 def reweight(
     columns: list[Tensor], distances: Tensor, quantile: float, small_sample: float = 1.0
-) -> Reweighting:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Take mean and covariance of the points within a chi-square quantile of a raw fit.
 
     The covariance has its consistency factor, and neither that nor the small-sample factor where
     no point is left out.
 
-    Args:
-        columns: P coordinates of shape ``(K, M)``.
-        distances: Squared distances to the raw fit, shape ``(K, M)``.
-        quantile: Level of the cut-off, below 1.
-        small_sample: Factor for the covariance of few points.
-
     Returns:
-        Location ``(M, P)``, covariance ``(M, P, P)`` and the points kept ``(K, M)``, bool.
+        Location, covariance and support, as in :class:`Estimate`.
     """
     size = len(columns)
     bound = distances.new_tensor([chi2_quantile(quantile, size)])
@@ -173,4 +137,4 @@ def reweight(
     factor = consistency_factor(quantile, size) * small_sample
     whole = count == len(distances)
     covariance = torch.where(whole[:, None, None], covariance, covariance * factor)
-    return Reweighting(join_columns(means), covariance, weights > 0)
+    return join_columns(means), covariance, weights > 0

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors.voxels import restore_points, sample_voxels
+from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.structures import UNLABELED
 from torchrg.transforms.depth import DepthToCloud
 

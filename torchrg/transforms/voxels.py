@@ -11,8 +11,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.config import PipelineConfig, load_config
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows
-from torchrg.neighbors.voxels import restore_points, sample_voxels
+from torchrg.neighbors import finite_rows, restore_points, sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
 from torchrg.structures import UNLABELED, PlaneAdjacency, Segmentation

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrg._parallel import each_block_of
+from torchrg._parallel import ROWS_IN_CACHE, map_chosen
 from torchrg.config import NormalsConfig
 from torchrg.linalg.moments import Columns, fit_planes, residuals, split_columns
 from torchrg.neighbors import gather_patches, search_knn
@@ -15,7 +15,6 @@ from torchrg.normals.pca import fit_normals_pca
 from torchrg.structures import Neighbors, NormalFit
 
 _LEAST_NEIGHBORS = 12
-_BLOCK = 8192
 _NUM_ROUNDS = 2
 _INLIER_REACH = 3.0
 _LEAST_ERROR = 0.003
@@ -69,7 +68,7 @@ def estimate_consensus(
         >>> bool((fit.normals[:400].abs() == torch.tensor([0.0, 0, 1])).all())
         True
     """
-    block = min(chunk_size, _BLOCK)
+    block = min(chunk_size, ROWS_IN_CACHE)
     fit = fit_points(points, neighbors, _fit_pca, chunk_size=chunk_size)
     if neighbors.indices.shape[1] < _LEAST_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))
@@ -98,7 +97,7 @@ def estimate_consensus(
         curvature[rows] = bent / torch.where(total > 0, total, 1.0)
         residual_rms[rows] = smallest.sqrt()
 
-    each_block_of(describe, sharp, block)
+    map_chosen(describe, sharp, block)
     return NormalFit(planes.normals, curvature, fit.valid, residual_rms, sharp)
 
 
@@ -142,7 +141,7 @@ def _standard_errors(
         error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
         errors[rows] = torch.maximum(errors[rows], error.clamp_(max=_MOST_ERROR))
 
-    each_block_of(work, sharp, block)
+    map_chosen(work, sharp, block)
     return errors
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import chunks_of
+from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.linalg import above, at_most
 from torchrg.linalg.moments import (
     Columns,
@@ -23,8 +23,6 @@ _NUM_PAIRS = 32
 _THINNEST_TRIANGLE = 0.1
 _VOTE_TOLERANCE = 2.0
 _FIT_TOLERANCE = 3.5
-_ROWS = 8192
-"""Points times candidates that are scored in one step."""
 
 
 def vote_planes(
@@ -69,8 +67,8 @@ def vote_planes(
     reach = _VOTE_TOLERANCE * noise
     best, normals = _score(columns, weights, start, reach), start
     candidates, broad = _planes_through(columns, _pairs(sq_distances.shape[1]))
-    # Few points are scored for several candidates in one step.
-    for some in chunks_of(len(candidates), max(1, _ROWS // max(len(noise), 1))):
+    # Few points are scored for several candidates in one step, points times candidates in cache.
+    for some in chunks_of(len(candidates), max(1, ROWS_IN_CACHE // max(len(noise), 1))):
         scores = _score(columns, weights, candidates[some], reach)
         scores = torch.where(broad[some], scores, -torch.inf)
         for candidate, score in zip(candidates[some], scores, strict=True):

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import each_block
+from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks
 from torchrg.linalg import coordinate_resolution, covariance
 from torchrg.linalg.moments import (
     fit_planes,
@@ -18,7 +18,6 @@ from torchrg.linalg.moments import (
 from torchrg.neighbors import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 
-_BLOCK = 8192
 _QUANTILE = 0.35
 _COMMON_QUANTILE = 0.15
 _MOST_ABOVE = 3.0
@@ -61,7 +60,7 @@ class Survey(NamedTuple):
 
 
 def survey_noise(
-    points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = 16384
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = CHUNK_SIZE
 ) -> Survey:
     r"""Estimate the noise about each point, at edges and on curved surfaces too.
 
@@ -104,7 +103,7 @@ def survey_noise(
         for values, part in zip((offsets, radius, whole, *small), found, strict=True):
             values[block] = part
 
-    each_block(work, len(points), chunk_size, points.device)
+    map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
     noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors, _QUANTILE)
     count: Tensor | int = neighbors.indices.shape[1]
@@ -190,5 +189,5 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
         near.partition(rank - 1, axis=1)
         found.numpy()[block] = near[:, rank - 1]
 
-    each_block(work, len(values), _BLOCK, values.device)
+    map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
     return found

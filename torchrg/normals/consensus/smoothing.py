@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import each_block
+from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.linalg import signs
 from torchrg.linalg.moments import residuals, split_columns, sq_lengths
 from torchrg.neighbors import gather_patches
@@ -42,7 +42,7 @@ def average_planes(
     errors: Tensor,
     rows: Tensor,
     *,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
 ) -> TangentPlanes:
     r"""Give points the average of the planes of those neighbours that agree with theirs.
 
@@ -100,7 +100,7 @@ def average_planes(
         moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
         offsets[chosen] = torch.where(found, moved, offsets[chosen])
 
-    each_block(work, len(rows), chunk_size, rows.device)
+    map_chunks(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
 
 
@@ -111,7 +111,7 @@ def choose_planes(
     noise: Tensor,
     rows: Tensor,
     *,
-    chunk_size: int = 16384,
+    chunk_size: int = CHUNK_SIZE,
 ) -> TangentPlanes:
     r"""Give points the plane, among those of their neighbours, that their neighbourhood supports.
 
@@ -158,7 +158,7 @@ def choose_planes(
             normals[chosen] = torch.where(better[:, None], normal, normals[chosen])
             offsets[chosen] = torch.where(better, offset, offsets[chosen])
 
-    each_block(work, len(rows), chunk_size, rows.device)
+    map_chunks(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import each_block, each_block_of
+from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg.moments import Columns, split_columns
 from torchrg.neighbors import gather_patches
 from torchrg.normals.consensus.hypotheses import (
@@ -95,7 +95,7 @@ def fit_pieces(
             columns, fit.normals[rows], counted
         )
 
-    each_block_of(bend, unexplained, chunk_size)
+    map_chosen(bend, unexplained, chunk_size)
     broken = unexplained & (bent > _BENT * noise)
     broken &= bent > _CURVED_SHARE * survey.deviations
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
@@ -119,7 +119,7 @@ def fit_pieces(
 
     asked = broken & (_may_meet(broken, neighbors, chunk_size) | (bent > _FAR_OFF * noise))
     for same in _by_count(asked, neighbors):
-        each_block_of(split, same, chunk_size)
+        map_chosen(split, same, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meeting = broken & explained & (gain > _LEAST_GAIN) & (pooled > _LEAST_POOLED_GAIN)
     voting = broken & ~meeting & (bent > _FAR_OFF * noise)
@@ -213,5 +213,5 @@ def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> T
         counted = neighbors.valid[part, :_NUM_POOLED]
         means[part] = (near * counted).sum(dim=1) / counted.sum(dim=1).clamp_(min=1)
 
-    each_block(work, len(values), chunk_size, values.device)
+    map_chunks(work, len(values), chunk_size, values.device)
     return means

@@ -1,0 +1,29 @@
+"""Morton codes hold the bits of three numbers, and find the next cube."""
+
+import pytest
+import torch
+
+from torchrg.neighbors.order import gather_bits, shift_codes, spread_bits
+
+
+def test_morton_codes_hold_the_bits_of_three_numbers(rng):
+    numbers = torch.randint(0, 2**21, (500, 3), generator=rng)
+    codes = sum(spread_bits(numbers[:, axis]) << axis for axis in range(3))
+    for code, triple in zip(codes.tolist(), numbers.tolist(), strict=True):
+        bits = "".join(
+            str(triple[axis] >> bit & 1) for bit in reversed(range(21)) for axis in (2, 1, 0)
+        )
+        assert code == int(bits, 2)
+    assert torch.equal(torch.stack([gather_bits(codes >> a) for a in range(3)], 1), numbers)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_shifted_codes_are_those_of_the_next_cube(rng, axis):
+    numbers = torch.randint(0, 2**21 - 1, (500, 3), generator=rng)
+
+    def encode(triples):
+        return sum(spread_bits(triples[:, a]) << a for a in range(3))
+
+    moved = numbers.clone()
+    moved[:, axis] += 1
+    assert torch.equal(shift_codes(encode(numbers), axis), encode(moved))
