@@ -7,7 +7,6 @@ from torchrg.render.grid import (
     build_grid,
     gather_bits,
     local_spacing,
-    shift_codes,
     spread_bits,
     surface_cells,
 )
@@ -27,18 +26,6 @@ def test_morton_codes_hold_the_bits_of_three_numbers(rng):
         )
         assert code == int(bits, 2)
     assert torch.equal(torch.stack([gather_bits(codes >> a) for a in range(3)], 1), numbers)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_shifted_codes_are_those_of_the_next_cube(rng, axis):
-    numbers = torch.randint(0, 2**16 - 1, (500, 3), generator=rng)
-
-    def encode(triples):
-        return sum(spread_bits(triples[:, a]) << a for a in range(3))
-
-    moved = numbers.clone()
-    moved[:, axis] += 1
-    assert torch.equal(shift_codes(encode(numbers), axis), encode(moved))
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3])

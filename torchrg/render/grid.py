@@ -39,19 +39,6 @@ def gather_bits(codes: Tensor) -> Tensor:
     return codes
 
 
-def shift_codes(codes: Tensor, axis: int) -> Tensor:
-    """Return the codes of the cubes one further along an axis; past the last one comes the first.
-
-    Example:
-        >>> import torch
-        >>> shift_codes(torch.tensor([0b000, 0b010, 0b101]), 0).tolist()
-        [1, 3, 12]
-    """
-    mask = _EVERY_THIRD << axis
-    moved = ((codes | ~mask) + (1 << axis)) & mask
-    return (codes & ~mask) | moved
-
-
 BITS = 16
 """The longest side of a cloud is ``2**BITS`` voxels."""
 
