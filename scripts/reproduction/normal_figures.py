@@ -9,7 +9,8 @@ from torch import Tensor
 
 from reproduction.cells import Record
 from reproduction.plotting import settings
-from torchrg.render import color_normals, color_sharp, render_cloud, tile_pictures, write_png
+from reproduction.tiles import tile_pictures
+from torchrg.render import color_normals, color_sharp, render_cloud, write_png
 from torchrg.scenes import Scene
 
 STYLES = {

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
+from reproduction.tiles import tile_pictures
 from torchrg.metrics import contingency_table, match_regions
-from torchrg.render import color_planes, render_cloud, tile_pictures, write_png
+from torchrg.render import color_planes, render_cloud, write_png
 from torchrg.structures import UNLABELED
 
 _GRAY = 190

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors.order import gather_bits
+from torchrg.neighbors import search_knn
+from torchrg.regions.adjacency import count_contacts
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.colors import oklab_to_rgb, rgb_to_oklab, touching_planes
-from torchrg.render.grid import build_grid
+from torchrg.render.colors import oklab_to_rgb, rgb_to_oklab
 from torchrg.scenes import make_room
 
 CLEARLY = 0.08  # in OKLab; neighbouring tones of a good screen differ by about 0.02
@@ -39,50 +39,12 @@ def test_oklab_and_back_is_the_same_color(rng):
     torch.testing.assert_close(oklab_to_rgb(rgb_to_oklab(colors)), colors, atol=1e-7, rtol=0)
 
 
-def test_touching_planes_are_those_with_points_in_neighbouring_cubes(rng):
-    points = torch.rand(400, 3, generator=rng)
-    labels = (points * 2).long() @ torch.tensor([4, 2, 1]) - 1
-    grid = build_grid(points)
-    level = next(level for level in grid.levels if len(level.codes) <= 80)
-    cell_of = grid.cell_of
-    for finer in grid.levels[: grid.levels.index(level)]:
-        cell_of = finer.parents[cell_of]
-    # codes hold the cube's place in its own level
-    cubes = torch.stack([gather_bits(level.codes >> axis) for axis in range(3)], dim=1)[cell_of]
-    own = labels[grid.rows]
-    steps = (cubes[:, None] - cubes[None]).abs().sum(dim=2)
-    expected = {
-        (min(a, b), max(a, b))
-        for a, b in zip(
-            own[:, None].expand(-1, 400)[steps <= 1].tolist(),
-            own[None].expand(400, -1)[steps <= 1].tolist(),
-            strict=True,
-        )
-        if a != b and min(a, b) >= 0
-    }
-    found = {tuple(pair) for pair in touching_planes(grid, labels, max_cells=80).tolist()}
-    assert expected <= found
-    between = found - expected
-    # a cube between two others, or at their common corner, pairs what is in both
-    near = steps <= 2
-    wide = {
-        (min(a, b), max(a, b))
-        for a, b in zip(
-            own[:, None].expand(-1, 400)[near].tolist(),
-            own[None].expand(400, -1)[near].tolist(),
-            strict=True,
-        )
-    }
-    assert between <= wide
-
-
 def test_planes_that_touch_look_clearly_different():
     room = make_room(60_000, seed=3)
     colors = color_planes(room.labels, room.points)
-    grid = build_grid(room.points)
     table = torch.zeros(int(room.labels.max()) + 1, 3, dtype=torch.uint8)
     table[room.labels[room.labels >= 0]] = colors[room.labels >= 0]
-    first, second = touching_planes(grid, room.labels, max_cells=60_000).T
+    first, second = count_contacts(room.labels, search_knn(room.points, 9))[0].T
     distances = (lab_of(table[first]) - lab_of(table[second])).norm(dim=1)
     assert len(distances) > 200
     assert float(distances.amin()) > CLEARLY

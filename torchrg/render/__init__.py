@@ -2,9 +2,7 @@
 
 from torchrg.render.cameras import make_camera
 from torchrg.render.colors import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.pictures import render_cloud, render_points
-from torchrg.render.png import write_png
-from torchrg.render.tiles import tile_pictures
+from torchrg.render.pictures import render_cloud, render_points, write_png
 
 __all__ = [
     "color_curvature",
@@ -14,6 +12,5 @@ __all__ = [
     "make_camera",
     "render_cloud",
     "render_points",
-    "tile_pictures",
     "write_png",
 ]

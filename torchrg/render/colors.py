@@ -12,8 +12,9 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics.contingency import check_labels, contingency_table, number_labels
 from torchrg.metrics.labels import match_regions
-from torchrg.neighbors.order import shift_codes
-from torchrg.render.grid import CloudGrid, build_grid
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.voxels import sample_voxels
+from torchrg.regions.adjacency import count_contacts
 
 _TO_CONES = (
     (0.4122214708, 0.5363325363, 0.0514459929),
@@ -268,51 +269,10 @@ def color_sharp(sharp: Tensor | NDArray[Any]) -> Tensor:
     return colors[tensor.long()]
 
 
-_MOST_IN_A_CUBE = 8  # planes of a cube that are paired with each other
-
-
-def touching_planes(grid: CloudGrid, labels: Tensor, *, max_cells: int) -> Tensor:
-    """Return the pairs of planes with points in the same or in neighbouring cubes.
-
-    Args:
-        grid: The cloud.
-        labels: Of all its points, shape ``(N,)``, int64: 0 to M-1, negative for none.
-        max_cells: The cubes are the smallest of which no more are occupied.
-
-    Returns:
-        Pairs of labels, the smaller first, ascending, shape ``(E, 2)``. In a cube of very many
-        planes not all of them are paired.
-
-    Example:
-        >>> from torchrg.render.grid import build_grid
-        >>> line = torch.cartesian_prod(torch.arange(64.0), torch.zeros(1), torch.zeros(1))
-        >>> touching_planes(build_grid(line), torch.arange(64) // 16, max_cells=8).tolist()
-        [[0, 1], [1, 2], [2, 3]]
-    """
-    own_label = labels[grid.rows]
-    labeled = own_label >= 0
-    if not bool(labeled.any()):
-        return labels.new_zeros((0, 2))
-    cell_of, level = grid.cell_of, grid.levels[0]
-    for coarser in grid.levels[1:]:
-        if len(level.codes) <= max_cells:
-            break
-        cell_of, level = level.parents[cell_of], coarser
-    count = int(own_label.amax()) + 1
-    own = torch.unique(cell_of[labeled] * count + own_label[labeled])
-    codes, planes = level.codes[own // count], (own % count).repeat(4)
-    codes = torch.cat([codes, *(shift_codes(codes, axis) for axis in range(3))])
-    both = torch.unique(torch.unique(codes, return_inverse=True)[1] * count + planes)
-    cubes, planes = both // count, both % count
-    found = []
-    for lag in range(1, _MOST_IN_A_CUBE):
-        same = cubes[lag:] == cubes[:-lag]
-        found.append(planes[:-lag][same] * count + planes[lag:][same])
-    pairs = torch.unique(torch.cat(found))
-    return torch.stack([pairs // count, pairs % count], dim=-1)
-
-
-_NEIGHBORHOODS = ((60_000, 1.0), (4_000, 0.2))  # cubes of the cloud, and how much they count
+_NEIGHBORHOODS = ((256, 1.0), (48, 0.2))
+"""Voxels along the longest side of the cloud whose neighbours touch, and how much they count."""
+_CONTACTS = 9
+"""Neighbours of a voxel that are asked for their planes, itself included."""
 
 
 def color_planes(
@@ -355,32 +315,32 @@ def color_planes(
     check_shapes(caller, labels=(tensor, "*"), points=(cloud, "* 3"), reference=(other, "*"))
     check_floating(caller, points=cloud)
     flat = check_labels(caller, labels=tensor.flatten())[0]
-    grid = None if cloud is None else build_grid(cloud.reshape(-1, 3))
+    cloud = None if cloud is None else cloud.detach().reshape(-1, 3)
     fixed = None
     if other is not None:
         same = check_labels(caller, reference=other.flatten())[0]
         table = contingency_table(flat, same)
         pairs = match_regions(table)
         fixed = torch.full_like(table.region_sizes, -1)
-        fixed[table.regions[pairs]] = _choose(same, grid)[1][table.faces[pairs]]
-    rows, choices = _choose(flat, grid, fixed)
+        fixed[table.regions[pairs]] = _choose(same, cloud)[1][table.faces[pairs]]
+    rows, choices = _choose(flat, cloud, fixed)
     gray = torch.full((1, 3), UNLABELED_GRAY, dtype=torch.uint8, device=flat.device)
     colors = torch.cat([make_palette()[0].to(flat.device)[choices], gray])
     return colors[rows].view(*tensor.shape, 3)
 
 
 def _choose(
-    labels: Tensor, grid: CloudGrid | None, fixed: Tensor | None = None
+    labels: Tensor, points: Tensor | None, fixed: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return each point's row among the labels that occur, and the palette's row of each label."""
     rows = number_labels(labels)[1]
     sizes = torch.bincount(rows[rows >= 0])
     pairs, weights = [sizes.new_zeros((0, 2))], [torch.zeros(0, dtype=torch.float64)]
-    for max_cells, weight in _NEIGHBORHOODS:
-        if grid is None or not grid.levels:
-            break
-        pairs.append(touching_planes(grid, rows, max_cells=max_cells))
-        weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
+    if points is not None:
+        counted = (rows >= 0) & points.isfinite().all(dim=-1)
+        for num_voxels, weight in _NEIGHBORHOODS:
+            pairs.append(_touching_planes(points[counted], rows[counted], num_voxels))
+            weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
     choices = choose_colors(
         sizes.cpu(),
         torch.cat(pairs).cpu(),
@@ -388,3 +348,13 @@ def _choose(
         fixed=None if fixed is None else fixed.cpu(),
     )
     return rows, choices.to(labels.device)
+
+
+def _touching_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
+    """Return the pairs of planes in neighbouring voxels, shape ``(E, 2)``."""
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).amax()) if len(points) else 0.0
+    if extent == 0:
+        return labels.new_zeros((0, 2))
+    sample = sample_voxels(points, extent / num_voxels).rows
+    neighbors = search_knn(points[sample], min(_CONTACTS, len(sample)))
+    return count_contacts(labels[sample], neighbors)[0]

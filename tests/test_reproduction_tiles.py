@@ -4,9 +4,9 @@ import sys
 
 import pytest
 import torch
+from reproduction.tiles import tile_pictures
 
 from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
-from torchrg.render import tile_pictures
 
 
 def solid(height, width, value):
