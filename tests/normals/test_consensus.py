@@ -38,10 +38,7 @@ def errors(fit, truth):
 
 
 def fit_all(points, estimate, k=50):
-    def fit(patches, mask, size):
-        return estimate(patches, mask, resolution=size)
-
-    return fit_points(points, search_knn(points, k), fit)
+    return fit_points(points, search_knn(points, k), estimate)
 
 
 @pytest.mark.slow

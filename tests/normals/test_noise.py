@@ -12,7 +12,7 @@ from torchrg.normals.pca import fit_normals_pca
 
 def survey(points, k=50):
     neighbors = search_knn(points, k)
-    fit = fit_points(points, neighbors, lambda q, mask, s: fit_normals_pca(q, mask, resolution=s))
+    fit = fit_points(points, neighbors, fit_normals_pca)
     return survey_noise(points, neighbors, fit)
 
 

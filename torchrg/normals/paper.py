@@ -144,7 +144,7 @@ def estimate_paper(
         >>> estimate_paper(points, neighbors, NormalsConfig(k=3), 16).valid.all()
         tensor(True)
     """
-    fit = fit_points(points, neighbors, _fit_pca, chunk_size=chunk_size)
+    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
     sharp = find_sharp_points(
         fit.normals,
         neighbors,
@@ -154,22 +154,10 @@ def estimate_paper(
         chunk_size=chunk_size,
     )
     rows = sharp.nonzero().squeeze(-1)
-    robust = partial(_fit_detmcd, config=config)
-    refined = fit_points(points, neighbors, robust, rows=rows, chunk_size=chunk_size)
-    return replace_rows(fit, rows, refined)._replace(sharp=sharp)
-
-
-def _fit_pca(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
-    return fit_normals_pca(patches, mask, resolution=resolution)
-
-
-def _fit_detmcd(
-    patches: Tensor, mask: Tensor | None, resolution: Tensor, *, config: NormalsConfig
-) -> NormalFit:
-    return fit_normals_detmcd(
-        patches,
-        mask,
+    robust = partial(
+        fit_normals_detmcd,
         support_fraction=config.support_fraction,
         quantile=config.inlier_quantile,
-        resolution=resolution,
     )
+    refined = fit_points(points, neighbors, robust, rows=rows, chunk_size=chunk_size)
+    return replace_rows(fit, rows, refined)._replace(sharp=sharp)

@@ -1,6 +1,7 @@
 """From fits of patches to estimators of clouds, a block at a time."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,8 +12,8 @@ from torchrg.linalg.moments import coordinate_resolution
 from torchrg.neighbors import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 
-FitPatches = Callable[[Tensor, Tensor | None, Tensor], NormalFit]
-"""Patches ``(n, K, 3)``, mask ``(n, K)`` or None, resolution ``(n,)`` -> fit."""
+FitPatches = Callable[..., NormalFit]
+"""Patches ``(n, K, 3)``, mask ``(n, K)`` or None, keyword ``resolution`` ``(n,)`` -> fit."""
 
 
 def fit_points(
@@ -39,8 +40,7 @@ def fit_points(
         >>> from torchrg.normals.pca import fit_normals_pca
         >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         >>> neighbors = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 0, 1]]))
-        >>> fit = lambda patches, mask, size: fit_normals_pca(patches, mask, resolution=size)
-        >>> fit_points(points, neighbors, fit).normals.abs()[0]
+        >>> fit_points(points, neighbors, fit_normals_pca).normals.abs()[0]
         tensor([0., 0., 1.])
     """
 
@@ -48,7 +48,7 @@ def fit_points(
         block = chunk if rows is None else rows[chunk]
         mask = None if neighbors.valid is None else neighbors.valid[block]
         patches = gather_patches(points, neighbors.indices[block])
-        return fit(patches, mask, coordinate_resolution(points[block]))
+        return fit(patches, mask, resolution=coordinate_resolution(points[block]))
 
     chunks = fair_chunks(len(points) if rows is None else len(rows), chunk_size)
     return join_fits(map_chunks(fit_chunk, chunks, points.device))
@@ -70,7 +70,7 @@ Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 """Points, their neighbours, settings, chunk size -> fit."""
 
 
-def at_all_points(fit: Callable[..., NormalFit], **settings: str) -> Estimator:
+def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
     """Return the estimator that fits every neighbourhood alike.
 
     Args:
@@ -92,11 +92,7 @@ def at_all_points(fit: Callable[..., NormalFit], **settings: str) -> Estimator:
         points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
     ) -> NormalFit:
         chosen = {keyword: getattr(config, field) for keyword, field in settings.items()}
-
-        def fit_block(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
-            return fit(patches, mask, resolution=resolution, **chosen)
-
-        return fit_points(points, neighbors, fit_block, chunk_size=chunk_size)
+        return fit_points(points, neighbors, partial(fit, **chosen), chunk_size=chunk_size)
 
     return estimate
 
