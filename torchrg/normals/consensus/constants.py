@@ -14,7 +14,8 @@ NOISE_QUANTILE = 0.35
 NOISE_COUNTS = (8, 16)
 """Neighbours. Small neighbourhoods, of which enough lie within one face at edges and corners."""
 NOISE_FACTORS = (1.22, 1.1)
-"""Per deviation. Noise by that quantile of the deviations, so that planes are unbiased."""
+"""Per deviation. Noise by that quantile of the deviations of noisy planes: of m points, the root of
+``(m - 3)`` by that quantile of chi-square with as many degrees of freedom."""
 NOISE_FACTOR_OF_ALL = 1.04
 """Per deviation. The same for all neighbours."""
 NOISE_LIMITS = (0.3425, 0.398)
