@@ -65,11 +65,11 @@ def vote_planes(
     reach = constants.VOTE_REACH * noise
     best, normals = _score(columns, weights, start, reach), start
     pairs = _pairs(sq_distances.shape[1], constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
-    candidates, broad = _planes_through(columns, pairs)
+    candidates, spanned = _planes_through(columns, pairs)
     # Few points are scored for several candidates in one step.
     for some in chunks_of(len(candidates), max(1, constants.CHUNK_SIZE // max(len(noise), 1))):
         scores = _score(columns, weights, candidates[some], reach)
-        scores = torch.where(broad[some], scores, -torch.inf)
+        scores = torch.where(spanned[some], scores, -torch.inf)
         for candidate, score in zip(candidates[some], scores, strict=True):
             better = score > best
             best = torch.where(better, score, best)
@@ -119,7 +119,7 @@ def _refit(
 
 
 def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor]:
-    """Return planes through the points and two neighbours of some ranks, and the broad triangles.
+    """Return planes through the points and two neighbours of some ranks, where they span one.
 
     Unit normals ``(P, n, 3)`` and flags ``(P, n)`` of P pairs of ranks.
     """
@@ -129,10 +129,9 @@ def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tup
     d, e, f = (column.index_select(0, ranks[:, 1]) for column in by_rank)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
     sq_area = x * x + y * y + z * z
-    sq_sides = (a * a + b * b + c * c) * (d * d + e * e + f * f)
-    broad = sq_area > constants.MIN_TRIANGLE**2 * sq_sides
-    length = torch.where(broad, sq_area, 1.0).sqrt_()
-    return torch.stack([x / length, y / length, z / length], dim=-1), broad
+    spanned = sq_area > 0
+    length = torch.where(spanned, sq_area, 1.0).sqrt_()
+    return torch.stack([x / length, y / length, z / length], dim=-1), spanned
 
 
 @cache
@@ -183,16 +182,8 @@ def fit_meeting_planes(
 ) -> MeetingPlanes:
     """Fit two planes that meet, and three where two do not explain the neighbours.
 
-    Three start from the wedge and the points off it, and from the first plane and votes.
-
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        normals: One plane of each neighbourhood, shape ``(n, 3)``.
-        offsets: Its offsets, shape ``(n,)``.
-        noise: Standard deviation of the noise, shape ``(n,)``.
-
-    Returns:
-        The plane of each point, and how well the planes explain all points.
+    They start from one plane of each neighbourhood, normal ``(n, 3)`` and offset ``(n,)``; three
+    from the wedge and the points off it, and from that plane and votes.
     """
     wedge = fit_wedges(columns, normals, offsets, noise)
     two = wedge.planes

@@ -32,19 +32,8 @@ def smooth_planes(
     ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 - d_ij^2 / (2 d_max^2)) / a_j^2``,
     each factor at least 0. On a curved surface a mere average would lean towards the denser side;
     the weights are therefore tilted by a linear function of the position, such that the weighted
-    mean of the positions is the point (local linear regression).
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        planes: Plane of each point.
-        noise: Standard deviation of the noise, shape ``(N,)``.
-        errors: Standard error of the normals, radians, shape ``(N,)``, positive.
-        rows: Points to treat, shape ``(n,)``.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The planes of all points.
+    mean of the positions is the point (local linear regression). ``errors`` are the ``a_i`` in
+    radians, ``(N,)``, positive; ``rows`` are the points to treat, ``(n,)``. Returns all planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
@@ -96,18 +85,8 @@ def choose_planes(
     The score of a plane is that of
     :func:`torchrg.normals.consensus.hypotheses.vote_planes` per weight, less a
     tenth of the square of the point's own residual in units of the noise; planes from which the
-    point is farther than three times the noise do not qualify.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        planes: Plane of each point.
-        noise: Standard deviation of the noise, shape ``(N,)``.
-        rows: Points to treat, shape ``(n,)``.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The planes of all points.
+    point is farther than three times the noise do not qualify. ``rows`` are the points to treat,
+    shape ``(n,)``. Returns the planes of all points.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
 
@@ -128,7 +107,7 @@ def choose_planes(
             rests = residuals(columns, normal, offset) / (constants.VOTE_REACH * scale)[:, None]
             own = offset / scale
             score = support_scores(rests, weights) / total - constants.CHOICE_COST * own * own
-            usable = (own.abs() < constants.CHOICE_REACH) & ((normal * normal).sum(dim=1) > 0)
+            usable = (own.abs() < constants.INLIER_REACH) & ((normal * normal).sum(dim=1) > 0)
             better = usable & (score > best)
             best = torch.where(better, score, best)
             normals[chosen] = torch.where(better[:, None], normal, normals[chosen])
@@ -162,7 +141,7 @@ def standard_errors(
         count, values = _inliers(points, neighbors, planes, survey.noise, rows)
         width = (count * values[:, 1].clamp(min=0)).sqrt_()
         error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
-        errors[rows] = torch.maximum(errors[rows], error.clamp_(max=constants.MAX_ERROR))
+        errors[rows] = torch.maximum(errors[rows], error)
 
     each_block_of(work, sharp, chunk_size)
     return errors

@@ -59,17 +59,7 @@ def fit_surfaces(
 
     is above 8, and above 20 on average over the point's 16 nearest (0 where nothing is broken):
     noise makes single points look broken, an edge all of them. Points left over with ``J > 2 s``
-    take the plane of the votes.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        fit: Planes of PCA.
-        survey: Deviations from these, and the noise.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        Tangent planes, and which points are sharp.
+    take the plane of the votes. ``fit`` and ``survey`` are those of all neighbours by PCA.
     """
     noise = survey.noise
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
