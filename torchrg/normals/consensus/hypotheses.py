@@ -111,11 +111,8 @@ def _refit(
 ) -> tuple[Tensor, Tensor]:
     """Return fitted planes; the given ones where the weighted points span none."""
     fitted, moved, values = fit_planes(columns, weights)
-    spread = values[:, 1] > 1e-6 * values[:, 2]
-    return (
-        torch.where(spread[:, None], fitted, normals),
-        torch.where(spread, moved, offsets),
-    )
+    spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
+    return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
 
 
 def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor]:
