@@ -3,7 +3,7 @@
 Halves and doubles every number of ``torchrg/normals/consensus/constants.py``, one at a time, on
 made rooms, shapes with sharp edges and smooth shapes, all with exact truth, and on scanned parts
 where their file is given (a cloud with ``labels``, 0 for points of no part). Where a score changes
-too much, less is tried.
+too much, less is tried. About ten minutes on one core with ``--quick``.
 
 python scripts/sensitivity.py [--parts office_parts.pcd] [--quick] [--json] [--only NAME ...]
 """
