@@ -178,6 +178,13 @@ class Segments:
 
 
 Columns = tuple[Tensor, Tensor, Tensor]
+"""Coordinates x, y and z of neighbourhoods, each ``(n, K)`` and contiguous.
+
+The lanes of :mod:`torchrg.robust.lanes` lie the other way, ``(K, n)``, as robust fits sort every
+neighbourhood and sort rows anyway. Tried here, that made consensus normals 18 % slower (200,000
+points, one core): neighbours rank by rank are gathered from all over the cloud, in 1.6 times the
+time, and sums over them are no faster.
+"""
 
 
 def split_columns(patches: Tensor) -> Columns:

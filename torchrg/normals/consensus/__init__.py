@@ -1,25 +1,27 @@
-"""Consensus normals: flat, curved or broken, told apart by the noise of the cloud itself."""
+"""Consensus normals: flat, curved or broken, told apart by the noise of the cloud itself.
+
+Read in this order: ``noise``, ``hypotheses`` (planes at broken points), ``surfaces`` (which one
+explains the neighbours), ``smoothing``; ``constants`` has every number with its reason.
+"""
 
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE, map_chosen
+from torchrg._parallel import ROWS_IN_CACHE
 from torchrg.config import NormalsConfig
-from torchrg.linalg.moments import Columns, fit_planes, residuals, split_columns
-from torchrg.neighbors import gather_patches, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.noise import Survey, survey_noise
-from torchrg.normals.consensus.smoothing import TangentPlanes, average_planes, choose_planes
-from torchrg.normals.consensus.surfaces import fit_pieces
+from torchrg.normals.consensus.smoothing import (
+    choose_planes,
+    describe_inliers,
+    smooth_planes,
+    standard_errors,
+)
+from torchrg.normals.consensus.surfaces import fit_surfaces
 from torchrg.normals.patches import fit_points
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.structures import Neighbors, NormalFit
-
-_LEAST_NEIGHBORS = 12
-_NUM_ROUNDS = 2
-_INLIER_REACH = 3.0
-_LEAST_ERROR = 0.003
-_MOST_ERROR = 0.1
-_QUIET = 0.15
 
 
 @torch.no_grad()
@@ -39,12 +41,11 @@ def estimate_consensus(
        two planes that meet, and of three. The point takes its plane of these if they explain the
        neighbours, and significantly better than the paraboloid does. Where they do not, and the
        paraboloid is far off, it takes the plane of the votes. See
-       :func:`torchrg.normals.consensus.surfaces.fit_pieces`. These points are ``sharp``.
-    5. *Rounds.* Twice, planes are averaged with those of the neighbours that agree
-       (:func:`torchrg.normals.consensus.smoothing.average_planes`) where the standard error of
-       the normals is worth it (0.17 degrees and more), and the points that follow votes choose
-       again among the planes of their neighbours
-       (:func:`torchrg.normals.consensus.smoothing.choose_planes`).
+       :func:`torchrg.normals.consensus.surfaces.fit_surfaces`. These points are ``sharp``.
+    5. *Smoothing.* Twice, bilateral smoothing of the normals
+       (:func:`torchrg.normals.consensus.smoothing.smooth_planes`) where their standard error is
+       worth it (0.17 degrees and more), and the points that follow votes choose again among the
+       planes of their neighbours (:func:`torchrg.normals.consensus.smoothing.choose_planes`).
 
     With ``config.adaptive_k``, neighbourhoods grow with the noise first: with ``u`` the median of
     noise by radius, by the factor ``(u / 0.15)^2``, up to that many neighbours.
@@ -68,41 +69,31 @@ def estimate_consensus(
         >>> bool((fit.normals[:400].abs() == torch.tensor([0.0, 0, 1])).all())
         True
     """
-    block = min(chunk_size, ROWS_IN_CACHE)
-    fit = fit_points(points, neighbors, _fit_pca, chunk_size=chunk_size)
-    if neighbors.indices.shape[1] < _LEAST_NEIGHBORS:
+    size = min(chunk_size, ROWS_IN_CACHE)
+    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))
-    survey = survey_noise(points, neighbors, fit, chunk_size=block)
+    survey = survey_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
         count = _wanted_neighbors(survey, neighbors, config.adaptive_k)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
-            fit = fit_points(points, neighbors, _fit_pca, chunk_size=chunk_size)
-            survey = survey_noise(points, neighbors, fit, chunk_size=block)
-    planes, sharp, voted = fit_pieces(points, neighbors, fit, survey, chunk_size=block)
-    errors = _standard_errors(points, neighbors, planes, survey, sharp, block)
-    noisy = (fit.valid & (errors > _LEAST_ERROR)).nonzero().squeeze(-1)
+            fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+            survey = survey_noise(points, neighbors, fit, chunk_size=size)
+    noise = survey.noise
+
+    planes, sharp, voted = fit_surfaces(points, neighbors, fit, survey, chunk_size=size)
+
+    errors = standard_errors(points, neighbors, planes, survey, sharp, chunk_size=size)
+    uncertain = (fit.valid & (errors > constants.MIN_ERROR)).nonzero().squeeze(-1)
     voters = voted.nonzero().squeeze(-1)
-    for _ in range(_NUM_ROUNDS):
-        planes = average_planes(
-            points, neighbors, planes, survey.noise, errors, noisy, chunk_size=block
-        )
-        planes = choose_planes(points, neighbors, planes, survey.noise, voters, chunk_size=block)
-    curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
-
-    def describe(rows: Tensor) -> None:
-        _, values = _inliers(points, neighbors, planes, survey.noise, rows)
-        smallest, total = values[:, 0].clamp(min=0), values.clamp(min=0).sum(dim=1)
-        bent = (smallest - survey.noise[rows].square()).clamp_(min=0)
-        curvature[rows] = bent / torch.where(total > 0, total, 1.0)
-        residual_rms[rows] = smallest.sqrt()
-
-    map_chosen(describe, sharp, block)
+    for _ in range(constants.NUM_PASSES):
+        planes = smooth_planes(points, neighbors, planes, noise, errors, uncertain, chunk_size=size)
+        planes = choose_planes(points, neighbors, planes, noise, voters, chunk_size=size)
+    curvature, residual_rms = describe_inliers(
+        points, neighbors, planes, noise, fit, sharp, chunk_size=size
+    )
     return NormalFit(planes.normals, curvature, fit.valid, residual_rms, sharp)
-
-
-def _fit_pca(patches: Tensor, mask: Tensor | None, resolution: Tensor) -> NormalFit:
-    return fit_normals_pca(patches, mask, resolution=resolution)
 
 
 def _wanted_neighbors(survey: Survey, neighbors: Neighbors, most: int) -> int:
@@ -112,49 +103,5 @@ def _wanted_neighbors(survey: Survey, neighbors: Neighbors, most: int) -> int:
     if not bool(known.any()):
         return count
     share = float((survey.noise[known] / survey.radius[known]).median())
-    return min(max(count, round(count * (share / _QUIET) ** 2)), most, num_points)
-
-
-def _standard_errors(
-    points: Tensor,
-    neighbors: Neighbors,
-    planes: TangentPlanes,
-    survey: Survey,
-    sharp: Tensor,
-    block: int,
-) -> Tensor:
-    """Return the standard error of the normals in radians, shape ``(N,)``.
-
-    Of a plane through ``n`` points that is the noise by ``(n l_1)^(1/2)``, with the middle
-    eigenvalue ``l_1`` of their covariance: a quarter of the squared radius where they fill a disc.
-    """
-    radius = torch.where(survey.radius > 0, survey.radius, 1.0)
-    counted = neighbors.valid
-    num_points: Tensor | int = neighbors.indices.shape[1]
-    if counted is not None:
-        num_points = counted.sum(dim=1).clamp_(min=1)
-    errors: Tensor = 2 * survey.noise / (radius * num_points**0.5)
-
-    def work(rows: Tensor) -> None:
-        count, values = _inliers(points, neighbors, planes, survey.noise, rows)
-        width = (count * values[:, 1].clamp(min=0)).sqrt_()
-        error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
-        errors[rows] = torch.maximum(errors[rows], error.clamp_(max=_MOST_ERROR))
-
-    map_chosen(work, sharp, block)
-    return errors
-
-
-def _inliers(
-    points: Tensor, neighbors: Neighbors, planes: TangentPlanes, noise: Tensor, rows: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
-    columns: Columns = split_columns(gather_patches(points, neighbors.indices[rows]))
-    near = (
-        residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
-        <= (_INLIER_REACH * noise[rows])[:, None]
-    )
-    if neighbors.valid is not None:
-        near &= neighbors.valid[rows]
-    weights = near.to(points.dtype)
-    return weights.sum(dim=1), fit_planes(columns, weights)[2]
+    wanted = round(count * (share / constants.ADAPTIVE_NOISE) ** 2)
+    return min(max(count, wanted), most, num_points)

@@ -18,11 +18,9 @@ from torchrg.linalg.moments import (
     residuals,
     sq_lengths,
 )
+from torchrg.normals.consensus import constants
 
-_NUM_PAIRS = 32
-_THINNEST_TRIANGLE = 0.1
-_VOTE_TOLERANCE = 2.0
-_FIT_TOLERANCE = 3.5
+_PLANE_PARAMETERS = 3
 
 
 def vote_planes(
@@ -63,39 +61,33 @@ def vote_planes(
     sq_distances = sq_lengths(columns)
     farthest = (sq_distances * counted).amax(dim=1, keepdim=True)
     nearness = sq_distances / torch.where(farthest > 0, farthest, 1.0)
-    weights = (1 - 0.9 * nearness) * counted
-    reach = _VOTE_TOLERANCE * noise
+    weights = (1 - constants.VOTE_FALLOFF * nearness) * counted
+    reach = constants.VOTE_REACH * noise
     best, normals = _score(columns, weights, start, reach), start
-    candidates, broad = _planes_through(columns, _pairs(sq_distances.shape[1]))
-    # Few points are scored for several candidates in one step, points times candidates in cache.
+    pairs = _pairs(sq_distances.shape[1], constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
+    candidates, spanned = _planes_through(columns, pairs)
+    # Few points are scored for several candidates in one step.
     for some in chunks_of(len(candidates), max(1, ROWS_IN_CACHE // max(len(noise), 1))):
         scores = _score(columns, weights, candidates[some], reach)
-        scores = torch.where(broad[some], scores, -torch.inf)
+        scores = torch.where(spanned[some], scores, -torch.inf)
         for candidate, score in zip(candidates[some], scores, strict=True):
             better = score > best
             best = torch.where(better, score, best)
             normals = torch.where(better[:, None], candidate, normals)
     offsets = torch.zeros_like(noise)
-    for _ in range(2):
+    for _ in range(constants.NUM_REFITS):
         near = _within(residuals(columns, normals, offsets), reach)
         normals, offsets = _refit(columns, weights * near, normals, offsets)
-    weights = (1 - 0.5 * nearness) * counted
-    for _ in range(2):
-        near = _within(residuals(columns, normals, offsets), _FIT_TOLERANCE * noise).square_()
+    weights = (1 - constants.FIT_FALLOFF * nearness) * counted
+    reach = constants.FIT_REACH * noise
+    for _ in range(constants.NUM_REFITS):
+        near = _within(residuals(columns, normals, offsets), reach).square_()
         normals, offsets = _refit(columns, weights * near, normals, offsets)
     return normals, offsets
 
 
 def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
-    """Return the score of planes by their residuals in units of the reach.
-
-    Args:
-        rests: Residuals, shape ``(*, n, K)``.
-        weights: Weights, shape ``(n, K)``.
-
-    Returns:
-        Shape ``(*, n)``.
-    """
+    """Return the score ``(*, n)`` of planes by their residuals ``(*, n, K)`` per reach."""
     support = (1 - rests * rests).clamp_(min=0).mul_(weights).sum(dim=-1)
     over = above(rests, 1).mul_(weights).sum(dim=-1)
     under = above(-rests, 1).mul_(weights).sum(dim=-1)
@@ -119,22 +111,14 @@ def _refit(
 ) -> tuple[Tensor, Tensor]:
     """Return fitted planes; the given ones where the weighted points span none."""
     fitted, moved, values = fit_planes(columns, weights)
-    spread = values[:, 1] > 1e-6 * values[:, 2]
-    return (
-        torch.where(spread[:, None], fitted, normals),
-        torch.where(spread, moved, offsets),
-    )
+    spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
+    return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
 
 
 def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor]:
-    """Return planes through the points and two neighbours, and whether the triangles are broad.
+    """Return planes through the points and two neighbours of some ranks, where they span one.
 
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        pairs: Ranks of the two neighbours.
-
-    Returns:
-        Unit normals ``(P, n, 3)`` and flags ``(P, n)``.
+    Unit normals ``(P, n, 3)`` and flags ``(P, n)`` of P pairs of ranks.
     """
     ranks = torch.tensor(pairs, dtype=torch.int64, device=columns[0].device).view(-1, 2)
     by_rank = [column.t() for column in columns]
@@ -142,32 +126,25 @@ def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tup
     d, e, f = (column.index_select(0, ranks[:, 1]) for column in by_rank)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
     sq_area = x * x + y * y + z * z
-    sq_sides = (a * a + b * b + c * c) * (d * d + e * e + f * f)
-    broad = sq_area > _THINNEST_TRIANGLE**2 * sq_sides
-    length = torch.where(broad, sq_area, 1.0).sqrt_()
-    return torch.stack([x / length, y / length, z / length], dim=-1), broad
+    spanned = sq_area > 0
+    length = torch.where(spanned, sq_area, 1.0).sqrt_()
+    return torch.stack([x / length, y / length, z / length], dim=-1), spanned
 
 
 @cache
-def _pairs(num_neighbors: int) -> tuple[tuple[int, int], ...]:
+def _pairs(num_neighbors: int, num_pairs: int, power: float) -> tuple[tuple[int, int], ...]:
     """Return pairs of ranks: spread over all neighbours, the near ones more often."""
     last = num_neighbors - 1
     if last < 2:
         return ()
     # The plastic number's low-discrepancy sequence covers the square of pairs evenly.
-    steps = np.arange(1, 8 * _NUM_PAIRS)[:, None] * np.array([0.7548776662466927, 0.569840290998])
-    ranks = 1 + np.floor(last * (steps % 1.0) ** 1.5).astype(int)
+    steps = np.arange(1, 8 * num_pairs)[:, None] * np.array([0.7548776662466927, 0.569840290998])
+    ranks = 1 + np.floor(last * (steps % 1.0) ** power).astype(int)
     pairs = dict.fromkeys((min(a, b), max(a, b)) for a, b in ranks.tolist() if a != b)
-    return tuple(pairs)[:_NUM_PAIRS]
+    return tuple(pairs)[:num_pairs]
 
 
-_NUM_ROUNDS = 4
-_GAP = 2.0
-_LEAST_POINTS = 5
-_PLANE_PARAMETERS = 3
-
-
-class Pieces(NamedTuple):
+class MeetingPlanes(NamedTuple):
     """The plane of each point, one of several that explain its neighbourhood.
 
     Attributes:
@@ -186,21 +163,54 @@ class Wedge(NamedTuple):
     """Two planes that meet.
 
     Attributes:
-        pieces: The plane of each point.
-        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``.
-        second: Points of the second plane, likewise.
+        planes: The plane of each point.
+        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``; the others are of the
+            second.
         outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
     """
 
-    pieces: Pieces
+    planes: MeetingPlanes
     first: Tensor
-    second: Tensor
     outer: Tensor
 
 
-def fit_wedges(
-    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
-) -> Wedge:
+def fit_meeting_planes(
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
+) -> MeetingPlanes:
+    """Fit two planes that meet, and three where two do not explain the neighbours.
+
+    They start from one plane of each neighbourhood, normal ``(n, 3)`` and offset ``(n,)``; three
+    from the wedge and the points off it, and from that plane and votes.
+    """
+    wedge = fit_wedges(columns, normals, offsets, noise)
+    two = wedge.planes
+    rows = (two.deviations > constants.CORNER_LIMIT * noise).nonzero().squeeze(-1)
+    some = (columns[0][rows], columns[1][rows], columns[2][rows])
+    start = MeetingPlanes(*(part[rows] for part in two))
+    least = constants.CORNER_SHARE * start.deviations
+    best = start._replace(deviations=least)
+    for groups in (
+        split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),
+        split_by_votes(some, normals[rows], offsets[rows], noise[rows]),
+    ):
+        best = _better(best, fit_corners(some, groups))
+    improved = best.deviations < least
+    rows = rows[improved]
+    merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(two, best, strict=True)]
+    return MeetingPlanes(*merged)
+
+
+def _better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
+    """Return, for each point, the fit that deviates less."""
+    less = other.deviations < one.deviations
+    return MeetingPlanes(
+        torch.where(less[:, None], other.normals, one.normals),
+        torch.where(less, other.offsets, one.offsets),
+        torch.where(less, other.deviations, one.deviations),
+    )
+
+
+def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor) -> Wedge:
     r"""Fit the surface of the intersection of two half-spaces to each neighbourhood.
 
     Let ``e_1`` and ``e_2`` be the distances of a point inside the two planes, each towards the side
@@ -209,17 +219,7 @@ def fit_wedges(
     sharp or blunt, alike). Planes and sides are fitted in turn, from one plane and the points
     beyond twice the noise on its fuller side. The point itself belongs to a plane by the same rule,
     which, unlike the nearest of two unbounded planes, is right for points that noise has moved out
-    of the solid.
-
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        normals: One plane of each neighbourhood, shape ``(n, 3)``.
-        offsets: Its offsets, shape ``(n,)``.
-        noise: Standard deviation of the noise, shape ``(n,)``.
-        counted: Weights 0 or 1, shape ``(n, K)``.
-
-    Returns:
-        The plane of each point, and how well the two explain all points.
+    of the solid. Arguments as for :func:`fit_meeting_planes`.
 
     Example:
         >>> from torchrg.linalg.moments import split_columns
@@ -228,15 +228,14 @@ def fit_wedges(
         >>> corner = torch.cat([torch.tensor([[0.0, 1, 0]]), floor, floor[:, [0, 2, 1]]])
         >>> columns = split_columns((corner - corner[:1])[None])
         >>> start, zero, noise = torch.tensor([[0.0, 1, 0]]), torch.zeros(1), torch.tensor([0.1])
-        >>> pieces = fit_wedges(columns, start, zero - 1, noise, torch.ones(1, 41)).pieces
-        >>> pieces.normals.abs(), bool(pieces.deviations < 0.01)
+        >>> planes = fit_wedges(columns, start, zero - 1, noise).planes
+        >>> planes.normals.abs(), bool(planes.deviations < 0.01)
         (tensor([[0., 0., 1.]]), True)
     """
     rests = residuals(columns, normals, offsets)
-    second = _beyond(rests, noise, counted)
-    first = _near(rests, noise) * counted
+    second, first = _beyond(rests, noise), _near(rests, noise)
     present = torch.ones_like(noise, dtype=torch.bool)
-    for _ in range(_NUM_ROUNDS):
+    for _ in range(constants.NUM_ALTERNATIONS):
         present &= _all_present((first, second))
         planes = fit_planes_to_each(columns, (first, second))
         inside = (
@@ -244,32 +243,24 @@ def fit_wedges(
             _inside(residuals(columns, *planes[1]), first),
         )
         outer = torch.minimum(*inside)
-        first = above(inside[1], inside[0]).mul_(counted)
-        second = counted - first
-    return Wedge(_summary(planes, (first, second), outer, present, counted), first, second, outer)
+        first = above(inside[1], inside[0])
+        second = 1 - first
+    return Wedge(_summary(planes, (first, second), outer, present), first, outer)
 
 
-def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> Pieces:
-    r"""Fit three half-spaces, from a first guess which points lie on which.
+def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
+    r"""Fit three half-spaces, from a first guess which points ``(n, K)``, 0 or 1, lie on which.
 
     Corners where three faces meet; rims of plates, where both faces of the plate are among the
     neighbours; steps and reveals. The first two planes are a wedge, as in :func:`fit_wedges`. If
     the third group begins inside of it, its half-space cuts the wedge, ``min(e_1, e_2, e_3)``;
     otherwise it is added, ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of
     the first two groups.
-
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        groups: Points of three planes, weights 0 or 1, each of shape ``(n, K)``.
-        counted: Weights 0 or 1, shape ``(n, K)``.
-
-    Returns:
-        The plane of each point, and how well the three explain all points.
     """
     first, second, third = groups
-    present = torch.ones_like(counted[:, 0], dtype=torch.bool)
+    present = torch.ones_like(first[:, 0], dtype=torch.bool)
     side: Tensor | None = None
-    for _ in range(_NUM_ROUNDS):
+    for _ in range(constants.NUM_ALTERNATIONS):
         present &= _all_present((first, second, third))
         planes = fit_planes_to_each(columns, (first, second, third))
         rests = [residuals(columns, *plane) for plane in planes]
@@ -279,27 +270,27 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor], counted: Tensor) -> 
             side = _side((wedge * third).sum(dim=1))
         wedge *= side
         outer = torch.minimum(added, wedge) * side
-        third = above(wedge, added).mul_(counted)
-        first = above(inside[1], inside[0]).mul_(counted - third)
-        second = counted - third - first
-    return _summary(planes, (first, second, third), outer, present, counted)
+        third = above(wedge, added)
+        first = above(inside[1], inside[0]).mul_(1 - third)
+        second = 1 - third - first
+    return _summary(planes, (first, second, third), outer, present)
 
 
-def split_off(wedge: Wedge, noise: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the two groups of a wedge, and as a third the points off it on its fuller side."""
-    third = _beyond(wedge.outer, noise, counted)
-    return wedge.first * (1 - third), wedge.second * (1 - third), third
+    third = _beyond(outer, noise)
+    return first * (1 - third), (1 - first) * (1 - third), third
 
 
 def split_by_votes(
-    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the points near a plane, those near the most voted plane of the rest, and the others.
 
     The plane of the rest passes through the nearest of its points.
     """
-    first = _near(residuals(columns, normals, offsets), noise) * counted
-    rest = counted - first
+    first = _near(residuals(columns, normals, offsets), noise)
+    rest = 1 - first
     anchor = rest.argmax(dim=1, keepdim=True)
     moved = tuple(column - column.gather(1, anchor) for column in columns)
     about: Columns = (moved[0], moved[1], moved[2])
@@ -310,13 +301,13 @@ def split_by_votes(
 
 def _near(rests: Tensor, noise: Tensor) -> Tensor:
     """Return which points are within twice the noise of a plane, as 0 or 1."""
-    return at_most(rests.abs(), (_GAP * noise)[:, None])
+    return at_most(rests.abs(), (constants.MEETING_GAP * noise)[:, None])
 
 
-def _beyond(rests: Tensor, noise: Tensor, counted: Tensor) -> Tensor:
+def _beyond(rests: Tensor, noise: Tensor) -> Tensor:
     """Return the points off a surface by more than twice the noise, on the side with more."""
-    gap = _GAP * noise[:, None]
-    over, under = above(rests, gap).mul_(counted), above(-rests, gap).mul_(counted)
+    gap = constants.MEETING_GAP * noise[:, None]
+    over, under = above(rests, gap), above(-rests, gap)
     more = at_most(under.sum(dim=1), over.sum(dim=1))[:, None]
     return over.mul_(more).add_(under.mul_(1 - more))
 
@@ -333,10 +324,8 @@ def _side(totals: Tensor) -> Tensor:
 
 def _all_present(groups: Sequence[Tensor]) -> Tensor:
     """Return where every group has enough points for a plane of its own."""
-    present = groups[0].sum(dim=1) >= _LEAST_POINTS
-    for group in groups[1:]:
-        present &= group.sum(dim=1) >= _LEAST_POINTS
-    return present
+    smallest = torch.stack([group.sum(dim=1) for group in groups]).amin(dim=0)
+    return smallest >= constants.MIN_PLANE_POINTS
 
 
 def _summary(
@@ -344,15 +333,14 @@ def _summary(
     groups: Sequence[Tensor],
     outer: Tensor,
     present: Tensor,
-    counted: Tensor,
-) -> Pieces:
+) -> MeetingPlanes:
     """Return the plane whose group each point is in, and the deviation from all planes."""
     normals, offsets = planes[0]
     for (normal, offset), group in zip(planes[1:], groups[1:], strict=True):
         own = group[:, 0] > 0
         normals = torch.where(own[:, None], normal, normals)
         offsets = torch.where(own, offset, offsets)
-    freedom = (counted.sum(dim=1) - _PLANE_PARAMETERS * len(planes)).clamp_(min=1)
-    deviations = ((outer * outer * counted).sum(dim=1) / freedom).sqrt_()
+    freedom = max(outer.shape[1] - _PLANE_PARAMETERS * len(planes), 1)
+    deviations = ((outer * outer).sum(dim=1) / freedom).sqrt_()
     deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
-    return Pieces(normals, offsets, deviations)
+    return MeetingPlanes(normals, offsets, deviations)

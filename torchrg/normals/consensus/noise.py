@@ -16,30 +16,8 @@ from torchrg.linalg.moments import (
     sq_lengths,
 )
 from torchrg.neighbors import gather_patches
+from torchrg.normals.consensus import constants
 from torchrg.structures import Neighbors, NormalFit
-
-_QUANTILE = 0.35
-_COMMON_QUANTILE = 0.15
-_MOST_ABOVE = 3.0
-_NARROW = 0.03
-
-
-class _Size(NamedTuple):
-    """A number of neighbours, and what planes of that many points say of the noise.
-
-    Attributes:
-        num_points: Number of neighbours.
-        factor: Noise by the 35th percentile of the deviations, on a plane with little noise.
-        limit: What that tends to as noise grows, by the radius that so many points of a plane have.
-    """
-
-    num_points: int
-    factor: float
-    limit: float
-
-
-_SMALL_SIZES = (_Size(8, 1.22, 0.3425), _Size(16, 1.1, 0.398))
-_WHOLE_FACTOR = 1.04
 
 
 class Survey(NamedTuple):
@@ -96,7 +74,7 @@ def survey_noise(
         True
     """
     offsets, radius, whole = (torch.empty_like(points[:, 0]) for _ in range(3))
-    small = [torch.empty_like(whole) for _ in _SMALL_SIZES]
+    small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
 
     def work(block: slice) -> None:
         found = _deviations(points, neighbors, fit, block)
@@ -105,19 +83,23 @@ def survey_noise(
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
-    noise = _WHOLE_FACTOR * _neighbor_quantiles(whole, neighbors, _QUANTILE)
+    quantile = constants.NOISE_QUANTILE
+    noise = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(whole, neighbors, quantile)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
         count = neighbors.valid.sum(dim=1)
-    for size, values in zip(_SMALL_SIZES, small, strict=True):
-        found = size.factor * _neighbor_quantiles(values, neighbors, _QUANTILE)
-        near = radius * (size.num_points / torch.as_tensor(count, dtype=radius.dtype)).sqrt()
-        share = found / torch.where(radius > 0, size.limit * near, 1.0)
+    factors, limits = constants.NOISE_FACTORS, constants.NOISE_LIMITS
+    for size, factor, limit, values in zip(
+        constants.NOISE_COUNTS, factors, limits, small, strict=True
+    ):
+        found = factor * _neighbor_quantiles(values, neighbors, quantile)
+        near = radius * (size / torch.as_tensor(count, dtype=radius.dtype)).sqrt()
+        share = found / torch.where(radius > 0, limit * near, 1.0)
         below = (1 - share * share).clamp_(min=0)
         scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
-    common = _neighbor_quantiles(noise, neighbors, _COMMON_QUANTILE)
-    noise = torch.minimum(noise, _MOST_ABOVE * common)
+    common = _neighbor_quantiles(noise, neighbors, constants.COMMON_QUANTILE)
+    noise = torch.minimum(noise, constants.MAX_ABOVE_COMMON * common)
     return Survey(offsets, whole, torch.maximum(noise, floor), radius)
 
 
@@ -138,7 +120,7 @@ def _deviations(
     whole = torch.where(valid & (count > 3), spread.sqrt_(), torch.inf)
     radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
     patches, counted = _each_place_once(patches, counted)
-    small = [_small_deviations(patches, counted, size.num_points) for size in _SMALL_SIZES]
+    small = [_small_deviations(patches, counted, size) for size in constants.NOISE_COUNTS]
     return offsets, radius, whole, *small
 
 
@@ -168,7 +150,7 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     normals, offsets, values = fit_planes(columns, counted[:, :count])
     rests = residuals(columns, normals, offsets)
     spread = (rests * rests).sum(dim=1) / (count - 3)
-    broad = (values[:, 1] > _NARROW * values[:, 2]) & (counted[:, count - 1] > 0)
+    broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, count - 1] > 0)
     return torch.where(broad, spread.sqrt_(), torch.inf)
 
 

@@ -1,40 +1,20 @@
-"""Rounds in which points learn from the planes of their neighbours."""
-
-from typing import NamedTuple
+"""Bilateral smoothing of normals, and the choice among the planes of the neighbours."""
 
 import torch
 from torch import Tensor
 
-from torchrg._parallel import CHUNK_SIZE, map_chunks
+from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg import signs
-from torchrg.linalg.moments import residuals, split_columns, sq_lengths
+from torchrg.linalg.moments import Columns, fit_planes, residuals, split_columns, sq_lengths
 from torchrg.neighbors import gather_patches
+from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
-from torchrg.structures import Neighbors
-
-_REACH = 2.5
-_AGREEMENT = 4.2
-_MAX_TILT = 0.95
-_RIDGE = 0.01
-_VOTE_TOLERANCE = 2.0
-_RANK_STEP = 3
-_OWN_PLANE_REACH = 3.0
-_OWN_RESIDUAL_COST = 0.1
+from torchrg.normals.consensus.noise import Survey
+from torchrg.normals.consensus.surfaces import TangentPlanes
+from torchrg.structures import Neighbors, NormalFit
 
 
-class TangentPlanes(NamedTuple):
-    """A plane at each point.
-
-    Attributes:
-        normals: Unit normals of any sign, shape ``(N, 3)``; zero where there is no plane.
-        offsets: Signed distance of the plane from its point along the normal, shape ``(N,)``.
-    """
-
-    normals: Tensor
-    offsets: Tensor
-
-
-def average_planes(
+def smooth_planes(
     points: Tensor,
     neighbors: Neighbors,
     planes: TangentPlanes,
@@ -42,29 +22,18 @@ def average_planes(
     errors: Tensor,
     rows: Tensor,
     *,
-    chunk_size: int = CHUNK_SIZE,
+    chunk_size: int,
 ) -> TangentPlanes:
-    r"""Give points the average of the planes of those neighbours that agree with theirs.
+    r"""Smooth normals bilaterally: average the planes of the neighbours that agree with a point's.
 
     Neighbour j agrees with point i as far as its plane passes through i, within 2.5 times the
     noise, and the chord ``c_ij`` between the normals is within 4.2 times its standard error
-    ``a_ij = (a_i^2 + a_j^2)^(1/2)``: a bilateral filter of planes, with weights ``w_j`` of
+    ``a_ij = (a_i^2 + a_j^2)^(1/2)``. The weights are
     ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 - d_ij^2 / (2 d_max^2)) / a_j^2``,
     each factor at least 0. On a curved surface a mere average would lean towards the denser side;
     the weights are therefore tilted by a linear function of the position, such that the weighted
-    mean of the positions is the point (local linear regression).
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        planes: Plane of each point.
-        noise: Standard deviation of the noise, shape ``(N,)``.
-        errors: Standard error of the normals, radians, shape ``(N,)``, positive.
-        rows: Points to treat, shape ``(n,)``.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The planes of all points.
+    mean of the positions is the point (local linear regression). ``errors`` are the ``a_i`` in
+    radians, ``(N,)``, positive; ``rows`` are the points to treat, ``(n,)``. Returns all planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
@@ -82,13 +51,11 @@ def average_planes(
         rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
         sq_chords = 2 * (1 - cosines.abs())
         sq_error = (errors * errors).index_select(0, flat).view(indices.shape)
-        sq_angle = _AGREEMENT**2 * (sq_error + sq_error[:, :1])
-        reach = _REACH * noise[chosen][:, None]
-        sq_distances = sq_lengths(columns)
-        farthest = sq_distances.amax(dim=1, keepdim=True)
+        sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
+        reach = constants.SMOOTHING_REACH * noise[chosen][:, None]
         weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
         weights *= (1 - (rests / reach).square_()).clamp_(min=0)
-        weights *= 1 - 0.5 * sq_distances / torch.where(farthest > 0, farthest, 1.0)
+        weights *= _falling(columns, constants.FIT_FALLOFF)
         if neighbors.valid is not None:
             weights *= neighbors.valid[chosen]
         weights = _balanced(columns, weights) * sign
@@ -111,25 +78,15 @@ def choose_planes(
     noise: Tensor,
     rows: Tensor,
     *,
-    chunk_size: int = CHUNK_SIZE,
+    chunk_size: int,
 ) -> TangentPlanes:
     r"""Give points the plane, among those of their neighbours, that their neighbourhood supports.
 
     The score of a plane is that of
     :func:`torchrg.normals.consensus.hypotheses.vote_planes` per weight, less a
     tenth of the square of the point's own residual in units of the noise; planes from which the
-    point is farther than three times the noise do not qualify.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        planes: Plane of each point.
-        noise: Standard deviation of the noise, shape ``(N,)``.
-        rows: Points to treat, shape ``(n,)``.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        The planes of all points.
+    point is farther than three times the noise do not qualify. ``rows`` are the points to treat,
+    shape ``(n,)``. Returns the planes of all points.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
 
@@ -137,22 +94,20 @@ def choose_planes(
         chosen = rows[block]
         indices = neighbors.indices[chosen]
         columns = split_columns(gather_patches(points, indices))
-        sq_distances = sq_lengths(columns)
-        farthest = sq_distances.amax(dim=1, keepdim=True)
-        weights = 1 - 0.9 * sq_distances / torch.where(farthest > 0, farthest, 1.0)
+        weights = _falling(columns, constants.VOTE_FALLOFF)
         if neighbors.valid is not None:
             weights *= neighbors.valid[chosen]
         total, scale = weights.sum(dim=1), noise[chosen]
         best = torch.full_like(scale, -torch.inf)
-        for rank in range(0, indices.shape[1], _RANK_STEP):
+        for rank in range(0, indices.shape[1], constants.CHOICE_STEP):
             other = indices[:, rank]
             normal = planes.normals.index_select(0, other)
             place = torch.stack([column[:, rank] for column in columns], dim=-1)
             offset = planes.offsets.index_select(0, other) + (normal * place).sum(dim=1)
-            rests = residuals(columns, normal, offset) / (_VOTE_TOLERANCE * scale)[:, None]
+            rests = residuals(columns, normal, offset) / (constants.VOTE_REACH * scale)[:, None]
             own = offset / scale
-            score = support_scores(rests, weights) / total - _OWN_RESIDUAL_COST * own * own
-            usable = (own.abs() < _OWN_PLANE_REACH) & ((normal * normal).sum(dim=1) > 0)
+            score = support_scores(rests, weights) / total - constants.CHOICE_COST * own * own
+            usable = (own.abs() < constants.INLIER_REACH) & ((normal * normal).sum(dim=1) > 0)
             better = usable & (score > best)
             best = torch.where(better, score, best)
             normals[chosen] = torch.where(better[:, None], normal, normals[chosen])
@@ -162,14 +117,90 @@ def choose_planes(
     return TangentPlanes(normals, offsets)
 
 
-def _balanced(columns: tuple[Tensor, Tensor, Tensor], weights: Tensor) -> Tensor:
+def standard_errors(
+    points: Tensor,
+    neighbors: Neighbors,
+    planes: TangentPlanes,
+    survey: Survey,
+    sharp: Tensor,
+    *,
+    chunk_size: int,
+) -> Tensor:
+    """Return the standard error of the normals in radians, shape ``(N,)``.
+
+    Of a plane through ``n`` points that is the noise by ``(n l_1)^(1/2)``, with the middle
+    eigenvalue ``l_1`` of their covariance: a quarter of the squared radius where they fill a disc.
+    """
+    radius = torch.where(survey.radius > 0, survey.radius, 1.0)
+    num_points: Tensor | int = neighbors.indices.shape[1]
+    if neighbors.valid is not None:
+        num_points = neighbors.valid.sum(dim=1).clamp_(min=1)
+    errors: Tensor = 2 * survey.noise / (radius * num_points**0.5)
+
+    def work(rows: Tensor) -> None:
+        count, values = _inliers(points, neighbors, planes, survey.noise, rows)
+        width = (count * values[:, 1].clamp(min=0)).sqrt_()
+        error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
+        errors[rows] = torch.maximum(errors[rows], error)
+
+    map_chosen(work, sharp, chunk_size)
+    return errors
+
+
+def describe_inliers(
+    points: Tensor,
+    neighbors: Neighbors,
+    planes: TangentPlanes,
+    noise: Tensor,
+    fit: NormalFit,
+    sharp: Tensor,
+    *,
+    chunk_size: int,
+) -> tuple[Tensor, Tensor]:
+    """Return curvature and residual of all points: at sharp ones those of the inliers alone."""
+    curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
+
+    def work(rows: Tensor) -> None:
+        _, values = _inliers(points, neighbors, planes, noise, rows)
+        smallest, total = values[:, 0].clamp(min=0), values.clamp(min=0).sum(dim=1)
+        bent = (smallest - noise[rows].square()).clamp_(min=0)
+        curvature[rows] = bent / torch.where(total > 0, total, 1.0)
+        residual_rms[rows] = smallest.sqrt()
+
+    map_chosen(work, sharp, chunk_size)
+    return curvature, residual_rms
+
+
+def _inliers(
+    points: Tensor, neighbors: Neighbors, planes: TangentPlanes, noise: Tensor, rows: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
+    columns = split_columns(gather_patches(points, neighbors.indices[rows]))
+    near = (
+        residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
+        <= (constants.INLIER_REACH * noise[rows])[:, None]
+    )
+    if neighbors.valid is not None:
+        near &= neighbors.valid[rows]
+    weights = near.to(points.dtype)
+    return weights.sum(dim=1), fit_planes(columns, weights)[2]
+
+
+def _falling(columns: Columns, share: float) -> Tensor:
+    """Return weights that fall with the squared distance, by a share at the farthest neighbour."""
+    sq_distances = sq_lengths(columns)
+    farthest = sq_distances.amax(dim=1, keepdim=True)
+    return 1 - share * sq_distances / torch.where(farthest > 0, farthest, 1.0)
+
+
+def _balanced(columns: Columns, weights: Tensor) -> Tensor:
     """Return weights tilted such that the weighted mean of the positions is nearly the point."""
     radius = sq_lengths(columns).amax(dim=1, keepdim=True).sqrt_()
     x, y, z = (column / torch.where(radius > 0, radius, 1.0) for column in columns)
     wx, wy, wz = weights * x, weights * y, weights * z
     xx, xy, xz = (wx * x).sum(dim=1), (wx * y).sum(dim=1), (wx * z).sum(dim=1)
     yy, yz, zz = (wy * y).sum(dim=1), (wy * z).sum(dim=1), (wz * z).sum(dim=1)
-    ridge = _RIDGE * (xx + yy + zz)
+    ridge = constants.TILT_RIDGE * (xx + yy + zz)
     xx, yy, zz = xx + ridge, yy + ridge, zz + ridge
     # Cramer's rule for a symmetric positive definite 3x3 system.
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
@@ -181,4 +212,4 @@ def _balanced(columns: tuple[Tensor, Tensor, Tensor], weights: Tensor) -> Tensor
     tilt_y = (b * mx + d * my + e * mz) * inverse
     tilt_z = (c * mx + e * my + f * mz) * inverse
     tilt = x * tilt_x[:, None] + y * tilt_y[:, None] + z * tilt_z[:, None]
-    return weights * (1 - tilt.clamp_(-_MAX_TILT, _MAX_TILT))
+    return weights * (1 - tilt.clamp_(-constants.MAX_TILT, constants.MAX_TILT))

@@ -8,39 +8,32 @@ from torch import Tensor
 from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg.moments import Columns, split_columns
 from torchrg.neighbors import gather_patches
-from torchrg.normals.consensus.hypotheses import (
-    Pieces,
-    Wedge,
-    fit_corners,
-    fit_wedges,
-    split_by_votes,
-    split_off,
-    vote_planes,
-)
+from torchrg.normals.consensus import constants
+from torchrg.normals.consensus.hypotheses import fit_meeting_planes, vote_planes
 from torchrg.normals.consensus.noise import Survey
-from torchrg.normals.consensus.smoothing import TangentPlanes
 from torchrg.normals.jet import fit_paraboloids
 from torchrg.structures import Neighbors, NormalFit
 
-_UNEXPLAINED = 1.05
-_BENT = 1.2
-_CURVED_SHARE = 0.15
-_EXPLAINED = 1.3
-_WELL_EXPLAINED = 1.15
-_CORNER_SHARE = 0.9
-_FAR_OFF = 2.0
-_LEAST_GAIN = 8.0
-_LEAST_POOLED_GAIN = 20.0
-_MOST_GAIN = 40.0
-_NUM_POOLED = 16
-_NUM_PARAMETERS = 6
+_PARABOLOID_PARAMETERS = 6
 
 
-class PieceFit(NamedTuple):
-    """Planes of all points, and how they were found.
+class TangentPlanes(NamedTuple):
+    """A plane at each point.
 
     Attributes:
-        planes: A plane at each point.
+        normals: Unit normals of any sign, shape ``(N, 3)``; zero where there is no plane.
+        offsets: Signed distance of the plane from its point along the normal, shape ``(N,)``.
+    """
+
+    normals: Tensor
+    offsets: Tensor
+
+
+class Surfaces(NamedTuple):
+    """The surfaces of all points.
+
+    Attributes:
+        planes: Tangent planes at the points.
         sharp: Points whose neighbourhood is broken, shape ``(N,)``, bool.
         voted: Sharp points that follow votes alone, shape ``(N,)``, bool.
     """
@@ -50,19 +43,13 @@ class PieceFit(NamedTuple):
     voted: Tensor
 
 
-def fit_pieces(
-    points: Tensor,
-    neighbors: Neighbors,
-    fit: NormalFit,
-    survey: Survey,
-    *,
-    chunk_size: int = 2048,
-) -> PieceFit:
-    r"""Give each point the plane, the paraboloid or the piece of broken planes that explains most.
+def fit_surfaces(
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, survey: Survey, *, chunk_size: int
+) -> Surfaces:
+    r"""Give each point the plane, the paraboloid or the one of several planes that explains most.
 
     With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. The others get a
-    paraboloid, of deviation ``J``; it stands where ``J`` is at most 1.2 s (of 200 points that have
-    an edge, one is missed; of those that have none, half are spared), or at most 0.15 of the
+    paraboloid, of deviation ``J``; it stands where ``J`` is at most 1.2 s, or at most 0.15 of the
     plane's deviation. Otherwise two planes that meet are fitted, and where these deviate by more
     than 1.15 s, three, which replace the two if their deviation is below 0.9 of theirs. The point
     takes its plane of these, of deviation ``W``, where ``W <= 1.3 s`` and the gain over the
@@ -72,22 +59,11 @@ def fit_pieces(
 
     is above 8, and above 20 on average over the point's 16 nearest (0 where nothing is broken):
     noise makes single points look broken, an edge all of them. Points left over with ``J > 2 s``
-    take the plane of the votes.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        fit: Planes of PCA.
-        survey: Deviations from these, and the noise.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        Planes, and which points are sharp.
+    take the plane of the votes. ``fit`` and ``survey`` are those of all neighbours by PCA.
     """
     noise = survey.noise
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
     bent = survey.deviations.clone()
-    unexplained = fit.valid & (survey.deviations > _UNEXPLAINED * noise)
 
     def bend(rows: Tensor) -> None:
         columns, counted = _gather(points, neighbors, rows)
@@ -95,71 +71,39 @@ def fit_pieces(
             columns, fit.normals[rows], counted
         )
 
-    map_chosen(bend, unexplained, chunk_size)
-    broken = unexplained & (bent > _BENT * noise)
-    broken &= bent > _CURVED_SHARE * survey.deviations
+    not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
+    map_chosen(bend, not_flat, chunk_size)
+    broken = not_flat & (bent > constants.CURVED_LIMIT * noise)
+    broken &= bent > constants.CURVED_SHARE * survey.deviations
+    far_off = bent > constants.FAR_OFF * noise
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
-    votes, pieces = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
+    by_votes, meeting = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
 
     def split(rows: Tensor) -> None:
-        columns = _gather_counted(points, neighbors, rows)
-        counted, scale = torch.ones_like(columns[0]), noise[rows]
-        voted = vote_planes(columns, scale, fit.normals[rows], counted)
-        found = _fit_broken(columns, *voted, scale, counted)
-        votes.normals[rows], votes.offsets[rows] = voted
-        pieces.normals[rows], pieces.offsets[rows] = found.normals, found.offsets
-        explained[rows] = found.deviations <= _EXPLAINED * scale
+        columns, scale = _gather_counted(points, neighbors, rows), noise[rows]
+        voted = vote_planes(columns, scale, fit.normals[rows], torch.ones_like(columns[0]))
+        found = fit_meeting_planes(columns, *voted, scale)
+        by_votes.normals[rows], by_votes.offsets[rows] = voted
+        meeting.normals[rows], meeting.offsets[rows] = found.normals, found.offsets
+        explained[rows] = found.deviations <= constants.MEETING_LIMIT * scale
         known = found.deviations.isfinite()
         rest = torch.where(known, found.deviations, scale)
         unit = torch.maximum(scale, rest)
-        drop = ((bent[rows] / unit).square() - (rest / unit).square()) * (
-            counted.sum(dim=1) - _NUM_PARAMETERS
-        )
-        gain[rows] = torch.where(known, drop, -_MOST_GAIN).clamp_(-_MOST_GAIN, _MOST_GAIN)
+        drop = (bent[rows] / unit).square() - (rest / unit).square()
+        drop *= columns[0].shape[1] - _PARABOLOID_PARAMETERS
+        most = constants.MAX_GAIN
+        gain[rows] = torch.where(known, drop, -most).clamp_(-most, most)
 
-    asked = broken & (_may_meet(broken, neighbors, chunk_size) | (bent > _FAR_OFF * noise))
+    asked = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
     for same in _by_count(asked, neighbors):
         map_chosen(split, same, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
-    meeting = broken & explained & (gain > _LEAST_GAIN) & (pooled > _LEAST_POOLED_GAIN)
-    voting = broken & ~meeting & (bent > _FAR_OFF * noise)
-    for chosen, planes in ((voting, votes), (meeting, pieces)):
+    meets = broken & explained & (gain > constants.MIN_GAIN) & (pooled > constants.MIN_POOLED_GAIN)
+    voted = broken & ~meets & far_off
+    for chosen, planes in ((voted, by_votes), (meets, meeting)):
         normals = torch.where(chosen[:, None], planes.normals, normals)
         offsets = torch.where(chosen, planes.offsets, offsets)
-    return PieceFit(TangentPlanes(normals, offsets), voting | meeting, voting)
-
-
-def _fit_broken(
-    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor, counted: Tensor
-) -> Pieces:
-    """Return two planes that meet, or three where two do not explain the neighbours."""
-    pieces, *parts = fit_wedges(columns, normals, offsets, noise, counted)
-    rows = (pieces.deviations > _WELL_EXPLAINED * noise).nonzero().squeeze(-1)
-    some = (columns[0][rows], columns[1][rows], columns[2][rows])
-    start = Pieces(*(part[rows] for part in pieces))
-    scale, count = noise[rows], counted[rows]
-    guesses = (
-        split_off(Wedge(start, *(part[rows] for part in parts)), scale, count),
-        split_by_votes(some, normals[rows], offsets[rows], scale, count),
-    )
-    best = start._replace(deviations=_CORNER_SHARE * start.deviations)
-    for groups in guesses:
-        best = _better(best, fit_corners(some, groups, count))
-    improved = best.deviations < _CORNER_SHARE * start.deviations
-    rows = rows[improved]
-    merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(pieces, best, strict=True)]
-    return Pieces(*merged)
-
-
-def _better(one: Pieces, other: Pieces) -> Pieces:
-    """Return, for each point, the fit that deviates less."""
-    less = other.deviations < one.deviations
-    return Pieces(
-        *(
-            torch.where(less.view(-1, *[1] * (a.dim() - 1)), b, a)
-            for a, b in zip(one, other, strict=True)
-        )
-    )
+    return Surfaces(TangentPlanes(normals, offsets), voted | meets, voted)
 
 
 def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns, Tensor]:
@@ -194,9 +138,9 @@ def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
 
     Noise makes single points look broken: most of them are spared the fits.
     """
-    most = _mean_of_nearest(broken.float() * _MOST_GAIN, neighbors, chunk_size)
-    open_points = broken & (most > _LEAST_POOLED_GAIN)
-    pooled = neighbors.indices[open_points, :_NUM_POOLED].reshape(-1)
+    most = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
+    open_points = broken & (most > constants.MIN_POOLED_GAIN)
+    pooled = neighbors.indices[open_points, : constants.NUM_POOLED].reshape(-1)
     return torch.zeros_like(broken).index_fill_(0, pooled.long(), True)
 
 
@@ -205,12 +149,12 @@ def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> T
     means = torch.empty_like(values)
 
     def work(part: slice) -> None:
-        indices = neighbors.indices[part, :_NUM_POOLED]
+        indices = neighbors.indices[part, : constants.NUM_POOLED]
         near = values.index_select(0, indices.reshape(-1)).view(indices.shape)
         if neighbors.valid is None:
             means[part] = near.mean(dim=1)
             return
-        counted = neighbors.valid[part, :_NUM_POOLED]
+        counted = neighbors.valid[part, : constants.NUM_POOLED]
         means[part] = (near * counted).sum(dim=1) / counted.sum(dim=1).clamp_(min=1)
 
     map_chunks(work, len(values), chunk_size, values.device)

@@ -1,0 +1,313 @@
+"""How far each constant of consensus normals may move before any score does.
+
+Halves and doubles every number of ``torchrg/normals/consensus/constants.py``, one at a time, on
+made rooms, shapes with sharp edges and smooth shapes, all with exact truth, and on scanned parts
+where their file is given (a cloud with ``labels``, 0 for points of no part). Where a score changes
+too much, less is tried. About ten minutes on one core with ``--quick``.
+
+python scripts/sensitivity.py [--parts office_parts.pcd] [--quick] [--json] [--only NAME ...]
+"""
+
+import argparse
+import ast
+import inspect
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from reproduction.scenes import make_shape
+from torch import Tensor
+
+from torchrg import load_config
+from torchrg.io import read_cloud
+from torchrg.metrics import score_labels, score_normals
+from torchrg.neighbors import search_knn
+from torchrg.normals.consensus import constants, estimate_consensus
+from torchrg.regions import grow_regions
+from torchrg.scenes import BENT_LAYOUT, CURVED_LAYOUT, THIN_LAYOUT, RoomLayout, make_room
+from torchrg.structures import Neighbors
+
+TOLERANCES = {"ARI": 1.0, "mean": 0.05, "RMS": 0.25}
+"""Changes up to these count as none: percentage points of labels, degrees of normals. F1 and mean
+best IoU are means over faces; there one face won or lost counts as none, which chance decides."""
+FACTORS = (2.0, 1.5, 1.25, 1.1)
+"""Tried from the first, up and down, until nothing changes."""
+MIN_SIZE = 50
+"""Points. Smaller regions are not scored, as in the paper."""
+_CONFIG = load_config("consensus")
+_CHUNK_SIZE = 16384
+
+
+class Case(NamedTuple):
+    """A cloud and what is scored on it.
+
+    Attributes:
+        name: For the table.
+        points: Shape ``(N, 3)``.
+        neighbors: Of all points.
+        labels: True faces, ``(N,)``; labels are scored where there are any.
+        normals: True normals, ``(N, 3)``, likewise.
+        num_faces: Number of true faces.
+        ignore: Label of points that are not scored.
+        adaptive_k: See :class:`torchrg.config.NormalsConfig`.
+    """
+
+    name: str
+    points: Tensor
+    neighbors: Neighbors
+    labels: Tensor | None
+    normals: Tensor | None
+    num_faces: int = 0
+    ignore: int | None = None
+    adaptive_k: int | None = None
+
+
+class Constant(NamedTuple):
+    """A number of the table: an attribute of ``constants``, or a place in one that is a tuple."""
+
+    name: str
+    place: int | None
+    value: float
+    unit: str
+
+    @property
+    def title(self) -> str:
+        """The name in the table."""
+        return self.name if self.place is None else f"{self.name}[{self.place}]"
+
+
+@dataclass(frozen=True)
+class Change:
+    """The largest change of a score, by its tolerance, over all clouds."""
+
+    value: float
+    score: str = ""
+    cloud: str = ""
+    change: float = 0.0
+
+    def __str__(self) -> str:
+        if not self.change:
+            return "no change"
+        unit = "deg" if self.score in ("mean", "RMS") else "pt"
+        return f"{self.change:+.2f} {unit} {self.score}, {self.cloud}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """How a constant matters: half and double, and the factors between which no score changes."""
+
+    constant: str
+    value: float
+    unit: str
+    half: Change
+    double: Change
+    lowest: float
+    highest: float
+
+
+def read_table() -> list[Constant]:
+    """Return every constant, in the order of the file, with the unit its docstring begins with."""
+    found = []
+    lines = ast.parse(inspect.getsource(constants)).body
+    for line, text in pairwise(lines):
+        if isinstance(line, ast.Assign) and isinstance(line.targets[0], ast.Name):
+            name = line.targets[0].id
+            unit = ast.literal_eval(text.value).split(". ")[0]  # type: ignore[attr-defined]
+            value = getattr(constants, name)
+            several = enumerate(value) if isinstance(value, tuple) else [(None, value)]
+            found += [Constant(name, place, number, unit) for place, number in several]
+    return found
+
+
+@contextmanager
+def moved(constant: Constant, factor: float) -> Iterator[float]:
+    """Multiply a constant for a while; counts stay whole and at least 1, shares at most 1."""
+    before = getattr(constants, constant.name)
+    value = constant.value * factor
+    if isinstance(constant.value, int):
+        value = max(round(value), 1)
+    if constant.unit.startswith("Share"):
+        value = min(value, 1.0)
+    after = value
+    if constant.place is not None:
+        after = (*before[: constant.place], value, *before[constant.place + 1 :])
+    setattr(constants, constant.name, after)
+    try:
+        yield value
+    finally:
+        setattr(constants, constant.name, before)
+
+
+def score(case: Case) -> dict[str, float]:
+    """Return the scores of a cloud with the constants as they are."""
+    settings = replace(_CONFIG.normals, adaptive_k=case.adaptive_k)
+    fit = estimate_consensus(case.points, case.neighbors, settings, _CHUNK_SIZE)
+    scores = {}
+    if case.labels is not None:
+        found = grow_regions(
+            case.points,
+            fit.normals,
+            fit.curvature,
+            case.neighbors,
+            _CONFIG.growing,
+            valid=fit.valid,
+            residual_rms=fit.residual_rms,
+        )
+        labels = score_labels(found, case.labels, min_size=MIN_SIZE, ignore=case.ignore)
+        scores |= {"F1": labels.f1, "mIoU": 100 * labels.mean_best_iou, "ARI": 100 * labels.ari}
+    if case.normals is not None:
+        angles = score_normals(fit.normals, case.normals)
+        scores |= {"mean": angles.mean, "RMS": angles.rms}
+    return scores
+
+
+def study(cases: Sequence[Case], table: Sequence[Constant]) -> Iterator[Finding]:
+    """Yield what becomes of the scores when constants move."""
+    before = {case.name: score(case) for case in cases}
+
+    def largest(
+        constant: Constant, factor: float, some: Sequence[Case]
+    ) -> tuple[Change, list[Case]]:
+        """Return the largest change, by its tolerance, and the clouds where one is above it."""
+        with moved(constant, factor) as value:
+            if value == constant.value:
+                return Change(value), []
+            worst, share, changed = Change(value), 0.0, []
+            for case in some:
+                for name, after in score(case).items():
+                    change = after - before[case.name][name]
+                    relative = abs(change) / (TOLERANCES.get(name) or 100 / case.num_faces)
+                    if relative > share:
+                        worst, share = Change(value, name, case.name, change), relative
+                    if relative > 1 and not (changed and changed[-1] is case):
+                        changed.append(case)
+        return worst, changed
+
+    def furthest(constant: Constant, factors: Sequence[float]) -> tuple[Change, float]:
+        """Return the change by the first factor, and the first that changes nothing."""
+        first, changed = largest(constant, factors[0], cases)
+        if not changed:
+            return first, factors[0]
+        for factor in factors[1:]:
+            if not largest(constant, factor, changed)[1]:
+                return first, factor
+        return first, 1.0
+
+    for constant in table:
+        half, lowest = furthest(constant, [1 / factor for factor in FACTORS])
+        double, highest = furthest(constant, FACTORS)
+        yield Finding(constant.title, constant.value, constant.unit, half, double, lowest, highest)
+
+
+def make_cases(parts: Path | None, *, quick: bool) -> list[Case]:
+    """Return the clouds: rooms (one in quick runs), parts if there are any, shapes."""
+    share = 0.6 if quick else 1.0
+    cases = []
+    for name, (layout, noise) in list(_ROOMS.items())[: 1 if quick else None]:
+        room = make_room(round(_ROOM_POINTS * share), noise=noise, seed=3, layout=layout)
+        neighbors = search_knn(room.points, _CONFIG.normals.k)
+        faces = len(room.labels.unique())
+        cases.append(Case(name, room.points, neighbors, room.labels, room.normals, faces))
+    if parts is not None:
+        cases.append(_read_parts(parts, round(_PART_POINTS * share)))
+    for name, (shape, noise, k, adaptive_k) in _SHAPES.items():
+        num_points = round((_SHAPE_POINTS if adaptive_k is None else _SHAPE_POINTS // 4) * share)
+        scene = make_shape(shape, num_points, noise, seed=1)
+        neighbors = search_knn(scene.points, k)
+        cases.append(
+            Case(name, scene.points, neighbors, None, scene.normals, adaptive_k=adaptive_k)
+        )
+    return cases
+
+
+def _read_parts(path: Path, num_points: int) -> Case:
+    """Return the points of a file nearest to its middle, as dense as they are there."""
+    cloud = read_cloud(path)
+    distances = (cloud.points - cloud.points.median(dim=0).values).square().sum(dim=1)
+    kept = distances.argsort(stable=True)[:num_points].sort().values
+    points = cloud.points[kept].contiguous()
+    labels = torch.from_numpy(cloud.fields["labels"])[kept]
+    neighbors = search_knn(points, _CONFIG.normals.k)
+    return Case("office parts", points, neighbors, labels, None, len(labels.unique()) - 1, ignore=0)
+
+
+def _small(layout: RoomLayout, **counts: int) -> RoomLayout:
+    """Return the layout in a small room with few things, where 50,000 points are dense."""
+    nothing = {field.name: 0 for field in fields(layout) if field.name.startswith("num_")}
+    return replace(layout, size=(4.4, 3.4, 2.4), **{**nothing, "num_viewpoints": 1, **counts})
+
+
+_ROOM_POINTS = 30_000
+_PART_POINTS = 30_000
+_SHAPE_POINTS = 10_000
+_ROOMS = {
+    "room": (
+        _small(
+            RoomLayout(), num_doors=1, num_windows=1, num_cabinets=1, num_shelves=1, num_tables=1
+        ),
+        0.003,
+    ),
+    "thin plates": (_small(THIN_LAYOUT, num_shelves=2, num_panels=2, num_tables=1), 0.002),
+    "curved room": (
+        _small(CURVED_LAYOUT, num_round_tables=1, num_bent_walls=2, num_windows=1),
+        0.003,
+    ),
+    "bent walls, exact": (_small(BENT_LAYOUT, num_bent_walls=4, num_tables=1), 0.0),
+}
+_SHAPES = {
+    "cube, exact": ("cube", 0.0, 50, None),
+    "cube": ("cube", 0.0025, 50, None),
+    "bracket": ("bracket", 0.0025, 50, None),
+    "plate, exact": ("thin_plate", 0.0, 50, None),
+    "cylinder": ("cylinder", 0.0025, 50, None),
+    "rounded box": ("rounded_box", 0.001, 50, None),
+    "torus": ("torus", 0.0025, 50, None),
+    "coral, exact": ("coral", 0.0, 50, None),
+    "cube, k = 16": ("cube", 0.001, 16, None),
+    "torus, adaptive k": ("torus", 0.012, 50, 300),
+}
+"""Shape, noise by its diagonal, neighbours, most neighbours."""
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--parts", type=Path, help="cloud of scanned parts with labels")
+    parser.add_argument("--quick", action="store_true", help="one room, and fewer points")
+    parser.add_argument("--only", nargs="+", help="names of constants")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.parts is not None and not arguments.parts.is_file():
+        print(f"{arguments.parts}: not there; without scanned parts", file=sys.stderr)
+        arguments.parts = None
+    torch.set_num_threads(1)
+    cases = make_cases(arguments.parts, quick=arguments.quick)
+    table = [one for one in read_table() if not arguments.only or one.name in arguments.only]
+    findings = study(cases, table)
+    if arguments.json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=1))
+        return
+    for case in cases:
+        shown = ", ".join(f"{name} {value:.2f}" for name, value in score(case).items())
+        print(f"{case.name:18} {len(case.points):7,} points: {shown}")
+    print(
+        "No change: F1 and mean best IoU by at most one face, ARI by 1 point, "
+        "angles by 0.05 degrees (mean) and 0.25 (RMS)."
+    )
+    print(f"{'constant':24} {'value':>8}  {'half':38} {'double':38} no change")
+    for found in findings:
+        span = f"x{found.lowest:.2g} to x{found.highest:.2g}"
+        print(
+            f"{found.constant:24} {found.value:8g}  {found.half!s:38} {found.double!s:38} {span}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
