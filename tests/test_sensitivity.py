@@ -46,12 +46,12 @@ def test_every_constant_is_read_where_the_estimator_is_called():
 
 def test_what_moves_is_put_back_and_what_matters_is_found(tiny):
     before = {name: getattr(constants, name) for name in NAMES}
-    chosen = ("FLAT_LIMIT", "CHUNK_SIZE", "NOISE_COUNTS")
+    chosen = ("FLAT_LIMIT", "MIN_BREADTH", "NOISE_COUNTS")
     table = [constant for constant in sensitivity.read_table() if constant.name in chosen]
-    chunk, *counts, flat = sensitivity.study([tiny], table)
+    *counts, breadth, flat = sensitivity.study([tiny], table)
     assert [one.constant for one in counts] == ["NOISE_COUNTS[0]", "NOISE_COUNTS[1]"]
-    assert chunk.half.change == chunk.double.change == 0
-    assert (chunk.lowest, chunk.highest) == (0.5, 2.0)
+    assert breadth.half.change == breadth.double.change == 0
+    assert (breadth.lowest, breadth.highest) == (0.5, 2.0)
     assert (flat.half.value, flat.double.value) == (0.525, 2.1)
     assert flat.double.change != 0
     assert {name: getattr(constants, name) for name in NAMES} == before
