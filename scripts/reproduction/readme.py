@@ -6,7 +6,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from reproduction.cells import Record
 from reproduction.clouds import TITLES
@@ -26,16 +25,6 @@ EXTERNAL = {
     "recall_iou50": ("faces found (IoU 0.5)", ".2f"),
     "mean_best_iou": ("mean best IoU", ".2f"),
 }
-SHAPES = ("cuboid", "dodecahedron")
-VARIANTS = {
-    "pca": "PCA",
-    "jet": "2-jet",
-    "irls": "weighted PCA",
-    "detmm": "DetMM",
-    "paper": "paper",
-    "consensus": "consensus",
-}
-NOISE = 0.25
 
 
 def update(report: Record) -> None:
@@ -65,12 +54,10 @@ def take_results(report: Record) -> Record:
         ValueError: If a part that it needs is not there.
     """
     parts = report["parts"]
-    missing = {"normals", "segmentation", "large", "times"} - parts.keys()
+    missing = {"segmentation", "large", "times"} - parts.keys()
     if missing:
         raise ValueError(f"take_results: expected all parts, got none of {sorted(missing)}.")
     scored = [*parts["segmentation"]["records"], *parts["large"]["records"]]
-    normals = parts["normals"]["records"]
-    size = max(record["num_points"] for record in normals)
     return {
         "quick": report["quick"],
         "made_with": report["made_with"],
@@ -88,98 +75,37 @@ def take_results(report: Record) -> Record:
             {name: record[name] for name in ("cloud", "preset", "points", "total")}
             for record in parts["times"]["records"]
         ],
-        "normals": {
-            "num_points": size,
-            "errors": [
-                {
-                    "shape": record["shape"],
-                    "variant": record["variant"],
-                    "seconds": record["seconds"],
-                    **{name: record["score"][name] for name in ("msae", "median", "under_10_deg")},
-                }
-                for record in normals
-                if (record["num_points"], record["noise_percent"]) == (size, NOISE)
-                and record["shape"] in SHAPES
-                and record["variant"] in VARIANTS
-            ],
-        },
-        "claims": [
-            {name: block[name] for name in ("text", "numbers", "why")}
-            for part in parts.values()
-            for block in part["blocks"]
-            if block["kind"] == "claim" and not block["holds"]
-        ],
     }
 
 
 def to_section(results: Record) -> str:
-    """Return the results section: tables, and what of the paper does not come out.
+    """Return the results section: one table of the clouds with truth.
 
     Times of small clouds are those of fixed costs, and stay out.
     """
     made = "small clouds: `--quick`" if results["quick"] else "full size"
-    fails = "\n".join(
-        " ".join(filter(None, ["*", claim["text"], claim["numbers"], claim["why"]]))
-        for claim in results["claims"]
-    )
-    parts = [
-        f"From the report of `scripts/reproduce_paper.py` ({made}): {results['made_with']}.",
-        _scores(results["scores"]),
-        _normals(results["normals"], with_times=not results["quick"]),
-    ]
-    if not results["quick"]:
-        parts.insert(2, _times(results["times"]))
-    if fails:
-        parts.append(f"What the paper says and does not come out on these clouds:\n\n{fails}")
-    return "\n\n".join(parts)
-
-
-def _scores(scores: list[Record]) -> str:
-    """Return the external indices of the clouds with truth."""
     rows = []
-    for key in dict.fromkeys(record["cloud"] for record in scores):
-        found = {record["preset"]: record for record in scores if record["cloud"] == key}
-        for name, (title, form) in EXTERNAL.items():
-            values = [found[preset][name] for preset in METHODS]
-            faces = next(iter(found.values()))["faces"]
-            rows.append(
-                [f"{TITLES[key]} ({faces} faces)", title, *mark_best(values, form, higher=True)]
-            )
+    for key in dict.fromkeys(record["cloud"] for record in results["scores"]):
+        found = {record["preset"]: record for record in results["scores"] if record["cloud"] == key}
+        name = f"{TITLES[key]} ({next(iter(found.values()))['faces']} faces)"
+        for index, (title, form) in EXTERNAL.items():
+            values = [found[preset][index] for preset in METHODS]
+            rows.append([name, title, *mark_best(values, form, higher=True)])
+        if not results["quick"]:
+            rows.append([name, "times faster than published", *_speedups(results["times"], key)])
     head = ["cloud in place of", "index", *METHODS.values()]
-    return markdown_table(table("Segmentation of clouds with known truth:", head, rows))
-
-
-def _times(times: list[Record]) -> str:
-    """Return seconds, and how many times faster than the paper's."""
-    rows = []
-    for key in dict.fromkeys(record["cloud"] for record in times):
-        found = {record["preset"]: record for record in times if record["cloud"] == key}
-        cells = []
-        for preset in METHODS:
-            times_faster = ratio(found[preset])
-            more = "" if times_faster is None else f" ({times_faster:,.0f} x)"
-            cells.append(f"{found[preset]['total']:.1f}{more}")
-        rows.append([TITLES[key], f"{next(iter(found.values()))['points']:,}", *cells])
     title = (
-        "Seconds from points to planes (how many times faster than the paper's MATLAB, per point):"
+        f"Clouds with known truth, from the report of `scripts/reproduce_paper.py` ({made}; "
+        f"{results['made_with']}):"
     )
-    return markdown_table(table(title, ["cloud", "points", *METHODS.values()], rows))
+    return markdown_table(table(title, head, rows))
 
 
-def _normals(normals: dict[str, Any], *, with_times: bool) -> str:
-    """Return errors of normals on two shapes."""
-    rows = []
-    for shape in SHAPES:
-        found = {r["variant"]: r for r in normals["errors"] if r["shape"] == shape}
-        msae = [found[name]["msae"] for name in VARIANTS]
-        share = [100 * found[name]["under_10_deg"] for name in VARIANTS]
-        rows.append([shape, "MSAE (degrees²)", *mark_best(msae, ".1f", higher=False)])
-        rows.append([shape, "errors under 10° (%)", *mark_best(share, ".1f", higher=True)])
-        if with_times:
-            seconds = (f"{found[name]['seconds']:.2f}" for name in VARIANTS)
-            rows.append([shape, "seconds", *seconds])
-    title = f"Normals of {normals['num_points']:,} points, {NOISE} % noise, k = 50:"
-    return markdown_table(table(title, ["shape", "", *VARIANTS.values()], rows))
+def _speedups(times: list[Record], cloud: str) -> list[str]:
+    """Return how many times faster, per point, each method is than the paper's MATLAB code."""
+    found = {record["preset"]: record for record in times if record["cloud"] == cloud}
+    ratios = [ratio(found[preset]) for preset in METHODS]
+    return ["" if value is None else f"{value:,.0f}" for value in ratios]
 
 
 def _write(path: Path, text: str) -> None:
