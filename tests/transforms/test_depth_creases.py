@@ -2,7 +2,7 @@
 
 import torch
 
-from torchrg.depth.refine import move_to_creases
+from torchrg.depth.growth import move_to_creases
 from torchrg.depth.windows import moved
 from torchrg.linalg.moments import Segments
 from torchrg.regions.planes import fit_planes

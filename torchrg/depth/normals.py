@@ -28,12 +28,10 @@ _LEAST_QUARTERS = 0.7
 class PixelPlanes(NamedTuple):
     """A plane in inverse depth for each pixel.
 
-    Attributes:
-        planes: The planes, in columns and rows from the optical axis.
-        radius: Radius of the window each comes from, shape ``(H, W)``; 0 where there is none.
-        flat: Whether that window is flat, shape ``(H, W)``, bool.
-        edge: Whether the window is flat but could not lie around the pixel, shape ``(H, W)``, bool.
-        noise: Standard deviation of inverse depth, as large windows see it, shape ``(H, W)``.
+    The planes are in columns and rows from the optical axis. ``radius`` is that of the window each
+    comes from, 0 where there is none; ``flat`` tells whether that window is flat, ``edge`` whether
+    it is but could not lie around the pixel; ``noise`` is the standard deviation of inverse depth,
+    as large windows see it. All are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes
@@ -63,27 +61,15 @@ def fit_pixels(
     both cases only if the pixel itself is on the plane. Pixels in no flat window take the smallest
     around them.
 
-    Args:
-        inverse: Inverse depth, shape ``(H, W)``, float64; anything finite where not seen.
-        seen: Pixels with depth, shape ``(H, W)``, bool.
-        u: Columns from the optical axis, shape ``(W,)``.
-        v: Rows from the optical axis, shape ``(H, 1)``.
-        noise: See :class:`torchrg.config.DepthConfig`.
-        dtype: Dtype of the depth.
+    ``inverse`` ``(H, W)``, float64, is anything finite where not ``seen``; columns ``u`` ``(W,)``
+    and rows ``v`` ``(H, 1)`` count from the optical axis; ``noise`` is that of
+    :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
 
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban
         scene reconstruction. CVPR, 2010.
         [2] M. Kuwahara et al. Processing of RI-angiocardiographic images. Digital Processing of
         Biomedical Images, 1976.
-
-    Example:
-        >>> u, v = torch.arange(40.0).double() - 20, torch.arange(30.0).double()[:, None] - 15
-        >>> inverse = torch.where(u < 0, 0.5, 0.4).double().expand(30, 40)
-        >>> seen = torch.ones(30, 40, dtype=torch.bool)
-        >>> found = fit_pixels(inverse, seen, u, v, noise=None, dtype=torch.float32)
-        >>> bool(found.flat.all()), int(found.edge[0].sum()) > 0
-        (True, True)
     """
     windows = {radius: fit_windows(inverse, seen, u, v, radius) for radius in RADII}
     levels = noise_by_radius(windows, inverse, seen, noise, dtype)

@@ -28,12 +28,8 @@ _LEAST_ROUNDING = 1e-7
 class WindowPlanes(NamedTuple):
     """Planes ``value = u_slope * u + v_slope * v + origin`` of the windows around all pixels.
 
-    Attributes:
-        u_slope: Change from column to column, shape ``(H, W)``.
-        v_slope: Change from row to row, shape ``(H, W)``.
-        origin: Value at ``u = v = 0``, shape ``(H, W)``.
-        deviation: Standard deviation of the window's pixels from the plane, shape ``(H, W)``;
-            infinite where there is no plane.
+    ``deviation`` is the standard deviation of a window's pixels from its plane, infinite where
+    there is none. All are of shape ``(H, W)``.
     """
 
     u_slope: Tensor
