@@ -2,8 +2,7 @@
 
 import torch
 
-from torchrg.depth.normals import RADII
-from torchrg.depth.windows import fit_windows, least_in_windows, moved, noise_by_radius
+from torchrg.depth.normals import RADII, fit_windows, least_in_windows, moved, noise_by_radius
 
 
 def coordinates(height, width):

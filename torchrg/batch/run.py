@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.report import BatchReport, format_table, kept_report
 from torchrg.batch.scans import Job, Source
@@ -51,15 +50,12 @@ class Plan(NamedTuple):
 
 
 def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
-    """Return a job for each scan of a source.
+    """Return a job for each scan of a source, in natural order.
 
     Args:
         source: The data set.
         out: Where results go.
         only: Pattern of the names to convert, as in a shell; ``*`` matches slashes too.
-
-    Returns:
-        The jobs in natural order.
 
     Raises:
         ConfigError: If no name matches the pattern, or results would go in among the scans.
@@ -123,11 +119,6 @@ def check_space(plan: Plan) -> None:
             f"{len(plan.to_convert):,} scans, got {free / 1e6:,.1f} MB; make room, choose another "
             "directory, or convert fewer with --only."
         )
-
-
-def too_large(plan: Plan, limit: int) -> list[Job]:
-    """Return the jobs that need more memory than a limit by themselves."""
-    return [job for job in plan.to_convert if memory_of_scan(job.scan.num_points) > limit]
 
 
 def format_plan(plan: Plan) -> str:

@@ -18,7 +18,6 @@ from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,
     FolderOfClouds,
-    RoomReport,
     Scene,
     read_pointcept_scene,
     read_room,
@@ -141,11 +140,7 @@ class S3DISSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return {
-            "kind": "s3dis",
-            "class_order": self.class_order,
-            "superpoint": self.superpoint,
-        }
+        return {"kind": "s3dis", "class_order": self.class_order, "superpoint": self.superpoint}
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -158,7 +153,11 @@ class S3DISSource:
         begin("read")
         room = read_room(self.root / scan.name, class_order=self.class_order)
         cloud = Cloud(room.coord, source=scan.name)
-        notes = (*check_finite(cloud), *_notes(room.report))
+        notes = [
+            *check_finite(cloud),
+            *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
+            *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
+        ]
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         begin("write")
         arrays, origin = room._asdict(), cloud.origin.tolist()
@@ -169,7 +168,7 @@ class S3DISSource:
             f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
             for r in room.report.repairs
         )
-        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, notes)
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, tuple(notes))
 
 
 def find_areas(root: Path) -> tuple[int, ...]:
@@ -182,12 +181,6 @@ def _estimate(scene: Scene) -> int:
     sizes = {file: file.stat().st_size for file in scene.files}
     largest = max(sizes, key=lambda file: sizes[file])
     return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
-
-
-def _notes(report: RoomReport) -> tuple[str, ...]:
-    """Return what was passed over in a room, a line each."""
-    skipped = [f"{item.file.name} not read: {item.reason}" for item in report.skipped]
-    return (*skipped, *(f"{file.name} taken as clutter" for file in report.as_clutter))
 
 
 @dataclass(frozen=True)

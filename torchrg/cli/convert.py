@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from torchrg.batch.convert import ScanReport
 from torchrg.batch.local import run_local
-from torchrg.batch.memory import SHARE, available_memory
+from torchrg.batch.memory import SHARE, available_memory, memory_of_scan
 from torchrg.batch.report import BatchReport, format_report
 from torchrg.batch.run import (
     REPORT,
@@ -27,7 +27,6 @@ from torchrg.batch.run import (
     list_jobs,
     make_plan,
     run_plan,
-    too_large,
     write_report,
 )
 from torchrg.batch.scans import Job, Source
@@ -189,12 +188,13 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     check_space(plan)
     given = arguments.limit_memory
     limit = int(SHARE * available_memory() if given is None else given * 1e9)
-    for job in too_large(plan, limit):
-        console.warn(
-            f"{job.scan.name}: about {job.scan.num_points:,} points may need more memory than "
-            f"{limit / 1e9:.1f} GB; it runs alone."
-        )
     jobs, workers = plan.to_convert, arguments.workers
+    for scan in (job.scan for job in jobs):
+        if memory_of_scan(scan.num_points) > limit:
+            console.warn(
+                f"{scan.name}: about {scan.num_points:,} points may need more memory than "
+                f"{limit / 1e9:.1f} GB; it runs alone."
+            )
     if arguments.engine == "local":
         workers = min(workers or _num_cores(), max(len(jobs), 1))
         reports: Reports = run_local(jobs, workers=workers, memory_limit=limit, lock=lock)

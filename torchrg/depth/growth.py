@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrg.config import DepthConfig, GrowingConfig
-from torchrg.depth.normals import PixelPlanes
-from torchrg.depth.windows import moved
+from torchrg.depth.normals import PixelPlanes, moved
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.moments import Segments
 from torchrg.regions import grow_regions
