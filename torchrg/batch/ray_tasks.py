@@ -33,7 +33,7 @@ def run_ray(
         jobs: The scans.
         workers: Most tasks at a time. Default: as many as Ray has places for.
         memory_limit: Memory of a cluster that is started here, in bytes.
-        address: Cluster to use. Default: one is started on this machine, and stopped at the end.
+        address: Cluster to use. Default: one is started here, and stopped at the end.
         work: What to do with a job.
 
     Yields:

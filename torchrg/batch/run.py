@@ -87,11 +87,8 @@ def make_plan(
     A scan is done if its record says what would be done now, from the same bytes, and its results
     have not changed since: files are read to see, those of scans without a record are not.
 
-    Args:
-        jobs: The scans.
-        force: Whether to convert those that are done too.
-        threads: Scans looked at at a time.
-        on_scan: Called when one has been looked at.
+    So many ``threads`` look at a scan each; ``on_scan`` is called when one has been looked at. With
+    ``force``, those that are done are converted too.
     """
 
     def look(job: Job) -> str:
@@ -144,12 +141,8 @@ def run_plan(
     A full disk ends the batch, as every further scan would fail after its work; so does an
     interrupt. What is complete stays, and the next run goes on from there.
 
-    Args:
-        plan: The plan.
-        reports: The engine at work: reports as scans end, None in between.
-        engine: Its name, for the report; ``workers`` too.
-        workers: Most scans at a time.
-        on_report: Called with everything that the engine yields.
+    ``reports`` are those of the engine at work, as scans end, None in between; ``on_report`` is
+    called with each. ``engine`` and ``workers`` are noted in the report.
     """
     started, begin = time.time(), time.perf_counter()
     found = {job.scan.name: kept_report(job) for job in plan.done}

@@ -26,12 +26,7 @@ class DepthTransform(SampleTransform):
     )
 
     def read_images(self, sample: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None.
-
-        Raises:
-            ConfigError: If the sample lacks depth or intrinsics.
-            ShapeError: If their shapes are not as in :class:`SegmentDepth`.
-        """
+        """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
         depth, intrinsics = self.read(sample, "depth"), self.read(sample, "intrinsics")
         if depth.ndim not in (2, 3, 4) or (depth.ndim > 2 and depth.shape[-3] != 1):
             raise ShapeError(
