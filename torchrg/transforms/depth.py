@@ -172,10 +172,6 @@ class SegmentDepth(DepthTransform):
             added[self.key(sample, "planes")] = tables if batch else tables[0]
         return added
 
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
-
 
 class FusedFrames(NamedTuple):
     """A cloud of several depth frames.

@@ -37,6 +37,7 @@ class SampleTransform(nn.Module):
     """
 
     names: Sequence[str] = KEYS
+    config: Any = None
 
     def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
         super().__init__()
@@ -47,6 +48,10 @@ class SampleTransform(nn.Module):
                 f"{type(self).__name__}: expected keys to rename {', '.join(self.names)}, got "
                 f"{', '.join(sorted(unknown))}."
             )
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return "" if self.config is None else repr(self.config)
 
     def key(self, sample: Any, name: str) -> str:  # noqa: ANN401
         """Return what an entry is called in a sample."""
@@ -98,7 +103,6 @@ class CloudTransform(SampleTransform):
     """Base of the transforms that add a row for each point, cloud by cloud."""
 
     reads: tuple[str, ...] = ("coord",)
-    config: Any
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return new entries of one cloud, from those that are read."""
@@ -115,10 +119,6 @@ class CloudTransform(SampleTransform):
             self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
         }
         return self.changed(sample, added, per_point=list(added))
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
 
 
 class CenterCloud(SampleTransform):
