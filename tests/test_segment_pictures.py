@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from torchrg.cli import main, picture
+from torchrg.cli import main
 from torchrg.render import render_cloud
 
 PNG = b"\x89PNG"
@@ -22,7 +22,8 @@ def rooms(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch):
-    monkeypatch.setattr(picture, "render_cloud", functools.partial(render_cloud, width=80))
+    small = functools.partial(render_cloud, width=80)
+    monkeypatch.setattr("torchrg.cli.segment.render_cloud", small)
 
 
 def segment(*arguments):

@@ -12,13 +12,8 @@ from torchrg.errors import ShapeError
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     """Return a tensor as it is, and a NumPy array as a tensor that shares its memory.
 
-    Args:
-        caller: Name of the public function, the first word of the message.
-        name: Name of the argument.
-        values: What the user passed.
-
-    Returns:
-        A tensor; big-endian and read-only arrays are copied, everything else is shared.
+    Big-endian and read-only arrays are copied. ``caller``, here and below, is the name of the
+    public function, the first word of the message.
 
     Raises:
         ShapeError: If ``values`` is neither a tensor nor a numeric NumPy array.
@@ -37,11 +32,7 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
-    """Check that tensors hold float32 or float64, all the same.
-
-    Args:
-        caller: Name of the public function, the first word of the message.
-        **arguments: The tensors by argument name; None is skipped.
+    """Check that tensors hold float32 or float64, all the same; None is skipped.
 
     Raises:
         ShapeError: If one does not, or if two differ in dtype or device.
@@ -72,9 +63,7 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     A letter stands for one length, the same in every pattern; a number for that length; a leading
     ``*`` for any leading axes, the same in every pattern. An argument that is None is skipped.
 
-    Args:
-        caller: Name of the public function, the first word of the message.
-        **arguments: For each argument name, its tensor and its pattern, as in ``(x, "* N 3")``.
+    Arguments are a tensor and its pattern by name, as in ``x=(x, "* N 3")``.
 
     Raises:
         ShapeError: If a tensor does not match its pattern.

@@ -9,13 +9,7 @@ from torchrg.errors import MissingDependencyError
 def require(module: str, *, extra: str, purpose: str) -> ModuleType:
     """Import an optional module, or say how to install it.
 
-    Args:
-        module: Dotted name of the module.
-        extra: The extra of torchrg that brings it.
-        purpose: What the caller wanted, to complete "... is needed to <purpose>".
-
-    Returns:
-        The imported module.
+    ``extra`` of torchrg brings it; ``purpose`` completes "... is needed to <purpose>".
 
     Raises:
         MissingDependencyError: If the module is not installed.

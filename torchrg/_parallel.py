@@ -53,15 +53,8 @@ def map_chunks(
 ) -> list[Result]:
     """Call ``work`` on slices that together cover all rows; see :func:`map_tasks`.
 
-    Args:
-        work: Called at least once, without rows on an empty slice.
-        num_rows: Number of rows.
-        chunk_size: Most rows of a slice.
-        device: Where the rows are.
-        least: Rows of a slice below which another thread is not worth its start.
-
-    Returns:
-        What ``work`` returns, in the order of the rows.
+    ``work`` is called at least once, without rows on an empty slice; ``least`` is the number of
+    rows below which another thread is not worth its start. The results are in the order of rows.
 
     Example:
         >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))

@@ -107,13 +107,7 @@ class NormalFit(NamedTuple):
     sharp: Tensor | None = None
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
-        """Return a fit whose tensors are changed by one function, None left alone.
-
-        Example:
-            >>> three = torch.zeros(3)
-            >>> NormalFit(torch.zeros(3, 3), three, three, three).each(lambda x: x[:2]).valid
-            tensor([0., 0.])
-        """
+        """Return a fit whose tensors are changed by one function, None left alone."""
         sharp = None if self.sharp is None else change(self.sharp)
         normals, curvature, valid, residual_rms = (change(part) for part in self[:4])
         return NormalFit(normals, curvature, valid, residual_rms, sharp)

@@ -10,8 +10,7 @@ import pytest
 from tqdm import tqdm
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.plan import make_plan
-from torchrg.batch.run import DirectoryLock
+from torchrg.batch.run import DirectoryLock, make_plan
 from torchrg.cli import main
 from torchrg.cli.convert import _Progress
 from torchrg.config import load_config

@@ -8,8 +8,8 @@ import pytest
 
 import torchrg
 from torchrg.batch.convert import convert_scan
-from torchrg.batch.plan import list_jobs, make_plan
 from torchrg.batch.records import RECORD, reason_to_convert
+from torchrg.batch.run import list_jobs, make_plan
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
 

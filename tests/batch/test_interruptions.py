@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from torchrg.batch.convert import convert_scan
-from torchrg.batch.plan import list_jobs
+from torchrg.batch.run import list_jobs
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
 from torchrg.scenes import make_room

@@ -3,9 +3,8 @@
 import json
 
 from torchrg.batch.convert import convert_scan
-from torchrg.batch.plan import make_plan
 from torchrg.batch.report import format_report, format_table
-from torchrg.batch.run import run_plan, write_report
+from torchrg.batch.run import make_plan, run_plan, write_report
 
 
 def run(jobs, on_report=lambda report: None):
@@ -17,7 +16,7 @@ def run(jobs, on_report=lambda report: None):
 
 def statuses(ending):
     """Return what became of each scan."""
-    return {scan.name: scan.status for scan in ending.report.scans}
+    return {scan.name: scan.status for scan in ending.scans}
 
 
 def test_a_full_disk_ends_the_batch_and_the_next_run_goes_on(faults, tmp_path):
@@ -26,7 +25,7 @@ def test_a_full_disk_ends_the_batch_and_the_next_run_goes_on(faults, tmp_path):
     ending = run(jobs)
     assert ending.disk_full
     assert statuses(ending) == {"1_a": "converted", "2_b": "failed", "3_c": "not started"}
-    assert "No space left on device" in ending.report.with_status("failed")[0].reason
+    assert "No space left on device" in ending.with_status("failed")[0].reason
     (tmp_path / "in" / "2_b.txt").write_text("plain")
     ending = run(jobs)
     assert not ending.disk_full
@@ -47,7 +46,7 @@ def test_an_interrupt_ends_the_batch_with_what_is_complete(faults, tmp_path):
 
 def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
     jobs = faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"})
-    report = run(jobs).report
+    report = run(jobs)
     write_report(tmp_path, report)
     written = json.loads((tmp_path / "report.json").read_text())
     assert written["scans_by_status"] == {
@@ -63,13 +62,13 @@ def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
     table = format_report(report)
     assert "9_a" in table
     assert "9_a: was plain" in table
-    kept = run(jobs).report.with_status("kept")[0]
+    kept = run(jobs).with_status("kept")[0]
     assert (kept.num_points, kept.num_regions, kept.warnings) == (9, 1, ("was plain",))
 
 
 def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
     monkeypatch.setattr("torchrg.batch.report.MOST_ROWS", 1)
-    report = run(faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"})).report
+    report = run(faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"}))
     table = format_report(report)
     assert "8_b" in table
     assert "9_a" not in table

@@ -1,6 +1,5 @@
 """The plane table against shapes whose planes, areas and extents are known."""
 
-import json
 import math
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 
 from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
 from torchrg.neighbors import search_knn
-from torchrg.regions import planes_to_json, planes_to_rows, summarize_planes
+from torchrg.regions import summarize_planes
 from torchrg.structures import PLANE_KINDS
 
 
@@ -132,7 +131,6 @@ def test_table_of_no_region_is_empty():
         points, points, torch.full((5,), -1), neighbors=search_knn(points, 3), up=(0, 0, 1)
     )
     assert len(planes.count) == len(planes.normal) == len(planes.adjacency.pairs) == 0
-    assert planes_to_rows(planes) == []
     nothing = summarize_planes(points[:0], points[:0], torch.zeros(0, dtype=torch.int64))
     assert len(nothing.count) == 0
 
@@ -291,23 +289,6 @@ def test_outlines_without_shapely_say_how_to_get_it(monkeypatch):
     points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[outline\]'"):
         summarize_planes(points, points, one_region(points), outline=True)
-
-
-def test_rows_and_json_hold_the_table():
-    points, normals, labels = box_of_points(np.random.default_rng(13), n=500)
-    planes = summarize_planes(
-        points, normals, labels, neighbors=search_knn(points, 20), up=(0, 0, 1)
-    )
-    rows = planes_to_rows(planes)
-    assert [row["label"] for row in rows] == list(range(6))
-    assert rows[0]["kind"] == "floor"
-    assert rows[2]["normal"] == planes.normal[2].tolist()
-    assert sorted(found["plane"] for found in rows[0]["neighbors"]) == [2, 3, 4, 5]
-    assert json.loads(planes_to_json(planes)) == {"planes": rows}
-    plain = planes_to_rows(summarize_planes(points, normals, labels))
-    assert "kind" not in plain[0]
-    assert "neighbors" not in plain[0]
-    assert "outline" not in plain[0]
 
 
 def test_wrong_arguments_are_refused():

@@ -12,7 +12,7 @@ from torchrg.regions import grow_regions
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
 from torchrg.regions.criteria import GrowingCloud
 from torchrg.regions.refine import absorb_points, refine_regions
-from torchrg.structures import UNLABELED
+from torchrg.structures import UNLABELED, Neighbors
 
 OFF = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)
 
@@ -130,6 +130,13 @@ def test_absorption_follows_its_rule_literally():
     expected = absorbed_one_by_one(points, normals, labels, neighbors, planes, valid, 30.0)
     assert found.tolist() == expected
     assert (found >= 0).sum() > (labels >= 0).sum()
+
+
+def test_contacts_of_touching_regions_are_counted():
+    neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
+    pairs, counts = count_contacts(torch.tensor([0, 1, 1]), neighbors)
+    assert (pairs.tolist(), counts.tolist()) == ([[0, 1]], [2])
+    assert contact_neighbors(neighbors)[0].tolist() == [[1], [0], [1]]
 
 
 def test_touching_pieces_of_one_plane_are_merged():

@@ -2,8 +2,8 @@
 
 import torch
 
-from torchrg.depth.refine import move_to_creases
-from torchrg.depth.windows import moved
+from torchrg.depth.growth import move_to_creases
+from torchrg.depth.normals import moved
 from torchrg.linalg.moments import Segments
 from torchrg.regions.planes import fit_planes
 from torchrg.structures import Neighbors

@@ -2,8 +2,14 @@
 
 import torch
 
-from torchrg.depth.normals import RADII
-from torchrg.depth.windows import fit_windows, least_in_windows, moved, noise_by_radius
+from torchrg.depth.normals import (
+    RADII,
+    fit_pixels,
+    fit_windows,
+    least_in_windows,
+    moved,
+    noise_by_radius,
+)
 
 
 def coordinates(height, width):
@@ -80,3 +86,13 @@ def test_noise_that_is_given_is_taken(rng):
     noise = noise_by_radius(windows, inverse, seen, (0.01, 0.02), torch.float32)
     torch.testing.assert_close(noise[2], 0.02 + 0.01 * inverse**2)
     assert torch.equal(noise[2], noise[4])
+
+
+def test_windows_beside_a_step_are_flat_and_tell_the_edge():
+    u, v = coordinates(30, 40)
+    inverse = torch.where(u < 0, 0.5, 0.4).double().expand(30, 40)
+    seen = torch.ones(30, 40, dtype=torch.bool)
+    found = fit_pixels(inverse, seen, u, v, noise=None, dtype=torch.float32)
+    assert found.flat.all()
+    assert found.edge[0].any()
+    assert not found.edge.all()

@@ -2,8 +2,8 @@
 
 A source (:class:`~torchrg.batch.sources.FolderSource`, :class:`~torchrg.batch.sources.S3DISSource`,
 :class:`~torchrg.batch.sources.RGBDSource`, or a :class:`~torchrg.batch.scans.Source` of your own)
-lists scans and converts one of them. :func:`~torchrg.batch.plan.list_jobs` makes jobs of them,
-:func:`~torchrg.batch.plan.make_plan` finds those that are not done,
+lists scans and converts one of them. :func:`~torchrg.batch.run.list_jobs` makes jobs of them,
+:func:`~torchrg.batch.run.make_plan` finds those that are not done,
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
 :func:`~torchrg.batch.run.run_plan` collects what becomes of them.
 
@@ -13,7 +13,7 @@ Example:
     >>> import numpy as np
     >>> from torchrg.batch.convert import convert_scan
     >>> from torchrg.batch.sources import FolderSource
-    >>> from torchrg.batch.plan import list_jobs
+    >>> from torchrg.batch.run import list_jobs
     >>> from torchrg.config import load_config
     >>> from torchrg.scenes import make_room
     >>> folder = Path(tempfile.mkdtemp())

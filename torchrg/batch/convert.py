@@ -79,15 +79,17 @@ def convert_scan(job: Job) -> ScanReport:
     except Exception as error:  # noqa: BLE001 One scan must never end the others.
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
+        is_foreseen = isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)
         outcome = {
             "status": "failed",
             "reason": _reason(error),
-            "details": "" if _is_foreseen(error) else traceback.format_exc(),
+            "details": "" if is_foreseen else traceback.format_exc(),
             "disk_full": _is_disk_full(error),
         }
+    clock.begin("done")
     return ScanReport(
         job.scan.name,
-        seconds=clock.end(),
+        seconds=clock.seconds,
         peak_memory=peak_memory(),
         host=f"{platform.node()} ({os.getpid()})",
         **outcome,
@@ -108,11 +110,6 @@ class _StageClock:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._start
         self._stage, self._start = stage, now
 
-    def end(self) -> dict[str, float]:
-        """End the last stage and return the seconds of all."""
-        self.begin("done")
-        return self.seconds
-
 
 def _reason(error: Exception) -> str:
     """Return an error as one line that names the file where it can."""
@@ -122,11 +119,6 @@ def _reason(error: Exception) -> str:
         return f"{error.filename or 'a file'}: {error.strerror or error}."
     text = " ".join(str(error).split())
     return text if isinstance(error, TorchrgError) else f"{type(error).__name__}: {text}"
-
-
-def _is_foreseen(error: Exception) -> bool:
-    """Return whether the reason says all there is to say."""
-    return isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)
 
 
 def _is_out_of_memory(error: Exception) -> bool:

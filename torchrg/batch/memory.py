@@ -32,21 +32,14 @@ def available_memory() -> int:
 
     The smaller of what the machine has free and what a control group (a container) leaves.
     """
-    free = [_machine_memory()]
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    free = [_read_entry("/proc/meminfo", "MemAvailable", otherwise=whole)]
     for limit, used in _CGROUP_FILES:
         try:
             free.append(int((_CGROUP / limit).read_text()) - int((_CGROUP / used).read_text()))
         except (OSError, ValueError):
             continue  # No such group, or one without a limit, which is the word "max".
     return max(0, min(free))
-
-
-def _machine_memory() -> int:
-    """Return the machine's available memory, or all of it where only that is known."""
-    try:
-        return _read_entry("/proc/meminfo", "MemAvailable")
-    except (OSError, KeyError, ValueError):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def reset_peak_memory() -> None:
@@ -59,16 +52,17 @@ def reset_peak_memory() -> None:
 
 def peak_memory() -> int:
     """Return the largest resident memory of this process since the last reset, in bytes."""
-    try:
-        return _read_entry("/proc/self/status", "VmHWM")
-    except (OSError, KeyError, ValueError):
-        import resource
+    import resource
 
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return _read_entry("/proc/self/status", "VmHWM", otherwise=usage.ru_maxrss * 1024)
 
 
-def _read_entry(path: str, name: str) -> int:
+def _read_entry(path: str, name: str, *, otherwise: int) -> int:
     """Return an entry, in kibibytes, of a table that Linux shows as a file, in bytes."""
-    lines = Path(path).read_text(encoding="ascii").splitlines()
-    table = dict(line.split(":", 1) for line in lines if ":" in line)
-    return int(table[name].split()[0]) * 1024
+    try:
+        lines = Path(path).read_text(encoding="ascii").splitlines()
+        table = dict(line.split(":", 1) for line in lines if ":" in line)
+        return int(table[name].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return otherwise

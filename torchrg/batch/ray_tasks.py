@@ -33,7 +33,7 @@ def run_ray(
         jobs: The scans.
         workers: Most tasks at a time. Default: as many as Ray has places for.
         memory_limit: Memory of a cluster that is started here, in bytes.
-        address: Cluster to use. Default: one is started on this machine, and stopped at the end.
+        address: Cluster to use. Default: one is started here, and stopped at the end.
         work: What to do with a job.
 
     Yields:
@@ -44,7 +44,19 @@ def run_ray(
         MissingDependencyError: If Ray is not installed.
     """
     ray = require("ray", extra="ray", purpose="convert on a Ray cluster")
-    _connect(ray, address, workers, memory_limit)
+    started = {
+        "num_cpus": workers,
+        "_memory": memory_limit,
+        "object_store_memory": _OBJECT_STORE_BYTES,
+        "include_dashboard": False,
+    }
+    ray.init(
+        address=address or "local",
+        logging_level="error",
+        log_to_driver=False,
+        runtime_env={"env_vars": ONE_THREAD},
+        **({} if address else started),
+    )
     pending: dict[Any, Job] = {}
     try:
         largest = max(
@@ -66,23 +78,6 @@ def run_ray(
         for reference in pending:
             ray.cancel(reference, force=True)
         ray.shutdown()
-
-
-def _connect(ray: Any, address: str | None, workers: int | None, memory_limit: int) -> None:  # noqa: ANN401
-    """Connect to a cluster, or start one on this machine."""
-    started = {
-        "num_cpus": workers,
-        "_memory": memory_limit,
-        "object_store_memory": _OBJECT_STORE_BYTES,
-        "include_dashboard": False,
-    }
-    ray.init(
-        address="local" if address is None else address,
-        logging_level="error",
-        log_to_driver=False,
-        runtime_env={"env_vars": ONE_THREAD},
-        **(started if address is None else {}),
-    )
 
 
 def _convert(work: Work, job: Job) -> ScanReport:

@@ -23,12 +23,7 @@ def describe_run(
 ) -> dict[str, Any]:
     """Return what is needed to make a result of one file again, ready for JSON.
 
-    Args:
-        source: The input file.
-        settings: The resolved settings.
-
-    Returns:
-        Versions, settings, name and SHA-256 of the input, device.
+    Versions, settings, name and SHA-256 of the input, device.
     """
     return {
         "versions": describe_versions(),

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.plan import Plan
 from torchrg.batch.records import describe_versions, read_record
 from torchrg.batch.scans import Job
 
@@ -26,6 +25,7 @@ class BatchReport:
         seconds: How long it took.
         engine: Which one.
         workers: How many scans at a time at most, None without a bound of ours.
+        interrupted: Whether it was stopped by Ctrl-C or SIGTERM.
     """
 
     scans: tuple[ScanReport, ...]
@@ -33,6 +33,12 @@ class BatchReport:
     seconds: float
     engine: str
     workers: int | None
+    interrupted: bool = False
+
+    @property
+    def disk_full(self) -> bool:
+        """Whether it stopped because there is no space left."""
+        return any(scan.disk_full for scan in self.scans)
 
     def with_status(self, status: str) -> list[ScanReport]:
         """Return the scans of a status."""
@@ -125,16 +131,6 @@ def format_report(report: BatchReport) -> str:
     rate = report.num_points / report.seconds if report.seconds else 0.0
     speed = f"{report.num_points:,} points in {report.seconds:,.1f} s: {rate:,.0f} points a second"
     return "\n".join([format_table(head, rows), *notes, speed])
-
-
-def format_plan(plan: Plan) -> str:
-    """Return what a plan would do: a row for each scan that is to be converted."""
-    rows = [
-        [job.scan.name, plan.reasons[job.scan.name], f"{job.scan.num_points:,}"]
-        for job in plan.to_convert
-    ]
-    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
-    return "\n".join([format_table(["scan", "why", "points (about)"], rows), sums])
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

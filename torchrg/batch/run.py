@@ -1,19 +1,23 @@
-"""Run a plan on an engine, and collect what becomes of each scan."""
+"""A batch: its plan, checked before the first scan, its run on an engine, and its lock."""
 
 import contextlib
 import json
 import os
 import platform
+import shutil
 import time
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
+from fnmatch import fnmatchcase
 from multiprocessing import reduction
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.plan import Plan
-from torchrg.batch.report import BatchReport, kept_report
-from torchrg.errors import FormatError
+from torchrg.batch.records import reason_to_convert
+from torchrg.batch.report import BatchReport, format_table, kept_report
+from torchrg.batch.scans import Job, Source
+from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
 
 REPORT = "report.json"
@@ -25,18 +29,103 @@ _PATIENCE_SECONDS = 5.0
 Reports = Generator[ScanReport | None, None, None]
 
 
-class Ending(NamedTuple):
-    """How a batch ended.
+class Plan(NamedTuple):
+    """The scans of a batch in natural order, and why each is to be converted, by name.
 
-    Attributes:
-        report: What became of the scans.
-        interrupted: Whether it was stopped by Ctrl-C or SIGTERM.
-        disk_full: Whether it stopped because there is no space left.
+    A scan that is done is not among the reasons.
     """
 
-    report: BatchReport
-    interrupted: bool
-    disk_full: bool
+    jobs: tuple[Job, ...]
+    reasons: dict[str, str]
+
+    @property
+    def to_convert(self) -> list[Job]:
+        """The jobs that are not done."""
+        return [job for job in self.jobs if job.scan.name in self.reasons]
+
+    @property
+    def done(self) -> list[Job]:
+        """The jobs that are."""
+        return [job for job in self.jobs if job.scan.name not in self.reasons]
+
+
+def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
+    """Return a job for each scan of a source, in natural order.
+
+    Args:
+        source: The data set.
+        out: Where results go.
+        only: Pattern of the names to convert, as in a shell; ``*`` matches slashes too.
+
+    Raises:
+        ConfigError: If no name matches the pattern, or results would go in among the scans.
+        FormatError: If the source has no scans.
+    """
+    if source.root in out.parents or (source.root == out and not source.in_place):
+        raise ConfigError(
+            f"{out}: expected a directory outside {source.root}, so that no result is read as a "
+            "scan; choose another."
+        )
+    scans = source.list_scans()
+    chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
+    if not chosen:
+        names = ", ".join(scan.name for scan in scans[:5])
+        more = f" and {len(scans) - 5:,} more" if len(scans) > 5 else ""
+        raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
+    return [Job(source, scan, out) for scan in chosen]
+
+
+def make_plan(
+    jobs: list[Job],
+    *,
+    force: bool = False,
+    threads: int = 1,
+    on_scan: Callable[[], object] = lambda: None,
+) -> Plan:
+    """Find out which scans are to be converted.
+
+    A scan is done if its record says what would be done now, from the same bytes, and its results
+    have not changed since: files are read to see, those of scans without a record are not.
+
+    So many ``threads`` look at a scan each; ``on_scan`` is called when one has been looked at. With
+    ``force``, those that are done are converted too.
+    """
+
+    def look(job: Job) -> str:
+        reason = "forced" if force else reason_to_convert(job)
+        on_scan()
+        return reason
+
+    with ThreadPoolExecutor(threads) as pool:
+        reasons = list(pool.map(look, jobs))
+    named = {job.scan.name: reason for job, reason in zip(jobs, reasons, strict=True) if reason}
+    return Plan(tuple(jobs), named)
+
+
+def check_space(plan: Plan) -> None:
+    """Raise FormatError if the disk has no room for the results, by the estimates of the scans."""
+    if not plan.to_convert:
+        return
+    source, out = plan.jobs[0].source, plan.jobs[0].out
+    needed = source.bytes_per_point * sum(job.scan.num_points for job in plan.to_convert)
+    existing = next(place for place in (out, *out.absolute().parents) if place.exists())
+    free = shutil.disk_usage(existing).free
+    if needed > free:
+        raise FormatError(
+            f"{out}: expected about {needed / 1e6:,.1f} MB of free disk for "
+            f"{len(plan.to_convert):,} scans, got {free / 1e6:,.1f} MB; make room, choose another "
+            "directory, or convert fewer with --only."
+        )
+
+
+def format_plan(plan: Plan) -> str:
+    """Return what a plan would do: a row for each scan that is to be converted."""
+    rows = [
+        [job.scan.name, plan.reasons[job.scan.name], f"{job.scan.num_points:,}"]
+        for job in plan.to_convert
+    ]
+    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
+    return "\n".join([format_table(["scan", "why", "points (about)"], rows), sums])
 
 
 def run_plan(
@@ -46,22 +135,18 @@ def run_plan(
     engine: str,
     workers: int | None,
     on_report: Callable[[ScanReport | None], None] = lambda report: None,
-) -> Ending:
+) -> BatchReport:
     """Convert the scans of a plan that are not done.
 
     A full disk ends the batch, as every further scan would fail after its work; so does an
     interrupt. What is complete stays, and the next run goes on from there.
 
-    Args:
-        plan: The plan.
-        reports: The engine at work: reports as scans end, None in between.
-        engine: Its name, for the report.
-        workers: Most scans at a time, for the report.
-        on_report: Called with everything that the engine yields.
+    ``reports`` are those of the engine at work, as scans end, None in between; ``on_report`` is
+    called with each. ``engine`` and ``workers`` are noted in the report.
     """
     started, begin = time.time(), time.perf_counter()
     found = {job.scan.name: kept_report(job) for job in plan.done}
-    interrupted = disk_full = False
+    interrupted = False
     try:
         with contextlib.closing(reports):
             for report in reports:
@@ -69,7 +154,6 @@ def run_plan(
                 if report is not None:
                     found[report.name] = report
                     if report.disk_full:
-                        disk_full = True
                         break
     except KeyboardInterrupt:
         interrupted = True
@@ -78,8 +162,7 @@ def run_plan(
         for job in plan.jobs
     ]
     seconds = time.perf_counter() - begin
-    whole = BatchReport(tuple(scans), started, seconds, engine, workers)
-    return Ending(whole, interrupted, disk_full)
+    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
 
 
 def write_report(out: Path, report: BatchReport) -> None:

@@ -81,10 +81,7 @@ class Source(Protocol):
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read a scan, segment it, and write its results, each file whole or not at all.
 
-        Args:
-            scan: One of :meth:`list_scans`.
-            folder: Where its results go; it exists.
-            begin: To be called with the name of each stage when it starts.
+        The folder exists; ``begin`` is to be called with the name of each stage when it starts.
         """
 
 
@@ -129,15 +126,9 @@ def write_results(
 ) -> list[str]:
     """Write ``coord``, ``normal``, ``curvature``, ``plane`` as ``.npy``, and ``planes.json``.
 
-    Args:
-        folder: Where; it exists.
-        coord: Coordinates, shape ``(*, 3)``, in the dtype to be written.
-        segmentation: What was found there, of the same leading axes.
-        fields: Further arrays by name.
-        origin: Where the origin of the segmentation is, in the coordinates of ``coord``.
-
-    Returns:
-        Names of the files.
+    Into a folder that exists; ``coord`` ``(*, 3)`` in the dtype to be written, the segmentation of
+    the same leading axes, further ``fields`` by name. ``origin`` is where the origin of the
+    segmentation is, in the coordinates of ``coord``. Returns the names of the files.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,

@@ -1,7 +1,7 @@
 """The kinds of data sets that are converted.
 
-A new kind is a :class:`~torchrg.batch.scans.Source` here with a row of :data:`SOURCES`, its
-arguments in ``torchrg.cli.convert``, and a test; a source of your own needs no row.
+A new kind is a :class:`~torchrg.batch.scans.Source` here, its arguments in ``torchrg.cli.convert``,
+and a test.
 """
 
 import struct
@@ -13,12 +13,11 @@ from typing import Any, ClassVar
 import torch
 
 from torchrg._optional import require
-from torchrg.batch.scans import Converted, Scan, Source, check_finite, write_results
+from torchrg.batch.scans import Converted, Scan, check_finite, write_results
 from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,
     FolderOfClouds,
-    RoomReport,
     Scene,
     read_pointcept_scene,
     read_room,
@@ -70,7 +69,7 @@ class FolderSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return _options(self, "superpoint")
+        return {"kind": "folder", "superpoint": self.superpoint}
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
@@ -141,7 +140,7 @@ class S3DISSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return _options(self, "class_order", "superpoint")
+        return {"kind": "s3dis", "class_order": self.class_order, "superpoint": self.superpoint}
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -154,7 +153,11 @@ class S3DISSource:
         begin("read")
         room = read_room(self.root / scan.name, class_order=self.class_order)
         cloud = Cloud(room.coord, source=scan.name)
-        notes = (*check_finite(cloud), *_notes(room.report))
+        notes = [
+            *check_finite(cloud),
+            *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
+            *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
+        ]
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         begin("write")
         arrays, origin = room._asdict(), cloud.origin.tolist()
@@ -165,7 +168,7 @@ class S3DISSource:
             f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
             for r in room.report.repairs
         )
-        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, notes)
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, tuple(notes))
 
 
 def find_areas(root: Path) -> tuple[int, ...]:
@@ -178,12 +181,6 @@ def _estimate(scene: Scene) -> int:
     sizes = {file: file.stat().st_size for file in scene.files}
     largest = max(sizes, key=lambda file: sizes[file])
     return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
-
-
-def _notes(report: RoomReport) -> tuple[str, ...]:
-    """Return what was passed over in a room, a line each."""
-    skipped = [f"{item.file.name} not read: {item.reason}" for item in report.skipped]
-    return (*skipped, *(f"{file.name} taken as clutter" for file in report.as_clutter))
 
 
 @dataclass(frozen=True)
@@ -213,7 +210,12 @@ class RGBDSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return _options(self, "layout", "intrinsics", "depth_scale")
+        return {
+            "kind": "rgbd",
+            "layout": self.layout,
+            "intrinsics": self.intrinsics,
+            "depth_scale": self.depth_scale,
+        }
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
@@ -262,14 +264,8 @@ def _num_pixels(path: Path) -> int:
 
 def _plain(frame: RGBDFrame) -> dict[str, Any]:
     """Return a frame as plain values."""
-    return {
-        "depth": frame.depth,
-        "intrinsics": frame.intrinsics.tolist(),
-        "depth_scale": frame.depth_scale,
-        "name": frame.name,
-        "pose": None if frame.pose is None else frame.pose.tolist(),
-        "no_depth": frame.no_depth,
-    }
+    pose = None if frame.pose is None else frame.pose.tolist()
+    return vars(frame) | {"intrinsics": frame.intrinsics.tolist(), "pose": pose}
 
 
 def _frame(values: dict[str, Any]) -> RGBDFrame:
@@ -279,17 +275,3 @@ def _frame(values: dict[str, Any]) -> RGBDFrame:
         for name in ("intrinsics", "pose")
     }
     return RGBDFrame(**(values | matrices))
-
-
-SOURCES: dict[str, type[Source]] = {
-    "folder": FolderSource,
-    "s3dis": S3DISSource,
-    "rgbd": RGBDSource,
-}
-"""Sources by the kind that records and ``torchrg convert`` call them."""
-
-
-def _options(source: Source, *names: str) -> dict[str, Any]:
-    """Return the kind of a source and those of its options that decide results."""
-    kind = next(kind for kind, known in SOURCES.items() if isinstance(source, known))
-    return {"kind": kind, **{name: getattr(source, name) for name in names}}

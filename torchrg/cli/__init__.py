@@ -16,6 +16,15 @@ COMMANDS = {
     "info": "say what a file holds",
 }
 """Commands by name, each with a module of the same name, and what they do."""
+_OVERVIEW = """usage: torchrg COMMAND ...
+
+Normals, curvature and plane labels for indoor point clouds.
+
+{}
+
+torchrg COMMAND --help says more. torchrg --version prints the version.""".format(
+    "\n".join(f"  {name:<9}{purpose}" for name, purpose in COMMANDS.items())
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview())
+        print(_OVERVIEW)
         return 0 if arguments else USAGE_ERROR
     name, *rest = arguments
     if name == "--version":
@@ -42,16 +51,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         return fail(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
     return _run(name, rest)
-
-
-def _overview() -> str:
-    """Return the help that lists the commands."""
-    rows = "\n".join(f"  {name:<9}{purpose}" for name, purpose in COMMANDS.items())
-    return (
-        "usage: torchrg COMMAND ...\n\n"
-        "Normals, curvature and plane labels for indoor point clouds.\n\n"
-        f"{rows}\n\ntorchrg COMMAND --help says more. torchrg --version prints the version."
-    )
 
 
 def _run(name: str, arguments: list[str]) -> int:

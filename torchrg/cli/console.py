@@ -179,3 +179,25 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
             raise FormatError(f"{source}: another input has the same name; run them one by one.")
     out.mkdir(parents=True, exist_ok=True)
     return results
+
+
+def picture_paths(results: Sequence[Path], picture: Path | None) -> list[Path | None]:
+    """Return where the picture of each result goes, by the rules of :func:`output_paths`."""
+    if picture is None:
+        return [None] * len(results)
+    if len(results) == 1 and not picture.is_dir():
+        check_picture(picture)
+        return [picture]
+    if picture.suffix.lower() == ".png" and not picture.is_dir():
+        raise FormatError(
+            f"{picture}: expected a directory for {len(results)} pictures, got a file name."
+        )
+    picture.mkdir(parents=True, exist_ok=True)
+    return [picture / f"{path.stem}.png" for path in results]
+
+
+def check_picture(path: Path) -> None:
+    """Raise FormatError before long work if a picture has no place, or is no .png file."""
+    if path.suffix.lower() != ".png":
+        raise FormatError(f"{path}: expected a file that ends in .png.")
+    check_place(path)

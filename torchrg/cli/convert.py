@@ -15,10 +15,20 @@ from tqdm import tqdm
 
 from torchrg.batch.convert import ScanReport
 from torchrg.batch.local import run_local
-from torchrg.batch.memory import SHARE, available_memory
-from torchrg.batch.plan import Plan, check_space, list_jobs, make_plan, too_large
-from torchrg.batch.report import format_plan, format_report
-from torchrg.batch.run import REPORT, DirectoryLock, Ending, Reports, run_plan, write_report
+from torchrg.batch.memory import SHARE, available_memory, memory_of_scan
+from torchrg.batch.report import BatchReport, format_report
+from torchrg.batch.run import (
+    REPORT,
+    DirectoryLock,
+    Plan,
+    Reports,
+    check_space,
+    format_plan,
+    list_jobs,
+    make_plan,
+    run_plan,
+    write_report,
+)
 from torchrg.batch.scans import Job, Source
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli import console
@@ -178,12 +188,13 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     check_space(plan)
     given = arguments.limit_memory
     limit = int(SHARE * available_memory() if given is None else given * 1e9)
-    for job in too_large(plan, limit):
-        console.warn(
-            f"{job.scan.name}: about {job.scan.num_points:,} points may need more memory than "
-            f"{limit / 1e9:.1f} GB; it runs alone."
-        )
     jobs, workers = plan.to_convert, arguments.workers
+    for scan in (job.scan for job in jobs):
+        if memory_of_scan(scan.num_points) > limit:
+            console.warn(
+                f"{scan.name}: about {scan.num_points:,} points may need more memory than "
+                f"{limit / 1e9:.1f} GB; it runs alone."
+            )
     if arguments.engine == "local":
         workers = min(workers or _num_cores(), max(len(jobs), 1))
         reports: Reports = run_local(jobs, workers=workers, memory_limit=limit, lock=lock)
@@ -195,8 +206,8 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
     with tqdm(total=total, unit="pt", unit_scale=True, smoothing=0, disable=None) as bar:
         shown, engine = _Progress(bar, plan), arguments.engine
-        ending = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
-    return _finish(ending, out)
+        report = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
+    return _finish(report, out)
 
 
 class _Progress:
@@ -217,9 +228,8 @@ class _Progress:
         self.bar.set_description_str(f"{self.num_done}/{len(self.sizes)} scans{failed}")
 
 
-def _finish(ending: Ending, out: Path) -> int:
+def _finish(report: BatchReport, out: Path) -> int:
     """Write and print the report, and return the exit code."""
-    report = ending.report
     print(format_report(report))
     for scan in report.with_status("failed"):
         console.fail(f"{scan.name}: {scan.reason}")
@@ -228,14 +238,14 @@ def _finish(ending: Ending, out: Path) -> int:
     try:
         write_report(out, report)
     except FormatError as error:
-        if not ending.disk_full:
+        if not report.disk_full:
             raise
         console.warn(str(error))
     again = "same command goes on from here."
-    if ending.disk_full:
+    if report.disk_full:
         message = f"{out}: the disk is full; {state}. Make room, and the {again}"
         return console.fail(message, code=console.SOME_FAILED)
-    if ending.interrupted:
+    if report.interrupted:
         message = f"interrupted; {state}. The {again}"
         return console.fail(message, code=console.INTERRUPTED)
     if num_done < len(report.scans):

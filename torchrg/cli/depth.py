@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchrg.batch.records import describe_run
 from torchrg.cli import console
-from torchrg.cli.picture import picture_paths
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
 from torchrg.depth import (
     DepthConfig,
@@ -25,7 +24,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
 from torchrg.render import color_planes, write_png
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import Cloud
 
 
 @dataclass(frozen=True)
@@ -59,12 +58,12 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(Arguments, argv, prog="torchrg depth")
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out, suffix=".png")
-    pictures = picture_paths(outputs, arguments.picture)
+    pictures = console.picture_paths(outputs, arguments.picture)
     return console.run_each(_segment_image, arguments, outputs, pictures)
 
 
 def _segment_image(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
-    """Segment one image."""
+    """Segment one image, write its result and print one line about it."""
     begin = time.perf_counter()
     cloud, depth, intrinsics = _read_frame(source, arguments)
     is_image = target.suffix.lower() == ".png"
@@ -88,7 +87,15 @@ def _segment_image(arguments: Arguments, source: Path, target: Path, picture: Pa
     if picture is not None:
         colors = color_planes(seg.labels, cloud.points.view(*depth.shape, 3))
         write_png(picture, colors * (depth > 0)[..., None])
-    _report(source, target, depth, seg, time.perf_counter() - begin)
+    num_planes, num_pixels = len(seg.planes.count), int((depth > 0).sum())
+    if num_planes == 0:
+        console.warn(f"{source}: no plane found: no region is large enough.")
+    share = 100 * int((seg.labels >= 0).sum()) / max(num_pixels, 1)
+    height, width = depth.shape
+    print(
+        f"{source}: {width} x {height} pixels, {num_pixels:,} with depth, {num_planes:,} planes, "
+        f"{share:.1f} % of these labelled, {time.perf_counter() - begin:.1f} s -> {target}"
+    )
 
 
 def _read_frame(source: Path, arguments: Arguments) -> tuple[Cloud, Tensor, Tensor]:
@@ -123,16 +130,3 @@ def _read_organised(source: Path, camera: Tensor | None) -> tuple[Cloud, Tensor,
         )
     depth = points[..., 2]
     return cloud, torch.where(depth.isfinite(), depth, 0.0), camera
-
-
-def _report(source: Path, target: Path, depth: Tensor, seg: Segmentation, seconds: float) -> None:
-    """Print one line about a result, and a warning if it is empty."""
-    num_planes, num_pixels = len(seg.planes.count), int((depth > 0).sum())
-    if num_planes == 0:
-        console.warn(f"{source}: no plane found: no region is large enough.")
-    share = 100 * int((seg.labels >= 0).sum()) / max(num_pixels, 1)
-    height, width = depth.shape
-    print(
-        f"{source}: {width} x {height} pixels, {num_pixels:,} with depth, {num_planes:,} planes, "
-        f"{share:.1f} % of these labelled, {seconds:.1f} s -> {target}"
-    )

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from torchrg.cli.console import parse
 from torchrg.io import read_cloud
@@ -44,17 +43,12 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         facts["extent"] = " ".join(f"{value:.6g}" for value in high - low)
         places = np.unique(kept - cloud.origin, axis=0)
         facts["duplicates"] = f"{len(kept) - len(places):,}"
-        facts["spacing"] = _median_spacing(places)
+        facts["spacing"] = "none"
+        if len(places) > 1:
+            nearest = places[search_knn(places, 2).indices[:, 1].numpy()]
+            spacing = np.median(np.linalg.norm(places - nearest, axis=1))
+            facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
     for name, values in cloud.fields.items():
         shape = " x ".join(map(str, values.shape[1:])) or "1"
         facts[name] = f"{shape} {values.dtype}"
     return facts
-
-
-def _median_spacing(places: NDArray[np.floating]) -> str:
-    """Return the median distance to the nearest other place, in the unit of the cloud."""
-    if len(places) < 2:
-        return "none"
-    nearest = places[search_knn(places, 2).indices[:, 1].numpy()]
-    spacing = np.median(np.linalg.norm(places - nearest, axis=1))
-    return f"{spacing:.4g} (median to the nearest point)"

@@ -76,7 +76,10 @@ def run(argv: list[str]) -> int:
         return 0
     if predicted.is_dir():
         _print_scans(scans)
-    _print_scores(scores)
+    for part, values in scores.items():
+        print(part)
+        for name, value in values.items():
+            print(f"  {name:<22}{_spelled(value)}")
     return 0
 
 
@@ -194,14 +197,6 @@ def _print_scans(scans: dict[str, Scores]) -> None:
     ]
     print(format_table(["scan", *(name for _, name in columns)], rows))
     print(f"\nmean of {len(scans):,} scans")
-
-
-def _print_scores(scores: Scores) -> None:
-    """Print all indices of a scan, one in a line."""
-    for part, values in scores.items():
-        print(part)
-        for name, value in values.items():
-            print(f"  {name:<22}{_spelled(value)}")
 
 
 def _spelled(value: float | None) -> str:

@@ -12,11 +12,10 @@ from tqdm import tqdm
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
-from torchrg.cli.picture import draw_segmentation, picture_paths
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
-from torchrg.structures import Cloud, Segmentation
+from torchrg.render import color_planes, render_cloud, write_png
 from torchrg.transforms import segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -55,7 +54,7 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(Arguments, argv, prog="torchrg segment", default=start)
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out)
-    pictures = picture_paths(outputs, arguments.picture)
+    pictures = console.picture_paths(outputs, arguments.picture)
     return console.run_each(_segment_file, arguments, outputs, pictures)
 
 
@@ -74,7 +73,7 @@ def _refuse_images(argv: list[str]) -> None:
 
 
 def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
-    """Segment one file, with a progress bar on a terminal."""
+    """Segment one file, with a progress bar on a terminal and one line about the result."""
     begin = time.perf_counter()
     cloud = read_cloud(source)
     for note in check_finite(cloud):
@@ -94,12 +93,9 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
     provenance = describe_run(source, settings) | ({} if voxel is None else {"voxel": voxel})
     write_cloud(target, cloud, seg, provenance=provenance)
     if picture is not None:
-        draw_segmentation(picture, cloud, seg)
-    _report(source, target, cloud, seg, time.perf_counter() - begin)
-
-
-def _report(source: Path, target: Path, cloud: Cloud, seg: Segmentation, seconds: float) -> None:
-    """Print one line about a result, and a warning if it is empty."""
+        colors = color_planes(seg.labels, cloud.points)
+        write_png(picture, render_cloud(cloud.points, colors, normals=seg.normals))
+    seconds = time.perf_counter() - begin
     num_planes = len(seg.planes.count)
     if num_planes == 0:
         kept = cloud.coordinates[cloud.finite]

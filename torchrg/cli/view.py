@@ -8,8 +8,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchrg.cli.console import parse
-from torchrg.cli.picture import check_picture
+from torchrg.cli.console import check_picture, parse
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud
 from torchrg.render import (

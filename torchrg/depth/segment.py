@@ -6,9 +6,8 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.config import DepthConfig
 from torchrg.depth.camera import depth_to_points, has_depth
-from torchrg.depth.growth import grow_pixels
+from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import PixelPlanes, fit_pixels
-from torchrg.depth.refine import InverseCloud
 from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 

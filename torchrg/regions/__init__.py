@@ -1,6 +1,6 @@
 """Regions: which neighbours join, growth, and the table of planes."""
 
 from torchrg.regions.growth import grow_regions
-from torchrg.regions.planes import planes_to_json, planes_to_rows, summarize_planes
+from torchrg.regions.planes import summarize_planes
 
-__all__ = ["grow_regions", "planes_to_json", "planes_to_rows", "summarize_planes"]
+__all__ = ["grow_regions", "summarize_planes"]

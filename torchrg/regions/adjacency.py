@@ -43,16 +43,9 @@ def find_adjacency(
     :math:`\rho` and n edges from each point a curve of length L meets edges with
     :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy and Crofton) [1].
 
-    Args:
-        points: Points, shape ``(N, 3)``.
-        labels: Region of each point, shape ``(N,)``: 0 to M-1 or negative.
-        neighbors: Neighbours of each point.
-        normal: Unit normals of the planes, shape ``(M, 3)``.
-        thickness: Standard deviation of the points from the planes, shape ``(M,)``.
-        curved: Regions that are not flat, shape ``(M,)``, bool.
-
-    Returns:
-        The pairs, in float64. Regions that touch in less than three edges do not meet.
+    The planes have unit normals ``(M, 3)`` and a standard deviation of their points
+    (``thickness``, ``(M,)``); ``curved`` tells which regions are not flat. The pairs are in
+    float64; regions that touch in less than three edges do not meet.
 
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
@@ -70,32 +63,22 @@ def find_adjacency(
     reach = (_REACH * thickness[pairs].amax(dim=1))[on_curves.pair]
     flat = across.abs().amax(dim=0) <= torch.maximum(reach, _MAX_STEEPNESS * spacing)
     on_curves = _select(on_curves, flat)
+    size = edge.norm(dim=1)
+    share = math.pi**2 * spacing * spacing / (2 * num_nearest * num_nearest * size)
+    share = torch.where(size > 0, share, 0.0)
     num_contacts = torch.bincount(torch.cat([on_lines.pair, on_curves.pair]), minlength=len(pairs))
     along = torch.linalg.cross(first, second)
     length = torch.where(
         crossing,
         _length_on_line(points, on_lines, along / along.norm(dim=1, keepdim=True), len(pairs)),
-        _length_by_crossings(
-            on_curves.pair, edge[flat].norm(dim=1), spacing[flat], num_nearest[flat], len(pairs)
-        ),
+        _sum_of(on_curves.pair, share[flat], len(pairs)),
     )
     kept = num_contacts >= _LEAST_CONTACTS
     return PlaneAdjacency(pairs[kept], length[kept], angle[kept])
 
 
 def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the nearest neighbours of each point, and which of these entries count.
-
-    Args:
-        neighbors: Neighbours, by distance, the point itself first.
-
-    Returns:
-        Rows ``(N, n)``, int64, and mask ``(N, n)``, with n = 8 or what there is.
-
-    Example:
-        >>> contact_neighbors(Neighbors(torch.tensor([[0, 1], [1, 0]])))[0].tolist()
-        [[1], [0]]
-    """
+    """Return the (at most) 8 nearest neighbours of each point ``(N, n)``, and which count."""
     nearest = neighbors.indices[:, 1 : _NUM_CONTACTS + 1].long()
     if neighbors.valid is None:
         return nearest, torch.ones_like(nearest, dtype=torch.bool)
@@ -105,17 +88,8 @@ def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
 def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
     """Return the pairs of regions that touch, and the number of contacts of each pair.
 
-    Args:
-        labels: Region of each point, shape ``(N,)``, negative for none.
-        neighbors: Neighbours of each point.
-
-    Returns:
-        Pairs ``(E, 2)``, the smaller label first, ascending, and counts ``(E,)``.
-
-    Example:
-        >>> neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
-        >>> count_contacts(torch.tensor([0, 1, 1]), neighbors)
-        (tensor([[0, 1]]), tensor([2]))
+    Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending, and
+    counts ``(E,)``.
     """
     pairs, contacts = _find_contacts(labels, *contact_neighbors(neighbors))
     return pairs, torch.bincount(contacts.pair, minlength=len(pairs))
@@ -179,14 +153,6 @@ def _length_on_line(points: Tensor, contacts: _Contacts, along: Tensor, num_pair
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     steps = _sum_of(owner, is_next, num_pairs)
     return steps * torch.where(size.isfinite(), size, 0.0)
-
-
-def _length_by_crossings(
-    pair: Tensor, length: Tensor, radius: Tensor, num_nearest: Tensor, num_pairs: int
-) -> Tensor:
-    """Return the length of the curve that each pair's edges cross, shape ``(E,)``."""
-    share = math.pi**2 * radius * radius / (2 * num_nearest * num_nearest * length)
-    return _sum_of(pair, torch.where(length > 0, share, 0.0), num_pairs)
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -31,10 +31,8 @@ _CHUNKS_A_THREAD = 4
 class EdgeLists(NamedTuple):
     """Edges of a directed graph in compressed rows.
 
-    Attributes:
-        starts: The edges of point i are ``starts[i]`` to ``starts[i + 1]``, shape ``(N + 1,)``.
-        targets: Targets (or codes of targets), shape ``(capacity,)``, of which ``starts[N]`` are
-            used: what is behind them is room for more.
+    The edges of point i are ``starts[i]`` to ``starts[i + 1]``. Of the targets, or codes of
+    targets, ``starts[N]`` are used: what is behind them is room for more.
     """
 
     starts: NDArray[np.signedinteger]
@@ -174,12 +172,7 @@ def checked_cloud(
     colors: Tensor | NDArray[np.generic] | None,
     residual_rms: Tensor | NDArray[np.floating] | None,
 ) -> GrowingCloud:
-    """Check what the user passed to :func:`torchrg.grow_regions`, in the order it came in.
-
-    Raises:
-        ShapeError: If a shape, dtype or device is not as that function says.
-        ConfigError: If the settings ask for colours or residuals, and there are none.
-    """
+    """Check what the user passed to :func:`torchrg.grow_regions`, in the order it came in."""
     caller = "grow_regions"
     points = as_tensor(caller, "points", points).detach()
     normals = as_tensor(caller, "normals", normals).detach()

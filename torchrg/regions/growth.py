@@ -104,17 +104,8 @@ def grow_regions(
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, those of equal size by their first point.
 
-    Args:
-        regions: Any number below N that is the same in a region and another elsewhere, -1 for
-            none, shape ``(N,)``.
-        min_size: Smaller regions get :data:`torchrg.UNLABELED`.
-
-    Returns:
-        Labels, shape ``(N,)``, int64.
-
-    Example:
-        >>> number_by_size(torch.tensor([3, 1, 1, 3, -1, 2, 1]), 2)
-        tensor([ 1,  0,  0,  1, -1, -1,  0])
+    ``regions`` ``(N,)`` holds any number below N that is the same in a region and another
+    elsewhere, -1 for none. Regions smaller than ``min_size`` become :data:`torchrg.UNLABELED`.
     """
     heads = regions.cpu().numpy()
     placed = np.flatnonzero(heads >= 0)

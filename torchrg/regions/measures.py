@@ -22,11 +22,8 @@ it: 0.5, 1 and 1.5 times pi, and another pi that the range of angles begins belo
 class Rectangles(NamedTuple):
     """Rectangles about M regions.
 
-    Attributes:
-        sides: Length of the long and of the short side, shape ``(M, 2)``.
-        directions: Unit directions of the long and of the short side in the plane's coordinates,
-            shape ``(M, 2, 2)``.
-        center: Center of each rectangle, shape ``(M, 2)``, along those directions.
+    Lengths of the long and of the short side, shape ``(M, 2)``; their unit directions in the
+    plane's coordinates, ``(M, 2, 2)``; and the centers, ``(M, 2)``, along those directions.
     """
 
     sides: Tensor
@@ -37,16 +34,9 @@ class Rectangles(NamedTuple):
 def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     """Find the rectangle of least area about each region.
 
-    One of its sides runs along an edge of the region's convex hull [1].
-
-    Args:
-        segments: The regions.
-        u: First coordinate in the plane, in the order of :meth:`Segments.take`, finite.
-        v: Second coordinate.
-
-    Returns:
-        The rectangles; of equally small ones that with the least angle to the coordinates. A region
-        on one line has a short side of 0, one of one place two.
+    One of its sides runs along an edge of the region's convex hull [1]. Of equally small ones it is
+    that with the least angle to the coordinates ``u`` and ``v`` in the plane, given in the order of
+    :meth:`Segments.take`. A region on one line has a short side of 0, one of one place two.
 
     References:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
@@ -130,15 +120,8 @@ def covered_areas(
     Cells along the outline are only partly covered: the expected excess is taken off. The area
     never exceeds that of the rectangle about the region.
 
-    Args:
-        segments: The regions.
-        u: First coordinate in the plane, in the order of :meth:`Segments.take`.
-        v: Second coordinate.
-        boxes: Rectangles about the regions.
-
-    Returns:
-        Areas, shape ``(M,)``, 0 where the points are on one line; and the width of cells that
-        leaves no holes between points, shape ``(M,)``.
+    Returns areas ``(M,)``, 0 where the points are on one line, and the width of cells that leaves
+    no holes between points ``(M,)``.
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()
@@ -219,13 +202,9 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     The points near an edge, found with square cells, are triangulated. Triangles over cells without
     points are left out, and the others united.
 
-    Args:
-        places: Points, shape ``(n, 2)``.
-        width: Width of the cells: holes and dents narrower than this are filled.
-
-    Returns:
-        Rings of shape ``(V, 2)``, the first point not repeated: outer ones counter-clockwise, holes
-        clockwise. None where the points are on one line.
+    Holes and dents narrower than ``width``, that of the cells, are filled. Outer rings ``(V, 2)``,
+    the first point not repeated, run counter-clockwise, holes clockwise; points on one line have
+    none.
 
     Raises:
         MissingDependencyError: If shapely is not installed.

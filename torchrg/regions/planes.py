@@ -1,9 +1,8 @@
 """The plane table: one plane fitted to each region, measured and classified."""
 
-import json
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,7 +32,8 @@ _SAME_MAGNITUDE = 1e-6
 """Components of a normal that differ by less than this share are equal but for rounding."""
 
 _CURVED_SPREAD_DEG = 8.0
-"""A smooth bend by three to four times this angle has this spread."""
+"""Root mean square angle of a region's normals to the direction they share, from which on it is
+curved: a smooth bend by three to four times this angle has this spread, a full column 45."""
 
 _MAX_TILT_DEG = 15.0
 """A floor or ceiling is within this angle of horizontal, a wall of vertical."""
@@ -119,7 +119,7 @@ def summarize_planes(
     first, second = _plane_axes(fit)
     places, centers = segments.take_columns(points), segments.spread_columns(fit.center)
     centered = [place - center for place, center in zip(places, centers, strict=True)]
-    u, v = (sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
+    u, v = (_sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)
@@ -186,40 +186,32 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
     (1.4826 times their median), so that points of another surface do not tilt the plane.
 
-    Args:
-        segments: The regions.
-        points: Points, shape ``(N, 3)``.
-        normals: Unit normals of any sign, shape ``(N, 3)``: they decide where points do not, in
-            regions of one or two points or along a line.
-
-    Returns:
-        The planes. The normal's component of largest magnitude, of equal ones the last, is
-        positive.
+    ``normals`` of any sign decide where points do not, in regions of one or two points or along a
+    line. Of a plane's normal the component of largest magnitude, of equal ones the last, is
+    positive.
 
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
-
-    Example:
-        >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [0.5, 0.5, 2.5]])
-        >>> segments = Segments(torch.zeros(5, dtype=torch.int64))
-        >>> fit_planes(segments, points, torch.eye(3)[[2] * 5]).normal.tolist()
-        [[0.0, 0.0, 1.0]]
     """
-    shares, directions = shared_moments(segments, normals)
-    usual, curved = directions[:, :, 2], _spread_deg(shares[:, 2]) > _CURVED_SPREAD_DEG
+    columns = segments.take_columns(normals)
+    shares, directions = eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
+    # The direction that the normals of a region share, signs aside, and their angle to it.
+    usual = directions[:, :, 2]
+    spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
     origin = segments.first(points).double()
     starts = segments.spread_columns(origin)
     local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
     resolution = coordinate_resolution(segments.first(points)).double()
     weights = torch.ones_like(local[0])
     for last in range(_NUM_FITS):
-        mean = _means(segments, local, weights)
+        total = segments.sum(weights)
+        mean = torch.stack([segments.sum(x * weights) / total for x in local], dim=1)
         middle = segments.spread_columns(mean)
         centered = [x - m for x, m in zip(local, middle, strict=True)]
         covariance = _covariances(segments, centered, weights)
         variances, axes = eigh3_of_few(covariance)
         normal = _with_sign(_plane_normals(variances, axes, usual))
-        residuals = sum_of_products(centered, segments.spread_columns(normal))
+        residuals = _sum_of_products(centered, segments.spread_columns(normal))
         thickness = MAD_FACTOR * segments.median(residuals.abs())
         if last == _NUM_FITS - 1:
             break
@@ -228,38 +220,14 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
     along = axes[:, :, 2]
-    center, sizes = origin + mean, segments.counts
+    center, sizes, curved = origin + mean, segments.counts, spread > _CURVED_SPREAD_DEG
     return FittedPlanes(normal, center, along, covariance, thickness, residuals, sizes, curved)
 
 
-def _spread_deg(share: Tensor) -> Tensor:
-    """Return the root mean square angle of normals to the direction they share, signs aside.
-
-    From the largest eigenvalue of their second moments, shape ``(M,)``: of an arc of 30 degrees
-    8.7, of a full column 45.
-    """
-    return (1 - share).clamp(min=0, max=1).sqrt().asin().rad2deg()
-
-
-def sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
+def _sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
     """Return the scalar products of vectors given by columns."""
     (a, b, c), (x, y, z) = first, second
     return a * x + b * y + c * z
-
-
-def shared_moments(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Return eigenvalues and eigenvectors of the normals' second moments, in ascending order.
-
-    The last eigenvector is the direction that the normals of a region share, signs aside.
-    """
-    columns = segments.take_columns(normals)
-    return eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
-
-
-def _means(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
-    """Return weighted means, shape ``(M, 3)``."""
-    total = segments.sum(weights)
-    return torch.stack([segments.sum(column * weights) / total for column in columns], dim=1)
 
 
 def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
@@ -336,63 +304,3 @@ def _outlines(
         lifted = (center + ring[:, :1] * first + ring[:, 1:] * second for ring in rings)
         outlines.append(tuple(ring.to(dtype) for ring in lifted))
     return tuple(outlines)
-
-
-def planes_to_rows(planes: Planes) -> list[dict[str, Any]]:
-    """Return the plane table as one mapping for each plane, for ``pandas.DataFrame(rows)``.
-
-    Args:
-        planes: The table.
-
-    Returns:
-        Rows with the label and plain numbers and lists by the names of :class:`Planes`. ``kind``
-        is a word, ``outline`` a list of rings, ``neighbors`` a list of planes that this one meets
-        with ``plane``, ``boundary_length`` and ``dihedral_deg``; they are left out where the table
-        does not have them.
-
-    Example:
-        >>> import torch
-        >>> from torchrg.regions.planes import summarize_planes
-        >>> points, labels = torch.eye(3), torch.zeros(3, dtype=torch.int64)
-        >>> rows = planes_to_rows(summarize_planes(points, torch.eye(3), labels))
-        >>> rows[0]["label"], rows[0]["count"], rows[0]["curved"]
-        (0, 3, True)
-    """
-    names = [name for name in planes._fields if name not in planes._field_defaults]
-    columns = {name: getattr(planes, name).tolist() for name in names}
-    rows: list[dict[str, Any]] = [
-        {"label": label, **{name: values[label] for name, values in columns.items()}}
-        for label in range(len(planes.offset))
-    ]
-    for label, row in enumerate(rows):
-        if planes.kind is not None:
-            row["kind"] = PLANE_KINDS[int(planes.kind[label])]
-        if planes.outline is not None:
-            row["outline"] = [ring.tolist() for ring in planes.outline[label]]
-        if planes.adjacency is not None:
-            row["neighbors"] = []
-    if planes.adjacency is not None:
-        for (a, b), *values in zip(*(part.tolist() for part in planes.adjacency), strict=True):
-            found = dict(zip(("boundary_length", "dihedral_deg"), values, strict=True))
-            rows[a]["neighbors"].append({"plane": b, **found})
-            rows[b]["neighbors"].append({"plane": a, **found})
-    return rows
-
-
-def planes_to_json(planes: Planes) -> str:
-    """Return the plane table as JSON text: ``{"planes": [...]}`` with the rows.
-
-    Args:
-        planes: The table.
-
-    Returns:
-        The text.
-
-    Example:
-        >>> import torch
-        >>> from torchrg.regions.planes import summarize_planes
-        >>> planes = summarize_planes(torch.eye(3), torch.eye(3), torch.zeros(3).int())
-        >>> json.loads(planes_to_json(planes))["planes"][0]["count"]
-        3
-    """
-    return json.dumps({"planes": planes_to_rows(planes)})

@@ -19,15 +19,10 @@ _LEAST_CONTACTS = 3
 
 
 def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
-    """Apply the steps after growth that the settings ask for.
+    """Apply the steps after growth that the settings ask for to a cloud in canonical order.
 
-    Args:
-        cloud: The cloud, in canonical order.
-        labels: Region of each point, shape ``(N,)``: 0 to M-1 or :data:`torchrg.UNLABELED`.
-        config: Settings.
-
-    Returns:
-        Regions, shape ``(N,)``, numbered below M, perhaps with gaps.
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
+    perhaps with gaps in their numbers.
     """
     if not bool((labels >= 0).any()):
         return labels
@@ -71,10 +66,7 @@ def _fit(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> tuple[Fi
 def reach_of_planes(fit: FittedPlanes, floor: Tensor, factor: float) -> Tensor:
     """Return how far from its plane a point may join a region: NaN, not at all, if it is curved.
 
-    Args:
-        fit: Planes of the regions.
-        floor: Least thickness of each, shape ``(M,)``.
-        factor: So many times the thickness.
+    ``factor`` times its thickness, which is at least ``floor``, shape ``(M,)``.
     """
     return torch.where(fit.curved, torch.nan, factor * torch.maximum(fit.thickness, floor))
 
@@ -96,29 +88,9 @@ def absorb_points(
     several regions it joins the one whose plane is nearest. Points that joined are neighbours of
     the next.
 
-    Args:
-        points: Points, shape ``(N, 3)``.
-        normals: Unit normals, shape ``(N, 3)``.
-        labels: Region of each point, shape ``(N,)``, or :data:`torchrg.UNLABELED`.
-        neighbors: Neighbours of each point.
-        planes: Unit normal ``(M, 3)``, a point ``(M, 3)`` and the reach ``(M,)`` of each region,
-            in float64; reach 0 keeps all but the points exactly on the plane out, NaN all.
-        valid: Points that may join, shape ``(N,)``, bool.
-        max_angle_deg: See above.
-
-    Returns:
-        Labels, shape ``(N,)``.
-
-    Example:
-        >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 1]])
-        >>> neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1], [3, 2]]))
-        >>> plane = torch.tensor([[0.0, 0, 1]]).double()
-        >>> planes = (plane, torch.zeros(1, 3).double(), torch.full((1,), 0.1).double())
-        >>> absorb_points(
-        ...     points, plane.float().expand(4, 3), torch.tensor([0, -1, -1, -1]), neighbors,
-        ...     planes, valid=torch.ones(4).bool(), max_angle_deg=30.0,
-        ... ).tolist()
-        [0, 0, 0, -1]
+    ``planes`` are unit normal ``(M, 3)``, a point ``(M, 3)`` and the reach ``(M,)`` of each region,
+    in float64; reach 0 keeps all but the points exactly on the plane out, NaN all. ``valid`` tells
+    which points may join.
     """
     normal, center, reach = planes
     labels = labels.clone()
@@ -157,15 +129,8 @@ def merge_coplanar(
     the plane through both is at most ``tolerance`` times what it is to its own. What is merged is
     one region from then on.
 
-    Args:
-        labels: Region of each point, shape ``(N,)``: 0 to M-1 or :data:`torchrg.UNLABELED`.
-        neighbors: Neighbours of each point.
-        fit: Planes of the regions.
-        floor: Least distance to its own plane that counts for a region, shape ``(M,)``.
-        tolerance: See above.
-
-    Returns:
-        Labels, shape ``(N,)``: of each region the smallest of those it is merged with.
+    ``floor`` ``(M,)`` is the least distance to its own plane that counts for a region. A merged
+    region has the smallest label of its parts.
     """
     pairs, num_contacts = count_contacts(labels, neighbors)
     pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].any(dim=1)]
@@ -183,11 +148,8 @@ def merge_coplanar(
 class _Moments(NamedTuple):
     """What merging reads of M regions, in float64.
 
-    Attributes:
-        weight: Number of points, shape ``(M,)``.
-        mean: Mean of the points, about an origin near them, shape ``(M, 3)``.
-        covariance: Covariance of the points, shape ``(M, 3, 3)``.
-        scale: Distance from its plane that counts as lying on it, shape ``(M,)``.
+    Number of points, their mean, about an origin near them, and covariance, and the distance from
+    its plane that counts as lying on it.
     """
 
     weight: Tensor

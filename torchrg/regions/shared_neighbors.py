@@ -25,17 +25,8 @@ side."""
 def min_shared_neighbors(connectivity: float, k: int) -> int:
     """Return the least number of common neighbours of connected points, eq. (10).
 
-    Args:
-        connectivity: Fraction of the k neighbours.
-        k: Number of neighbours, the point itself included.
-
-    Returns:
-        ``ceil(connectivity * k)``, of the decimal fraction that was written (0.07 * 100 is 7, not
-        the 7.000000000000001 of binary arithmetic).
-
-    Example:
-        >>> min_shared_neighbors(0.75, 50), min_shared_neighbors(0.07, 100)
-        (38, 7)
+    ``ceil(connectivity * k)`` of the decimal fraction that was written: 0.07 * 100 is 7, not the
+    7.000000000000001 of binary arithmetic.
     """
     return math.ceil(round(connectivity * k, 9))
 
@@ -68,12 +59,8 @@ class SharedNeighbors:
     def connected(self, rows: slice, asked: Tensor) -> Tensor:
         """Tell which of a block's edges join connected points, eq. (10).
 
-        Args:
-            rows: The points that the edges lead from.
-            asked: Which of the edges to their neighbours to test, shape ``(n, K)``, bool.
-
-        Returns:
-            Shape ``(n, K)``, bool; False where not asked.
+        ``asked`` says which of the edges from the points ``rows`` to test, shape ``(n, K)``, bool;
+        the others are False.
         """
         if self._min_shared <= 0:
             return asked.clone()

@@ -1,8 +1,7 @@
 """Modules for data pipelines: a dict of tensors (or a PyG ``Data``) in, a new one out."""
 
 from torchrg.neighbors import restore_points, sample_voxels
-from torchrg.transforms.depth import DepthToCloud, SegmentDepth
-from torchrg.transforms.fusion import fuse_depth
+from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
 from torchrg.transforms.sample import CenterCloud, KeepFinite
 from torchrg.transforms.voxels import SampleVoxels, segment_voxels

@@ -1,23 +1,23 @@
-"""Depth images as modules: to clouds, and to planes."""
+"""Depth images: as modules to clouds and to planes, and several of them as one cloud."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchrg._checks import as_tensor
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.structures import UNLABELED
 from torchrg.transforms.sample import SampleTransform
 
 
 class DepthTransform(SampleTransform):
-    """Base of the transforms of depth images: reads them one by one.
+    """Base of the transforms of depth images.
 
-    Args:
-        keys: Other names for some of ``names``.
-        world: Whether results are in world coordinates where a sample has a pose; otherwise they
-            are in camera coordinates.
+    Results are in world coordinates where a sample has a pose, else in camera coordinates.
     """
 
     names = (
@@ -25,17 +25,8 @@ class DepthTransform(SampleTransform):
         *("plane", "normal", "curvature", "planes"),
     )
 
-    def __init__(self, *, world: bool = True, keys: Mapping[str, str] | None = None) -> None:
-        super().__init__(keys=keys)
-        self.world = world
-
     def read_images(self, sample: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None.
-
-        Raises:
-            ConfigError: If the sample lacks depth or intrinsics.
-            ShapeError: If their shapes are not as in :class:`SegmentDepth`.
-        """
+        """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
         depth, intrinsics = self.read(sample, "depth"), self.read(sample, "intrinsics")
         if depth.ndim not in (2, 3, 4) or (depth.ndim > 2 and depth.shape[-3] != 1):
             raise ShapeError(
@@ -43,7 +34,7 @@ class DepthTransform(SampleTransform):
                 f"(B, 1, H, W), got {tuple(depth.shape)}."
             )
         depth = depth.reshape(-1, *depth.shape[-2:])
-        has_pose = self.world and sample.get(self.key(sample, "pose")) is not None
+        has_pose = sample.get(self.key(sample, "pose")) is not None
         poses = self.read(sample, "pose") if has_pose else None
         return (
             depth,
@@ -80,7 +71,6 @@ class DepthToCloud(DepthTransform):
     and replaces ``color`` by that of the points, ``(N, 3)``, of the nearest pixel.
 
     Args:
-        world: See :class:`SegmentDepth`.
         keys: Other names for the keys.
 
     Example:
@@ -131,8 +121,9 @@ class SegmentDepth(DepthTransform):
     """Add plane labels, normals and curvature to depth images; see :func:`segment_depth`.
 
     Reads ``depth``, of shape ``(H, W)``, ``(1, H, W)`` or ``(B, 1, H, W)``, ``intrinsics``
-    ``(3, 3)`` or ``(B, 3, 3)``, and ``pose`` ``(4, 4)`` or ``(B, 4, 4)`` if there. Adds images,
-    with ``B`` in front for a batch:
+    ``(3, 3)`` or ``(B, 3, 3)``, and ``pose`` ``(4, 4)`` or ``(B, 4, 4)`` if there: normals and
+    planes are then in world coordinates, else in camera coordinates. Adds images, with ``B`` in
+    front for a batch:
 
     * ``plane`` ``(H, W)``, int64: 0 to M-1 by descending size in each image, -1 for none;
     * ``normal`` ``(H, W, 3)``: unit normals towards the camera, 0 where there is no depth;
@@ -143,8 +134,6 @@ class SegmentDepth(DepthTransform):
 
     Args:
         config: Settings.
-        world: Whether normals and planes are in world coordinates where a sample has a pose;
-            otherwise they are in camera coordinates.
         planes: Whether to add the table.
         keys: Other names for the keys.
 
@@ -160,11 +149,10 @@ class SegmentDepth(DepthTransform):
         self,
         config: DepthConfig | None = None,
         *,
-        world: bool = True,
         planes: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(keys=keys, world=world)
+        super().__init__(keys=keys)
         self.config = config or DepthConfig()
         self.planes = planes
 
@@ -184,6 +172,108 @@ class SegmentDepth(DepthTransform):
             added[self.key(sample, "planes")] = tables if batch else tables[0]
         return added
 
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
+
+class FusedFrames(NamedTuple):
+    """A cloud of several depth frames.
+
+    Attributes:
+        coord: Points in world coordinates, shape ``(N, 3)``, float64: the pixels with depth, or one
+            of each voxel.
+        color: Their colours, shape ``(N, 3)``, uint8; None where a frame has none.
+        frame: Number of the frame that each point is from, shape ``(N,)``, int64.
+        pixel: Row-major place of each point in its frame, shape ``(N,)``, int64.
+        inverse: The point that stands for each pixel with depth, frame after frame, row-major,
+            shape ``(P,)``, int64.
+        seen: Pixels with depth of each frame, of shape ``(H, W)``, bool.
+    """
+
+    coord: Tensor
+    color: Tensor | None
+    frame: Tensor
+    pixel: Tensor
+    inverse: Tensor
+    seen: tuple[Tensor, ...]
+
+    def to_frames(self, values: Tensor, *, fill: int = UNLABELED) -> list[Tensor]:
+        """Return values of the points, labels for example, as images of the frames.
+
+        Args:
+            values: A row for each point, shape ``(N, ...)``.
+            fill: Value of the pixels without depth; for normals 0.
+
+        Returns:
+            An image of shape ``(H, W, ...)`` for each frame.
+
+        Raises:
+            ShapeError: If there is not a row for each point.
+        """
+        if len(values) != len(self.coord):
+            raise ShapeError(
+                f"to_frames: expected values of {len(self.coord)} points, got {len(values)}."
+            )
+        each = restore_points(values, self.inverse)
+        images = [values.new_full((*seen.shape, *values.shape[1:]), fill) for seen in self.seen]
+        parts = torch.split(each, [int(seen.sum()) for seen in self.seen])
+        for image, seen, part in zip(images, self.seen, parts, strict=True):
+            image[seen] = part
+        return images
+
+
+def fuse_depth(
+    samples: Sequence[Mapping[str, Any]], *, voxel_size: float | None = None
+) -> FusedFrames:
+    """Fuse depth frames with poses into one cloud.
+
+    Args:
+        samples: Samples as :class:`torchrg.datasets.RGBDFrames` gives them: ``depth``
+            ``(1, H, W)`` or ``(H, W)``, ``intrinsics`` ``(3, 3)``, ``pose`` ``(4, 4)``, perhaps
+            ``color``. Frames may differ in size.
+        voxel_size: Keep one point of each cell of a grid of this size, the one nearest to its
+            middle, see :func:`torchrg.transforms.sample_voxels`. Default: all points are kept.
+
+    Returns:
+        The cloud; :meth:`FusedFrames.to_frames` takes its labels back into every frame.
+
+    Raises:
+        ConfigError: If there is no sample, one lacks a pose, or ``voxel_size`` is not positive.
+        ShapeError: If a shape is not as above.
+
+    Example:
+        >>> sample = {"depth": torch.tensor([[1.0, 0.0]]), "intrinsics": torch.eye(3)}
+        >>> poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+        >>> poses[1, 2, 3] = 5.0
+        >>> fused = fuse_depth([{**sample, "pose": pose} for pose in poses])
+        >>> fused.coord.tolist(), fused.frame.tolist()
+        ([[0.0, 0.0, 1.0], [0.0, 0.0, 6.0]], [0, 1])
+        >>> [image.tolist() for image in fused.to_frames(torch.tensor([7, 8]))]
+        [[[7, -1]], [[8, -1]]]
+    """
+    if not samples:
+        raise ConfigError("fuse_depth: expected at least one sample, got none.")
+    clouds, seen = [], []
+    for number, sample in enumerate(samples):
+        if "pose" not in sample:
+            raise ConfigError(f"fuse_depth: expected a pose in sample {number}, got none.")
+        depth = as_tensor("fuse_depth", "depth", sample["depth"])
+        pose = as_tensor("fuse_depth", "pose", sample["pose"]).double()
+        if depth.ndim == 4:
+            raise ShapeError(
+                f"fuse_depth: expected depth of shape (1, H, W), got {tuple(depth.shape)}; pass "
+                "the frames of a batch one by one."
+            )
+        cloud = DepthToCloud()({**sample, "pose": pose})
+        clouds.append(cloud)
+        mask = torch.zeros(depth.shape[-2:], dtype=torch.bool, device=depth.device)
+        mask.view(-1)[cloud["pixel"]] = True
+        seen.append(mask)
+    coord, pixel = (torch.cat([cloud[key] for cloud in clouds]) for key in ("coord", "pixel"))
+    counts = torch.tensor([len(cloud["coord"]) for cloud in clouds], device=coord.device)
+    frame = torch.arange(len(clouds), device=coord.device).repeat_interleave(counts)
+    has_color = all("color" in cloud for cloud in clouds)
+    color = torch.cat([cloud["color"] for cloud in clouds]) if has_color else None
+    inverse = torch.arange(len(coord), device=coord.device)
+    if voxel_size is not None:
+        rows, inverse = sample_voxels(coord, voxel_size)
+        coord, frame, pixel = coord[rows], frame[rows], pixel[rows]
+        color = None if color is None else color[rows]
+    return FusedFrames(coord, color, frame, pixel, inverse, tuple(seen))

@@ -37,6 +37,7 @@ class SampleTransform(nn.Module):
     """
 
     names: Sequence[str] = KEYS
+    config: Any = None
 
     def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
         super().__init__()
@@ -48,18 +49,17 @@ class SampleTransform(nn.Module):
                 f"{', '.join(sorted(unknown))}."
             )
 
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return "" if self.config is None else repr(self.config)
+
     def key(self, sample: Any, name: str) -> str:  # noqa: ANN401
         """Return what an entry is called in a sample."""
         usual = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
         return self.renamed.get(name, usual)
 
     def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
-        """Return an entry of a sample as a tensor.
-
-        Raises:
-            ConfigError: If the sample lacks it.
-            ShapeError: If it is no array, or coordinates that are not of shape ``(N, 3)``.
-        """
+        """Return an entry of a sample as a tensor, or say what is wrong with it."""
         key, caller = self.key(sample, name), type(self).__name__
         entries = _entries_of(sample)
         if key not in entries:
@@ -103,7 +103,6 @@ class CloudTransform(SampleTransform):
     """Base of the transforms that add a row for each point, cloud by cloud."""
 
     reads: tuple[str, ...] = ("coord",)
-    config: Any
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return new entries of one cloud, from those that are read."""
@@ -120,10 +119,6 @@ class CloudTransform(SampleTransform):
             self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
         }
         return self.changed(sample, added, per_point=list(added))
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        return repr(self.config)
 
 
 class CenterCloud(SampleTransform):
@@ -172,15 +167,7 @@ class KeepFinite(SampleTransform):
 
 
 def rows_of_clouds(sample: Any, num_points: int) -> list[slice]:  # noqa: ANN401
-    """Return the rows of each cloud of a sample.
-
-    Raises:
-        ConfigError: If ``offset`` or ``batch`` does not fit the points.
-
-    Example:
-        >>> rows_of_clouds({"batch": torch.tensor([0, 0, 1, 1, 1])}, 5)
-        [slice(0, 2, None), slice(2, 5, None)]
-    """
+    """Return the rows of each cloud of a sample, by its ``offset`` or ``batch`` if it has one."""
     return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
 
 
@@ -188,10 +175,8 @@ def select_points(sample: Any, rows: Tensor, *, num_points: int) -> dict[str, Te
     """Return the entries of a sample that change when only some rows are kept, given ascending.
 
     Which entries have a row for each point, ``index_valid_keys`` says as Pointcept does, or else
-    their length. ``offset`` is among them where the sample has it.
-
-    Raises:
-        ConfigError: If the sample has edges, or is a batch that can be taken apart again.
+    their length. ``offset`` is among them where the sample has it. A sample that has edges, or is a
+    batch that can be taken apart again, is refused.
     """
     entries = _entries_of(sample)
     for key, repair in (("edge_index", "before edges are made"), ("ptr", "before batching")):
@@ -216,11 +201,7 @@ def select_points(sample: Any, rows: Tensor, *, num_points: int) -> dict[str, Te
 
 
 def _entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
-    """Return what a sample holds by key.
-
-    Raises:
-        ConfigError: If it is neither a mapping nor like a PyG ``Data``.
-    """
+    """Return what a sample holds by key, or say that it is none."""
     if isinstance(sample, Mapping):
         return sample
     if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
