@@ -22,9 +22,8 @@ from scipy.stats import kstest
 from torchrg.errors import ConfigError
 from torchrg.scenes import RoomLayout, SceneModel, build_room, make_room
 from torchrg.scenes.geometry import Frame, unit
-from torchrg.scenes.round import Cone, Ring
 from torchrg.scenes.scene import Part, is_occupied, plane_table
-from torchrg.scenes.surfaces import Flat
+from torchrg.scenes.surfaces import Cone, Flat, Ring
 from torchrg.structures import UNLABELED
 
 CURVED = RoomLayout(

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrg.scenes.geometry import Frame, Triple
-from torchrg.scenes.round import Cone
 from torchrg.scenes.scene import Part
-from torchrg.scenes.surfaces import Drum, Hole, Surface, rectangle
+from torchrg.scenes.surfaces import Cone, Drum, Hole, Surface, rectangle
 
 
 def shell(
