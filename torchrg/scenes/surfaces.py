@@ -1,4 +1,4 @@
-"""Surfaces, flat or of revolution, and bodies that hide what is in them"""
+"""Surfaces, flat or of revolution, and bodies that hide what is in them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
