@@ -15,7 +15,7 @@ from torchrg.batch.records import reason_to_convert
 from torchrg.batch.sources import SOURCES, FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli.convert import KINDS, RGBDArguments
 from torchrg.config import load_config
-from torchrg.datasets.rgbd_layouts import LAYOUTS
+from torchrg.datasets.rgbd import LAYOUTS
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.errors import ConfigError
 from torchrg.io import Cloud, estimate_points, write_cloud

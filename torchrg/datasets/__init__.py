@@ -21,14 +21,13 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
 
 A new data set is a :class:`~torchrg.datasets.folder.SceneDataset` in a file of its own, exported
 here, and a test; a new folder of depth frames is a row of
-:data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
+:data:`~torchrg.datasets.rgbd.LAYOUTS`.
 """
 
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.folder import FolderOfClouds, Scene
 from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_pointcept_scene
-from torchrg.datasets.rgbd import RGBDFrames
-from torchrg.datasets.rgbd_layouts import RGBDFrame
+from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
 from torchrg.datasets.s3dis import S3DIS
 
