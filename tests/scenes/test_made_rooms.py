@@ -9,7 +9,7 @@ import torch
 from scipy.stats import chisquare, kstest
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import RoomLayout, build_room, make_room
+from torchrg.scenes import RoomLayout, build_room, make_room, sample_scene
 from torchrg.scenes.scene import is_occupied
 
 CURVED = RoomLayout(
@@ -200,7 +200,7 @@ def test_noise_is_along_the_normal_with_the_deviation_asked_for(exact):
 
 
 def test_isotropic_noise_has_the_deviation_along_each_axis(exact):
-    noisy = make_room(200_000, noise=0.004, seed=0, noise_direction="isotropic")
+    noisy = sample_scene(build_room(), 200_000, noise=0.004, noise_direction="isotropic")
     shifts = (noisy.points - exact.points).double().numpy() / 0.004
     for axis in range(3):
         assert kstest(shifts[:, axis], "norm").pvalue > 1e-3
@@ -256,12 +256,16 @@ def test_bent_wall_passes_through_its_corners_and_bulges_by_the_bend():
         ({"noise": -1}, "sample_scene: expected noise >= 0 metres, got -1"),
         ({"noise": float("nan")}, "expected noise >= 0 metres, got nan"),
         ({"seed": -1}, "expected seed >= 0, got -1"),
-        ({"noise_direction": "up"}, "expected noise_direction to be one of normal, .*got 'up'"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         make_room(**{"num_points": 100, **settings})
+
+
+def test_unknown_directions_of_noise_are_refused():
+    with pytest.raises(ConfigError, match="noise_direction to be one of normal, isotropic, got"):
+        sample_scene(build_room(), 100, noise_direction="up")
 
 
 @pytest.mark.parametrize(

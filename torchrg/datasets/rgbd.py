@@ -18,10 +18,10 @@ from torchrg._checks import check_shapes
 from torchrg.datasets.folder import Scene, SceneDataset, check_folder, files_below, listed
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
-    nearest_times,
     read_color,
     read_depth,
     read_matrix,
+    read_nearest,
     read_timed,
     read_trajectory,
 )
@@ -213,8 +213,8 @@ def _find_tum(root: Path, intrinsics: Tensor | None, depth_scale: float | None) 
         camera = _tum_camera(folder) if intrinsics is None else intrinsics
         times, images = read_timed(folder / "depth.txt")
         lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
-        colors = _nearest(times, lists[1], read_timed)
-        poses = _nearest(times, lists[2], read_trajectory)
+        colors = read_nearest(times, lists[1], read_timed)
+        poses = read_nearest(times, lists[2], read_trajectory)
         frames += [
             RGBDFrame(
                 folder / image,
@@ -228,16 +228,6 @@ def _find_tum(root: Path, intrinsics: Tensor | None, depth_scale: float | None) 
             for image, color, pose in zip(images, colors, poses, strict=True)
         ]
     return frames
-
-
-def _nearest(
-    times: list[float], path: Path, read: Callable[[Path], tuple[list[float], Sequence[Any]]]
-) -> list[Any]:
-    """Return what a list by time has nearest to each of some times, None where that is nothing."""
-    if not path.is_file():
-        return [None] * len(times)
-    others, values = read(path)
-    return [None if i is None else values[i] for i in nearest_times(times, others)]
 
 
 def _tum_camera(folder: Path) -> Tensor:

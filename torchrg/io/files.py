@@ -144,10 +144,5 @@ def refusing(message: str, *errors: type[BaseException], repair: str = "") -> It
 
 
 def first_line(error: BaseException) -> str:
-    r"""Return the first line of an error's message, or its name if it has none.
-
-    Example:
-        >>> first_line(ValueError("no points.\nSee the manual."))
-        'no points'
-    """
+    """Return the first line of an error's message, or its name if it has none; no full stop."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")

@@ -24,15 +24,10 @@ def block(
     without: Collection[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> Part:
-    """Return a rectangular body standing on the origin of a frame, and its faces.
+    """Return a rectangular body, and its faces: :data:`SIDES`, "bottom" and "top".
 
-    Args:
-        kind: What it is.
-        frame: The third axis is up, the origin is the middle of the base.
-        size: Lengths along the three axes.
-        without: Faces left out because something covers all of them: of :data:`SIDES`, "bottom"
-            and "top".
-        kinds: Names of faces that are not called ``kind``.
+    The third axis of the frame is up, the origin the middle of the base. Faces that something
+    covers completely are left out by ``without``; ``kinds`` names those not called ``kind``.
     """
     x, y, z = size
     corners = {

@@ -13,7 +13,6 @@ from torchrg.scenes import furniture
 from torchrg.scenes.furniture import between
 from torchrg.scenes.geometry import Array, Frame, Triple
 from torchrg.scenes.scene import (
-    NoiseDirection,
     Part,
     Scene,
     SceneModel,
@@ -118,7 +117,6 @@ def make_room(
     seed: int = 0,
     *,
     layout: RoomLayout | None = None,
-    noise_direction: NoiseDirection = "normal",
 ) -> Scene:
     """Make a cloud of a furnished room with exact truth.
 
@@ -128,10 +126,9 @@ def make_room(
 
     Args:
         num_points: Number of points.
-        noise: Standard deviation of the noise, in metres.
+        noise: Standard deviation of the noise along the normals, in metres.
         seed: Two calls with equal arguments give equal clouds; see :func:`sample_scene`.
         layout: What is in the room. Default: ``RoomLayout()``.
-        noise_direction: See :func:`sample_scene`.
 
     Returns:
         The cloud and its truth.
@@ -144,8 +141,7 @@ def make_room(
         >>> room.points.shape, len(room.kinds)
         (torch.Size([5000, 3]), 153)
     """
-    model = build_room(seed, layout=layout)
-    return sample_scene(model, num_points, noise=noise, seed=seed, noise_direction=noise_direction)
+    return sample_scene(build_room(seed, layout=layout), num_points, noise=noise, seed=seed)
 
 
 def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel:
@@ -180,14 +176,9 @@ def furnish(
     doorways: Sequence[tuple[int, Hole]] = (),
     with_floor: bool = True,
 ) -> tuple[Part, ...]:
-    """Return the parts of a room: its shell, then what is in it.
+    """Return the parts of a room, whose origin is a corner of the floor: its shell, then the rest.
 
-    Args:
-        layout: What there is to be.
-        room: Its origin is a corner of the floor.
-        rng: Source of sizes and places.
-        doorways: Holes in walls that are there already, each with its wall.
-        with_floor: Whether the room has a floor of its own.
+    ``doorways`` are holes in walls that are there already, each with its wall.
 
     Raises:
         ConfigError: If the room is too small for its furniture.

@@ -249,11 +249,7 @@ def label_points(
 
 
 def seeded_generator(seed: int, purpose: int) -> np.random.Generator:
-    """Return one of several independent generators that belong to a seed, one for each purpose.
-
-    Raises:
-        ConfigError: If the seed is negative.
-    """
+    """Return one of several independent generators that belong to a seed, one for each purpose."""
     if seed < 0:
         raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
     return np.random.Generator(np.random.PCG64([seed, purpose]))
