@@ -272,7 +272,7 @@ def test_vertical_view_is_refused():
 
 def test_depth_frame_lies_on_the_faces_it_names():
     model = build_room(4)
-    planes, offsets = (torch.from_numpy(values) for values in model.planes)
+    planes, offsets = (torch.from_numpy(values) for values in plane_table(model.surfaces))
     frame = render_depth(model, cameras_around(model, 1, width=160, height=120)[0])
     rays = torch.from_numpy(frame.camera.rays())
     local = rays * frame.depth.double()[..., None]

@@ -89,11 +89,6 @@ class SceneModel:
         return np.repeat(np.arange(len(counts)), counts)
 
     @cached_property
-    def planes(self) -> tuple[Array, Array]:
-        """Normals ``(M, 3)`` and offsets ``(M,)`` of the faces; zero for curved ones."""
-        return plane_table(self.surfaces)
-
-    @cached_property
     def bounds(self) -> Array:
         """Lowest and highest coordinates of a box around all faces, shape ``(2, 3)``."""
         boxes = np.stack([surface.bounds for surface in self.surfaces])
@@ -234,7 +229,7 @@ def label_points(
     model: SceneModel, points: Floats, labels: NDArray[np.int64], normals: Floats
 ) -> Scene:
     """Return points ``(N, 3)`` of known faces ``(N,)`` as a cloud with the tables of its scene."""
-    face_normals, face_offsets = model.planes
+    face_normals, face_offsets = plane_table(model.surfaces)
     return Scene(
         points=torch.from_numpy(points),
         labels=torch.from_numpy(labels),
