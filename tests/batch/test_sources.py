@@ -15,7 +15,7 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config
-from torchrg.datasets.rgbd_layouts import LAYOUTS
+from torchrg.datasets.rgbd import LAYOUTS
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.errors import ConfigError
 from torchrg.io import Cloud, estimate_points, write_cloud

@@ -55,7 +55,7 @@ def tum(tmp_path):
         write_color(root / "rgb" / f"{name}5.png", value // 1000)
     write_text(root / "depth.txt", "# depth\n2.0 depth/2.0.png\n1.0 depth/1.0.png\n")
     write_text(root / "rgb.txt", "# color\n1.015 rgb/1.05.png\n2.3 rgb/2.05.png\n")
-    far = f"1.5 9 9 9 {QUARTER}\n"
+    far = f"1.5 9 9 9 {QUARTER}\n0.985 9 9 9 {QUARTER}\n"
     write_text(root / "groundtruth.txt", f"#\n{far}1.01 0.5 0.25 2 {QUARTER}\n")
     return root
 

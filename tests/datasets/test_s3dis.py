@@ -10,7 +10,7 @@ import torch
 
 from tests.datasets.s3dis_tree import digest, rows_of, text_of, write_clean_room, write_objects
 from torchrg.datasets import S3DIS, read_room
-from torchrg.datasets import room_cache as room_cache_module
+from torchrg.datasets import s3dis as s3dis_module
 from torchrg.errors import ConfigError, FormatError
 
 pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
@@ -80,7 +80,7 @@ def test_the_cache_gives_the_same_room_and_report(root, tmp_path, class_order):
 
 def test_the_text_is_read_once(root, tmp_path, monkeypatch):
     S3DIS(root, [1], cache=tmp_path)[0]
-    monkeypatch.setattr(room_cache_module, "read_room", None)
+    monkeypatch.setattr(s3dis_module, "read_room", None)
     S3DIS(root, [1], cache=tmp_path)[0]
     with pytest.raises(TypeError):
         S3DIS(root, [1], cache=tmp_path)[1]

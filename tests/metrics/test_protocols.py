@@ -165,10 +165,3 @@ def test_segcomp_refuses_a_threshold_without_unique_classes(threshold):
     table = contingency_table(torch.tensor([0]), torch.tensor([0]))
     with pytest.raises(ConfigError, match=r"count_segcomp: expected threshold in \[0.5, 1\), got"):
         count_segcomp(table, threshold=threshold)
-
-
-@pytest.mark.parametrize("bounds", [(0.5, 0.2), (1.1, 0.2), (0.75, 0.8), (0.75, 0.0)])
-def test_evops_refuses_bounds_that_do_not_match_one_to_one(bounds):
-    table = contingency_table(torch.tensor([0]), torch.tensor([0]))
-    with pytest.raises(ConfigError, match="score_evops: expected 0 < part_iou <= full_iou"):
-        score_evops(table, full_iou=bounds[0], part_iou=bounds[1])

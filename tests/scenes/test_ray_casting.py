@@ -22,9 +22,8 @@ from scipy.stats import kstest
 from torchrg.errors import ConfigError
 from torchrg.scenes import RoomLayout, SceneModel, build_room, make_room
 from torchrg.scenes.geometry import Frame, unit
-from torchrg.scenes.round import Cone, Ring
 from torchrg.scenes.scene import Part, is_occupied, plane_table
-from torchrg.scenes.surfaces import Flat
+from torchrg.scenes.surfaces import Cone, Flat, Ring
 from torchrg.structures import UNLABELED
 
 CURVED = RoomLayout(
@@ -273,7 +272,7 @@ def test_vertical_view_is_refused():
 
 def test_depth_frame_lies_on_the_faces_it_names():
     model = build_room(4)
-    planes, offsets = (torch.from_numpy(values) for values in model.planes)
+    planes, offsets = (torch.from_numpy(values) for values in plane_table(model.surfaces))
     frame = render_depth(model, cameras_around(model, 1, width=160, height=120)[0])
     rays = torch.from_numpy(frame.camera.rays())
     local = rays * frame.depth.double()[..., None]

@@ -47,7 +47,7 @@ def test_leaf_of_a_door_is_behind_the_wall():
 def test_faces_of_furniture():
     rng = np.random.default_rng(0)
     assert len(block("box", HERE, (1, 1, 1), without=["bottom"]).surfaces) == 5
-    assert len(draw_table(rng, HERE, 0.04, None).surfaces) == 10
+    assert len(draw_table(rng, HERE, 0.04).surfaces) == 10
     round_table = draw_round_table(rng, HERE, 0.04).surfaces
     assert [surface.plane is None for surface in round_table] == [False, False, True, True]
     wall = room_walls(HERE, (4, 3, 2.5))[0]

@@ -23,8 +23,7 @@ from torchrg.datasets import (
     read_room,
     write_pointcept_scene,
 )
-from torchrg.datasets.rgbd import RGBDFrames
-from torchrg.datasets.rgbd_layouts import RGBDFrame
+from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError

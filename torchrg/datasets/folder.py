@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchrg._checks import as_tensor
@@ -110,8 +109,17 @@ class FolderOfClouds(SceneDataset):
 
     def read_sample(self, index: int) -> dict[str, Any]:
         """Return the sample of a cloud."""
-        scene = self.scenes[index]
-        return {**_read(scene.path), "name": scene.name}
+        name, path, _ = self.scenes[index]
+        if path.is_dir():
+            return {**read_pointcept_scene(path), "name": name}
+        cloud = read_cloud(path)
+        fields = {
+            _FIELD_KEYS.get(field, field): as_tensor(str(path), field, values)
+            for field, values in cloud.fields.items()
+            if values.dtype.kind in "fiub"
+        }
+        origin = torch.from_numpy(cloud.origin).reshape(1, 3)
+        return {**fields, "coord": cloud.points, "origin": origin, "name": name}
 
 
 def _is_scene(folder: Path) -> bool:
@@ -125,20 +133,6 @@ def _files_of(path: Path) -> tuple[Path, ...]:
         return (path,)
     files = (path / f"{name}.npy" for name in POINT_ARRAYS)
     return tuple(file for file in files if file.is_file())
-
-
-def _read(path: Path) -> dict[str, Tensor]:
-    """Read a cloud as tensors."""
-    if path.is_dir():
-        return read_pointcept_scene(path)
-    cloud = read_cloud(path)
-    fields = {
-        _FIELD_KEYS.get(name, name): as_tensor(str(path), name, values)
-        for name, values in cloud.fields.items()
-        if values.dtype.kind in "fiub"
-    }
-    origin = torch.from_numpy(cloud.origin).reshape(1, 3)
-    return {**fields, "coord": cloud.points, "origin": origin}
 
 
 def check_folder(folder: Path) -> None:

@@ -145,14 +145,12 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         return values.detach().cpu().double()
 
     columns = {"id": torch.arange(len(planes.normal)), **planes._asdict()}
+    for name in ("kind", "outline", "adjacency"):
+        del columns[name]
     columns["offset"] = exact(planes.offset) + exact(planes.normal) @ shift
     columns["centroid"] = exact(planes.centroid) + shift
     columns["center"] = exact(planes.center) + shift
-    lists = {
-        name: columns[name].tolist()
-        for name in columns
-        if name not in ("kind", "outline", "adjacency")
-    }
+    lists = {name: values.tolist() for name, values in columns.items()}
     if planes.kind is not None:
         lists["kind"] = [PLANE_KINDS[kind] for kind in planes.kind.tolist()]
     if planes.outline is not None:

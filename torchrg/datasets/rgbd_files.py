@@ -2,6 +2,7 @@
 
 import os
 from bisect import bisect_left
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +22,11 @@ _MOST_SECONDS = 0.02
 def read_depth(
     path: str | os.PathLike[str], *, depth_scale: float, no_depth: int | None = None
 ) -> Tensor:
-    """Read a depth image.
+    """Read depth in metres, shape ``(H, W)``, float32, from a gray PNG of 16 bits or a ``.npy``.
 
-    Args:
-        path: A gray PNG of 16 bits, or a ``.npy`` of shape ``(H, W)`` with numbers.
-        depth_scale: Stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for metres. It
-            is not in the files, and never guessed.
-        no_depth: Stored value that means "no depth" beside 0 (65535 in 7-Scenes).
-
-    Returns:
-        Depth in metres, shape ``(H, W)``, float32; 0 where there is none (0, negative, not finite).
-
-    Raises:
-        FormatError: If the file is missing, damaged, or not a depth image.
-        ConfigError: If ``depth_scale`` is not positive.
+    It is 0 where there is none (0, negative, not finite, or ``no_depth``, as 65535 in 7-Scenes).
+    ``depth_scale`` is the stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for
+    metres. It is not in the files, and never guessed.
 
     Example:
         >>> import tempfile
@@ -60,25 +52,11 @@ def read_depth(
     return torch.from_numpy((np.where(bad, 0, depth) / depth_scale).astype(np.float32))
 
 
-def read_color(path: str | os.PathLike[str]) -> Tensor:
-    """Read a colour image.
+def read_color(source: Path) -> Tensor:
+    """Read red, green and blue, shape ``(3, H, W)``, uint8, from a PNG or JPEG of 8 bits a channel.
 
-    Args:
-        path: PNG or JPEG of 8 bits a channel.
-
-    Returns:
-        Red, green and blue, shape ``(3, H, W)``, uint8; a gray image has three equal channels.
-
-    Raises:
-        FormatError: If the file is missing, damaged, or not such an image.
-
-    Example:
-        >>> read_color("missing.png")
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.FormatError: missing.png: cannot be read: No such file or directory.
+    A gray image has three equal channels.
     """
-    source = Path(path)
     image = _read_image(source, "PNG or JPEG")
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (1, 3, 4):
         raise FormatError(
@@ -165,20 +143,22 @@ def read_trajectory(path: Path) -> tuple[list[float], list[Tensor]]:
     return values[:, 0].tolist(), list(poses)
 
 
-def nearest_times(times: list[float], others: list[float]) -> list[int | None]:
-    """Return the place of the nearest of ascending times, None where it is too far.
+def read_nearest(
+    times: list[float], path: Path, read: Callable[[Path], tuple[list[float], Sequence[Any]]]
+) -> list[Any]:
+    """Return what a list by time has nearest to each of some times, None where that is too far.
 
-    Example:
-        >>> nearest_times([1.0, 2.0], [0.5, 0.99, 1.0625, 2.5])
-        [1, None]
+    It is None everywhere if there is no such file.
     """
-    found: list[int | None] = []
+    others, values = read(path) if path.is_file() else ([], [])
+    found: list[Any] = []
     for time in times:
         place = bisect_left(others, time)
-        around = [i for i in (place - 1, place) if 0 <= i < len(others)]
+        around = range(max(place - 1, 0), min(place + 1, len(others)))
         best = min(around, key=lambda i: abs(others[i] - time), default=None)
-        near = best is not None and abs(others[best] - time) <= _MOST_SECONDS
-        found.append(best if near else None)
+        if best is not None and abs(others[best] - time) > _MOST_SECONDS:
+            best = None
+        found.append(None if best is None else values[best])
     return found
 
 

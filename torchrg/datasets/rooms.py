@@ -141,12 +141,7 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
 
 
 def class_names(class_order: str) -> tuple[str, ...]:
-    """Return the names of the 13 classes in an order, a key of :data:`CLASS_ORDERS`.
-
-    Example:
-        >>> class_names("pointcept")[7], class_names("spt")[7]
-        ('table', 'chair')
-    """
+    """Return the names of the 13 classes in an order, a key of :data:`CLASS_ORDERS`."""
     if class_order not in CLASS_ORDERS:
         raise ConfigError(
             f"S3DIS: expected class_order to be one of {', '.join(CLASS_ORDERS)}, got "
@@ -199,19 +194,10 @@ class _Annotation(NamedTuple):
 
 
 def read_annotation(path: Path) -> _Annotation:
-    r"""Read the points of one object, in the order of the file.
+    """Read the points of one object, in the order of the file.
 
     Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
     Colours may be written as ``106.000000`` and are rounded.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "wall_1.txt"
-        ...     _ = path.write_bytes(b"1.5 2.5 \x13.5 10 20 30\n")
-        ...     wall = read_annotation(path)
-        >>> wall.coord.tolist(), wall.repairs[0].line, wall.repairs[0].column
-        ([[1.5, 2.5, 3.5]], 1, 9)
     """
     check_file(path)
     original = path.read_bytes()

@@ -1,6 +1,5 @@
 """Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -16,18 +15,15 @@ from torchrg.io.files import atomic_path, check_file, check_place
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import (
     ARCHIVE_DAMAGES,
-    cloud_arrays,
     count_npy,
     count_npz,
     read_npy,
     read_npz,
-    write_arrays,
     write_npy,
     write_npz,
 )
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
 from torchrg.io.ply import count_ply, read_ply, write_ply
-from torchrg.io.result import check_segmentation, result_arrays, with_segmentation
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.structures import Cloud, Segmentation
 
@@ -158,29 +154,27 @@ def write_cloud(
     found = _format_of(target)
     check_output(target, cloud)
     cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
-    if segmentation is not None:
-        check_segmentation(target, cloud, segmentation)
-    if found.write is write_npz:
-        arrays = (
-            cloud_arrays(target, cloud)
-            if segmentation is None
-            else result_arrays(cloud, segmentation)
+    if segmentation is not None and len(segmentation.labels) != len(cloud):
+        raise FormatError(
+            f"{target}: expected a segmentation of {len(cloud)} points, got "
+            f"{len(segmentation.labels)}; pass the cloud that was segmented."
         )
-        if provenance is not None:
-            arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
-        write_arrays(target, arrays)
-    else:
-        written = cloud if segmentation is None else with_segmentation(cloud, segmentation)
-        found.write(target, written)
+    if found.write is write_npz:
+        write_npz(target, cloud, segmentation, provenance)
+        return
+    if segmentation is not None:
+        names = ("labels", "normals", "curvature")
+        kept = {name: values for name, values in cloud.fields.items() if name not in names}
+        results = {name: getattr(segmentation, name).numpy(force=True) for name in names}
+        cloud = replace(cloud, fields={**kept, **results})
+    found.write(target, cloud)
 
 
 def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:
     """Check before long work that its result has a place: known suffix, folder there.
 
-    Args:
-        path: Where a file shall be written.
-        cloud: The cloud that shall be written, if it is known yet: LAS holds no points that are
-            not finite.
+    ``cloud`` is the one that shall be written, if it is known yet: LAS holds no points that are not
+    finite.
 
     Raises:
         FormatError: If :func:`write_cloud` would refuse the path, or the cloud.
@@ -202,12 +196,8 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> No
 def estimate_points(path: Path) -> int:
     r"""Return the number of points that a file says it holds, without reading them.
 
-    Args:
-        path: A file.
-
-    Returns:
-        The number; for text, which has no header, and for E57 an estimate from the size; 0 for a
-        file that is damaged or of no known format, which reading will tell.
+    For text, which has no header, and for E57 it is an estimate from the size; 0 for a file that is
+    damaged or of no known format, which reading will tell.
 
     Example:
         >>> import tempfile

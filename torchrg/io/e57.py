@@ -114,15 +114,8 @@ def _pye57(verb: str) -> Any:  # noqa: ANN401
 class Scan(NamedTuple):
     """A scan of an E57 file: its name, and how its points were moved to where they are.
 
-    Attributes:
-        name: Its name.
-        rotation: Quaternion w x y z of any length; zero turns nothing.
-        translation: What is added after the rotation.
-
-    Example:
-        >>> half_turn = Scan("s", rotation=(0.0, 0.0, 0.0, 1.0), translation=(0.0, 0.0, 2.0))
-        >>> half_turn.to_world(np.array([[1.0, 5.0, 3.0]])).tolist()
-        [[-1.0, -5.0, 5.0]]
+    The rotation is a quaternion w x y z of any length, where zero turns nothing; the translation is
+    added after it.
     """
 
     name: str = "torchrg"

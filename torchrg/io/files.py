@@ -64,25 +64,18 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(stream.fileno())
         beside.replace(target)
     except OSError as error:
-        known = _with_number(error)
-        reason = known.strerror or known
-        raise FormatError(f"{path}: cannot be written: {reason}.") from known
+        # NumPy's error of a short write comes without its number; it is a full disk's.
+        if error.errno is None and "requested and" in str(error):
+            error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise FormatError(f"{path}: cannot be written: {error.strerror or error}.") from error
     finally:
         beside.unlink(missing_ok=True)
-
-
-def _with_number(error: OSError) -> OSError:
-    """Return NumPy's error of a short write, which comes without its number, as a full disk's."""
-    if error.errno is None and "requested and" in str(error):
-        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    return error
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove what :func:`atomic_path` left in a folder when its process was killed.
 
-    Args:
-        folder: The folder; nothing else may be writing there. Folders in it are left alone.
+    Nothing else may be writing there. Folders in it are left alone.
 
     Example:
         >>> import tempfile
@@ -99,14 +92,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def check_place(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be put at a path: its folder exists, and it is no directory itself.
-
-    Args:
-        path: Where a file shall be.
-
-    Raises:
-        FormatError: If it cannot.
-    """
+    """Check that a file can be put at a path: its folder exists, and it is no directory itself."""
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
@@ -158,10 +144,5 @@ def refusing(message: str, *errors: type[BaseException], repair: str = "") -> It
 
 
 def first_line(error: BaseException) -> str:
-    r"""Return the first line of an error's message, or its name if it has none.
-
-    Example:
-        >>> first_line(ValueError("no points.\nSee the manual."))
-        'no points'
-    """
+    """Return the first line of an error's message, or its name if it has none; no full stop."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")

@@ -1,12 +1,13 @@
 """NumPy's own files: ``.npy``, one array, and ``.npz``, several by name. No pickle is ever loaded.
 
 ``.npz``: ``points`` (or ``coord``), shape (N, 3), and any arrays of N rows, which become fields.
-Arrays of another length are left out, and so is what a result file says about its planes, under
-names that begin with ``plane_``.
+Arrays of another length are left out, and so is what a result says about its planes, under names
+that begin with ``plane_``. See :func:`torchrg.io.write_cloud` for all names of a result.
 ``.npy``: an array (N, 3) or wider, see :func:`torchrg.io.fields.name_columns` for its columns, or
 a structured array with named fields ``x``, ``y``, ``z``.
 """
 
+import json
 import math
 import tokenize
 import zipfile
@@ -16,8 +17,10 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import numpy as np
+import torch
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchrg.errors import FormatError
 from torchrg.io.fields import (
@@ -30,7 +33,7 @@ from torchrg.io.fields import (
     to_records,
 )
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
-from torchrg.structures import Cloud
+from torchrg.structures import PLANE_KINDS, Cloud, Segmentation
 
 _COORDINATES = ("points", "coord")
 _NOT_PER_POINT = "plane_"
@@ -96,30 +99,28 @@ def read_npz(path: Path, size: int) -> Cloud:
     return cloud_of(path, coordinates, fields)
 
 
-def write_npz(path: Path, cloud: Cloud) -> None:
-    """Write ``points`` and every field under its name."""
-    write_arrays(path, cloud_arrays(path, cloud))
+def write_npz(
+    path: Path,
+    cloud: Cloud,
+    segmentation: Segmentation | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write ``points`` and every field under its name, or the arrays of a result, and provenance.
 
-
-def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
-    """Return the number of rows of the coordinates."""
-    with zipfile.ZipFile(stream) as archive:
-        known = [f"{name}.npy" for name in _COORDINATES if f"{name}.npy" in archive.namelist()]
-        with archive.open(known[0]) as member:
-            return count_npy(path, member, size)
-
-
-def cloud_arrays(path: Path, cloud: Cloud) -> dict[str, NDArray[Any]]:
-    """Return ``points`` and the fields of a cloud, checked to have one row a point."""
-    for name, values in cloud.fields.items():
-        check_length(path, name, values, len(cloud))
-        if name in _COORDINATES:
-            raise FormatError(f"{path}: expected fields beside points, got {name!r}; rename it.")
-    return {"points": cloud.coordinates, **cloud.fields}
-
-
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a ``.npz`` file; equal arrays give equal bytes, whenever and wherever."""
+    Equal arrays give equal bytes, whenever and wherever.
+    """
+    if segmentation is None:
+        for name, values in cloud.fields.items():
+            check_length(path, name, values, len(cloud))
+            if name in _COORDINATES:
+                raise FormatError(
+                    f"{path}: expected fields beside points, got {name!r}; rename it."
+                )
+        arrays = {"points": cloud.coordinates, **cloud.fields}
+    else:
+        arrays = _result(cloud, segmentation)
+    if provenance is not None:
+        arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
     for name, values in arrays.items():
         if values.dtype.hasobject:
             raise FormatError(
@@ -132,18 +133,49 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
                 npy_format.write_array(stream, np.asarray(values, order="C"), allow_pickle=False)
 
 
-def map_array(path: Path) -> NDArray[Any]:
-    """Map the array of a ``.npy`` file into memory, copy-on-write: no change reaches the file.
+def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
+    """Return the number of rows of the coordinates."""
+    with zipfile.ZipFile(stream) as archive:
+        known = [f"{name}.npy" for name in _COORDINATES if f"{name}.npy" in archive.namelist()]
+        with archive.open(known[0]) as member:
+            return count_npy(path, member, size)
 
-    Args:
-        path: The file.
 
-    Returns:
-        The array; its values are read from the disk when they are used.
+def _result(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a result, planes in the coordinates of the cloud itself.
 
-    Raises:
-        FormatError: If the file is missing, damaged, or holds Python objects.
+    What the table of planes does not have is left out.
     """
+
+    def moved(places: Tensor) -> NDArray[np.float64]:
+        return places.numpy(force=True).astype(np.float64) + cloud.origin
+
+    per_point = segmentation._asdict()
+    planes = per_point.pop("planes")
+    table = planes._asdict()
+    kind, outline, adjacency = (table.pop(name) for name in ("kind", "outline", "adjacency"))
+    arrays = {"points": cloud.coordinates}
+    arrays |= {name: values.numpy(force=True) for name, values in per_point.items()}
+    arrays |= {f"plane_{name}": values.numpy(force=True) for name, values in table.items()}
+    arrays["plane_offset"] = (
+        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ cloud.origin
+    )
+    arrays |= {f"plane_{name}": moved(table[name]) for name in ("centroid", "center")}
+    if kind is not None:
+        arrays["plane_kind"] = np.array(PLANE_KINDS)[kind.numpy(force=True)]
+    if adjacency is not None:
+        for name, values in adjacency._asdict().items():
+            arrays[f"adjacency_{name}"] = values.numpy(force=True)
+    if outline is not None:
+        rings = [(plane, ring) for plane, own in enumerate(outline) for ring in own]
+        arrays["outline_points"] = moved(torch.cat([planes.center[:0], *(r for _, r in rings)]))
+        arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], dtype=np.int64)
+        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)
+    return arrays
+
+
+def map_array(path: Path) -> NDArray[Any]:
+    """Map the array of a ``.npy`` file into memory, copy-on-write: no change reaches the file."""
     size = check_file(path)
     with path.open("rb") as stream:
         shape = _read_header(path, stream, size, content="the array")

@@ -6,7 +6,6 @@ needs every header line in place, and writes ASCII with ten decimals.
 """
 
 import struct
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -155,12 +154,11 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     return _Header(dtype, width, height, viewpoint, encoding, number, stream.tell())
 
 
-class _Entries:
-    """The lines of a header by their first word."""
+class _Entries(NamedTuple):
+    """The lines of a header by their first word: number and further words."""
 
-    def __init__(self, path: Path, lines: Mapping[str, tuple[int, list[str]]]) -> None:
-        self.path = path
-        self.lines = lines
+    path: Path
+    lines: dict[str, tuple[int, list[str]]]
 
     def error(self, key: str, expected: str) -> FormatError:
         """Return the error that a line is wrong or missing."""

@@ -219,12 +219,7 @@ def _is_number(word: str) -> bool:
 
 
 def _format_table(columns: Iterable[NDArray[np.generic]]) -> Iterator[str]:
-    r"""Yield columns as text that reads back to the same values, a block of lines at a time.
-
-    Example:
-        >>> "".join(_format_table([np.array([0.1, 2.0]), np.array([3, 4], dtype=np.uint8)]))
-        '0.1 3\n2.0 4\n'
-    """
+    """Yield columns as text that reads back to the same values, a block of lines at a time."""
     kept = list(columns)
     # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
     marks = {"f4": "%.9g", "f8": "%r"}

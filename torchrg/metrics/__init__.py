@@ -4,7 +4,10 @@
 are in :mod:`torchrg.metrics.modules`, which needs the extra ``metrics``.
 """
 
-from torchrg.metrics.catalog import METRICS, Index
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
 from torchrg.metrics.clusters import ClusterScore, score_clusters
 from torchrg.metrics.contingency import ContingencyTable, contingency_table
 from torchrg.metrics.labels import (
@@ -38,3 +41,67 @@ __all__ = [
     "score_normals",
     "segmentation_covering",
 ]
+
+
+class Index(NamedTuple):
+    """What a number means.
+
+    Attributes:
+        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""`` for shares and
+            ratios.
+        higher_is_better: None where neither direction is better.
+    """
+
+    unit: str
+    higher_is_better: bool | None
+
+
+_LABELS = {
+    Index("%", True): "precision recall f1",
+    Index("count", None): "pairs regions faces points",
+    Index("count", True): "correct",
+    Index("count", False): "over_segmented under_segmented missed noise",
+    Index("", True): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
+    "evops_precision evops_recall evops_f1 evops_mean_iou evops_mean_dice "
+    "share_labeled covering ari nmi",
+    Index("", False): "evops_over_segmented evops_under_segmented evops_missed evops_noise",
+}
+_CLUSTERS = {
+    Index("rad", False): "cp",
+    Index("rad", True): "sp",
+    Index("", False): "dbi",
+    Index("", True): "dvi",
+    Index("count", None): "clusters points sample_size sampled_clusters",
+    Index("count", False): "invalid",
+    Index("", None): "seed dvi_exact",
+}
+_NORMALS = {
+    Index("deg^2", False): "msae",
+    Index("deg", False): "rms mean median",
+    Index("", True): "under_5_deg under_10_deg under_20_deg",
+    Index("count", None): "points",
+    Index("count", False): "invalid",
+}
+"""Of sharp points and of regular ones the indices mean the same."""
+
+
+def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str, Index]:
+    """Return the index of each field."""
+    found = {name: index for index, names in meanings.items() for name in names.split()}
+    plain = (name.removeprefix("sharp_").removeprefix("regular_") for name in fields)
+    return MappingProxyType(dict(zip(fields, map(found.__getitem__, plain), strict=True)))
+
+
+METRICS: Mapping[str, Mapping[str, Index]] = MappingProxyType(
+    {
+        "labels": _by_name(LabelScore._fields, _LABELS),
+        "clusters": _by_name(ClusterScore._fields, _CLUSTERS),
+        "normals": _by_name(NormalScore._fields, _NORMALS),
+    }
+)
+"""The fields of ``LabelScore``, ``ClusterScore`` and ``NormalScore``, by part and name.
+
+Example:
+    >>> METRICS["labels"]["f1"]
+    Index(unit='%', higher_is_better=True)
+"""

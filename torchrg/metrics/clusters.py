@@ -12,7 +12,6 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import check_labels, check_one_device, number_labels
 from torchrg.metrics.sphere import (
-    MAX_PAIRS,
     Centers,
     chord_table,
     chord_to_angle,
@@ -20,6 +19,7 @@ from torchrg.metrics.sphere import (
     find_centers,
     measure_spreads,
     merge_directions,
+    rows_at_once,
     unit_vectors,
 )
 from torchrg.neighbors import canonical_order
@@ -74,7 +74,6 @@ def score_clusters(
     max_angle_deg: float = 5.0,
     sample_size: int = 20_000,
     seed: int = 0,
-    max_pairs: int = MAX_PAIRS,
 ) -> ClusterScore:
     r"""Score clusters of normals on the Gaussian sphere: CP, SP, DBI and DVI [1].
 
@@ -109,7 +108,6 @@ def score_clusters(
             points than this can be its ends (on planes they are few, and the diameter is exact at
             any size). CP, SP and the distance between clusters are always exact.
         seed: Seed of the subsample. It does not depend on the order of the points.
-        max_pairs: Distances in memory at a time; changes the result by rounding only.
 
     Returns:
         The indices. No cluster: all nan. One cluster: CP, the others nan. A cluster of one point
@@ -135,7 +133,13 @@ def score_clusters(
     check_shapes("score_clusters", normals=(normals, "N 3"), labels=(labels, "N"))
     check_floating("score_clusters", normals=normals)
     check_one_device("score_clusters", normals=normals, labels=labels)
-    _check_settings(min_size, max_angle_deg, sample_size, max_pairs)
+    for name, value, least in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
+        if value < least:
+            raise ConfigError(f"score_clusters: expected {name} >= {least}, got {value!r}.")
+    if not 0 <= max_angle_deg <= 90:
+        raise ConfigError(
+            f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."
+        )
     directions, clusters, invalid = _labeled_directions(normals, labels, min_size)
     num_clusters = int(clusters.max()) + 1 if len(clusters) else 0
     found = find_centers(directions, clusters, num_clusters)
@@ -143,39 +147,25 @@ def score_clusters(
         clusters = merge_directions(found.centers, max_angle_deg=max_angle_deg)[clusters]
         num_clusters = int(clusters.max()) + 1 if len(clusters) else 0
         found = find_centers(directions, clusters, num_clusters)
-    parts = _split(found, clusters)
-    spreads = measure_spreads(
-        parts, found.centers, sample_size=sample_size, seed=seed, max_pairs=max_pairs
+    members = found.directions[clusters.argsort(stable=True)]
+    parts = torch.split(members, torch.bincount(clusters).tolist()) if num_clusters else ()
+    means, diameters, num_sampled, exact = measure_spreads(
+        parts, found.centers, sample_size=sample_size, seed=seed
     )
-    sp, dbi = _separation(found.centers, spreads.means, max_pairs)
+    sp, dbi = _separation(found.centers, means)
     return ClusterScore(
         cp=_compactness(found, clusters),
         sp=sp,
         dbi=dbi,
-        dvi=_dunn(closest_between(directions, clusters, max_pairs=max_pairs), spreads.diameters),
+        dvi=_dunn(closest_between(directions, clusters), diameters),
         clusters=num_clusters,
         points=len(clusters),
         invalid=invalid,
         sample_size=sample_size,
         seed=seed,
-        sampled_clusters=spreads.num_sampled,
-        dvi_exact=spreads.exact_diameters,
+        sampled_clusters=num_sampled,
+        dvi_exact=exact,
     )
-
-
-def _check_settings(min_size: int, max_angle_deg: float, sample_size: int, max_pairs: int) -> None:
-    """Raise a ConfigError for a setting out of range."""
-    for name, value, least in (
-        ("min_size", min_size, 1),
-        ("sample_size", sample_size, 2),
-        ("max_pairs", max_pairs, 1),
-    ):
-        if value < least:
-            raise ConfigError(f"score_clusters: expected {name} >= {least}, got {value!r}.")
-    if not 0 <= max_angle_deg <= 90:
-        raise ConfigError(
-            f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."
-        )
 
 
 def _labeled_directions(
@@ -197,20 +187,12 @@ def _compactness(found: Centers, clusters: Tensor) -> float:
     return float((torch.bincount(clusters, angles) / torch.bincount(clusters)).mean())
 
 
-def _split(found: Centers, clusters: Tensor) -> tuple[Tensor, ...]:
-    """Return the aligned directions of each cluster."""
-    if not len(clusters):
-        return ()
-    members = found.directions[clusters.argsort(stable=True)]
-    return torch.split(members, torch.bincount(clusters).tolist())
-
-
-def _separation(centers: Tensor, spreads: Tensor, max_pairs: int) -> tuple[float, float]:
+def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:
     """Return SP (eq. 13) and DBI (eq. 14); nan for fewer than two clusters."""
     count = len(centers)
     if count < 2:
         return math.nan, math.nan
-    total, worst, rows = 0.0, 0.0, max(1, max_pairs // count)
+    total, worst, rows = 0.0, 0.0, rows_at_once(count)
     for start in range(0, count, rows):
         some = slice(start, start + rows)
         distances = chord_to_angle(chord_table(centers[some], centers))
@@ -233,7 +215,7 @@ def _dunn(closest: float, diameters: Tensor) -> float:
     return closest / largest if largest > _COINCIDENT else math.inf
 
 
-def closest_between(directions: Tensor, clusters: Tensor, *, max_pairs: int = MAX_PAIRS) -> float:
+def closest_between(directions: Tensor, clusters: Tensor) -> float:
     """Return the smallest angle between directions of different clusters, for eq. (15).
 
     Exact for clouds of any size, by two searches. A grid on the sphere, made finer step by step,
@@ -243,7 +225,7 @@ def closest_between(directions: Tensor, clusters: Tensor, *, max_pairs: int = MA
     digit the directions are split by it and the closest pair across the split is found.
 
     Radians, in [0, pi/2]; infinite for fewer than two clusters. Directions are unit vectors
-    ``(N, 3)``, float64; at most ``max_pairs`` chords are in memory at a time.
+    ``(N, 3)``, float64.
     """
     if len(clusters) == 0 or clusters.min() == clusters.max():
         return torch.inf
@@ -255,18 +237,18 @@ def closest_between(directions: Tensor, clusters: Tensor, *, max_pairs: int = MA
     if (repeated & (clusters[1:] != clusters[:-1])).any():
         return 0.0
     new = torch.cat([torch.ones_like(repeated[:1]), ~repeated])
-    chord = _closest_chord(points[new], clusters[new], max_pairs)
+    chord = _closest_chord(points[new], clusters[new])
     return float(chord_to_angle(torch.tensor(chord, dtype=torch.float64)))
 
 
-def _closest_chord(points: Tensor, clusters: Tensor, max_pairs: int) -> float:
+def _closest_chord(points: Tensor, clusters: Tensor) -> float:
     """Return the shortest chord between two clusters of distinct points of the upper half."""
     best, cells = 2.0, clusters
     for level in range(_FINEST_LEVEL):
         cells, firsts = _refine(cells, points, level)
         if len(firsts) > _MAX_CELLS:
             return _closest_by_digits(points, clusters, best)
-        chords = _closest_others(points[firsts], clusters[firsts], max_pairs)
+        chords = _closest_others(points[firsts], clusters[firsts])
         best = min(best, float(chords.min()))
         if len(firsts) == len(points):
             break
@@ -290,9 +272,9 @@ def _refine(cells: Tensor, points: Tensor, level: int) -> tuple[Tensor, Tensor]:
     return torch.empty_like(keys).index_copy_(0, order, new.cumsum(0) - 1), order[new]
 
 
-def _closest_others(points: Tensor, clusters: Tensor, max_pairs: int) -> Tensor:
+def _closest_others(points: Tensor, clusters: Tensor) -> Tensor:
     """Return the chord from each point to the closest one of another cluster, shape ``(C,)``."""
-    rows = max(1, max_pairs // len(points))
+    rows = rows_at_once(len(points))
     closest = []
     for some, own in zip(torch.split(points, rows), torch.split(clusters, rows), strict=True):
         chords = chord_table(some, points)

@@ -10,10 +10,15 @@ from torch import Tensor
 
 from torchrg._optional import require
 from torchrg.errors import ConfigError
-from torchrg.metrics.catalog import METRICS
-from torchrg.metrics.clusters import ClusterScore, score_clusters
-from torchrg.metrics.labels import LabelScore, score_labels
-from torchrg.metrics.normals import NormalScore, score_normals
+from torchrg.metrics import (
+    METRICS,
+    ClusterScore,
+    LabelScore,
+    NormalScore,
+    score_clusters,
+    score_labels,
+    score_normals,
+)
 
 if TYPE_CHECKING:
     from torchmetrics import Metric

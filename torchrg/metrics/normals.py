@@ -102,37 +102,33 @@ def score_normals(
     """
     normals = as_tensor("score_normals", "normals", normals)
     truth = as_tensor("score_normals", "truth", truth)
+    given = {"sharp": sharp, "valid": valid}
     masks = {
-        name: None if mask is None else as_tensor("score_normals", name, mask)
-        for name, mask in (("sharp", sharp), ("valid", valid))
+        name: as_tensor("score_normals", name, mask)
+        for name, mask in given.items()
+        if mask is not None
     }
     check_floating("score_normals", normals=normals)
     check_floating("score_normals", truth=truth)
     vectors = {"normals": (normals, "* 3"), "truth": (truth, "* 3")}
     check_shapes("score_normals", **vectors, **{name: (m, "*") for name, m in masks.items()})
-    _check_masks(normals, truth, masks)
-
-    flat = {name: None if mask is None else mask.reshape(-1) for name, mask in masks.items()}
-    errors, scored, has_truth = _angle_errors(normals.reshape(-1, 3), truth.reshape(-1, 3))
-    if flat["valid"] is not None:
-        scored = scored & flat["valid"]
-    invalid = int((has_truth & ~scored).sum())
-    split: dict[str, Any] = {}
-    if flat["sharp"] is not None:
-        for name, part in (("sharp", flat["sharp"]), ("regular", ~flat["sharp"])):
-            values = _summarize(errors[scored & part])
-            split |= {f"{name}_{index}": value for index, value in values.items()}
-    return NormalScore(invalid=invalid, **_summarize(errors[scored]), **split)
-
-
-def _check_masks(normals: Tensor, truth: Tensor, masks: dict[str, Tensor | None]) -> None:
-    """Raise a ShapeError for a mask that is not bool, or tensors on several devices."""
-    given = {name: mask for name, mask in masks.items() if mask is not None}
-    for name, mask in given.items():
+    for name, mask in masks.items():
         if mask.dtype != torch.bool:
             dtype = str(mask.dtype).removeprefix("torch.")
             raise ShapeError(f"score_normals: expected {name} of bool, got {dtype}.")
-    check_one_device("score_normals", normals=normals, truth=truth, **given)
+    check_one_device("score_normals", normals=normals, truth=truth, **masks)
+
+    errors, scored, has_truth = _angle_errors(normals.reshape(-1, 3), truth.reshape(-1, 3))
+    if "valid" in masks:
+        scored = scored & masks["valid"].reshape(-1)
+    invalid = int((has_truth & ~scored).sum())
+    split: dict[str, Any] = {}
+    if "sharp" in masks:
+        edges = masks["sharp"].reshape(-1)
+        for name, part in (("sharp", edges), ("regular", ~edges)):
+            values = _summarize(errors[scored & part])
+            split |= {f"{name}_{index}": value for index, value in values.items()}
+    return NormalScore(invalid=invalid, **_summarize(errors[scored]), **split)
 
 
 def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:

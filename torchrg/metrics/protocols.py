@@ -8,6 +8,10 @@ from torch import Tensor
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import ContingencyTable
 
+_MATCH_IOU, _PART_IOU = 0.75, 0.2
+"""Least IoU of a match and of an overlap in part, as in the EVOPS benchmark. Above 0.5 matches are
+one to one."""
+
 
 class SegCompCounts(NamedTuple):
     """How the regions and faces are classified by the SegComp protocol.
@@ -135,15 +139,13 @@ def _wholes(
     return torch.where((count >= 2) & (held > limit), (mean + held) / 2, 0)
 
 
-def score_evops(
-    table: ContingencyTable, *, full_iou: float = 0.75, part_iou: float = 0.2
-) -> EvopsScore:
+def score_evops(table: ContingencyTable) -> EvopsScore:
     """Score regions against faces by the EVOPS protocol [1].
 
-    A region and a face *match* at an IoU of ``full_iou`` and overlap *in part* at ``part_iou``. A
-    region that overlaps several faces in part is under-segmented, a face that overlaps several
-    regions in part over-segmented. A region is noise, and a face missed, if it overlaps nothing
-    in part, or exactly one partner that it does not match and that has no other partner.
+    A region and a face *match* at an IoU of 0.75 and overlap *in part* at 0.2. A region that
+    overlaps several faces in part is under-segmented, a face that overlaps several regions in part
+    over-segmented. A region is noise, and a face missed, if it overlaps nothing in part, or exactly
+    one partner that it does not match and that has no other partner.
 
     Convention:
         Both bounds are included ("at least"), as in the benchmark. A point of no face counts in
@@ -151,15 +153,9 @@ def score_evops(
 
     Args:
         table: Overlaps of regions and faces.
-        full_iou: IoU of a match, above 0.5, so that matches are one to one.
-        part_iou: IoU of an overlap in part, at most ``full_iou``.
 
     Returns:
         Shares; 0 where there is nothing to take a share of.
-
-    Raises:
-        ConfigError: If the bounds are not ``0 < part_iou <= full_iou`` with ``full_iou`` in
-            (0.5, 1].
 
     References:
         [1] A. Kornilova et al. EVOPS benchmark: evaluation of plane segmentation from RGBD and
@@ -171,12 +167,7 @@ def score_evops(
         >>> score_evops(table).precision, score_evops(table).recall
         (0.5, 0.5)
     """
-    if not (0.5 < full_iou <= 1 and 0 < part_iou <= full_iou):
-        raise ConfigError(
-            "score_evops: expected 0 < part_iou <= full_iou and full_iou in (0.5, 1], "
-            f"got {part_iou!r} and {full_iou!r}."
-        )
-    full, part = table.iou >= full_iou, table.iou >= part_iou
+    full, part = table.iou >= _MATCH_IOU, table.iou >= _PART_IOU
     matched = table.iou[full]
     num_matched = len(matched)
     num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrg.neighbors import canonical_order
 
-MAX_PAIRS = 2**17
+_MAX_PAIRS = 2**17
 """Distances in memory at a time: about what stays in a cache."""
 
 _ROUNDING = 1e-12
@@ -25,22 +25,6 @@ class Centers(NamedTuple):
 
     centers: Tensor
     directions: Tensor
-
-
-class Spreads(NamedTuple):
-    """How wide each cluster is.
-
-    Attributes:
-        means: Mean angle over all pairs of points of each cluster, radians, shape ``(M,)``.
-        diameters: Largest angle within each cluster, radians, shape ``(M,)``.
-        num_sampled: Clusters whose mean was taken over a subsample.
-        exact_diameters: Whether no diameter was.
-    """
-
-    means: Tensor
-    diameters: Tensor
-    num_sampled: int
-    exact_diameters: bool
 
 
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,6 +44,11 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     unit = torch.where(exists[..., None], unit / size, 0)
     length = unit.square().sum(dim=-1, keepdim=True).sqrt()
     return torch.where(exists[..., None], unit / length, 0), exists
+
+
+def rows_at_once(length: int) -> int:
+    """Return how many rows of distances of a length are in memory at a time."""
+    return max(1, _MAX_PAIRS // max(1, length))
 
 
 def chord_table(a: Tensor, b: Tensor, *, aligned: bool = False) -> Tensor:
@@ -89,12 +78,8 @@ def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> Cen
 
     Normals have no sign, so each is first turned to the side of the cluster's principal axis, the
     direction that the sum of ``(n . axis)^2`` is largest for. The mean of the turned vectors
-    cannot vanish. The sign of a centre makes its largest entry positive.
-
-    Args:
-        directions: Shape ``(N, 3)``.
-        clusters: Cluster of each, 0 to M-1, each with one direction at least, shape ``(N,)``.
-        num_clusters: M.
+    cannot vanish. The sign of a centre makes its largest entry positive. Each cluster of
+    ``clusters`` ``(N,)``, 0 to M-1, has one direction at least.
 
     Example:
         >>> directions = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]], dtype=torch.float64)
@@ -117,9 +102,7 @@ def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> Cen
     return Centers(centers, aligned)
 
 
-def merge_directions(
-    centers: Tensor, *, max_angle_deg: float = 5.0, max_pairs: int = MAX_PAIRS
-) -> Tensor:
+def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
     """Number the groups of centres ``(M, 3)`` that are joined by steps of at most an angle.
 
     Groups are 0, 1, ... in the order of their first members, shape ``(M,)``, int64.
@@ -138,7 +121,7 @@ def merge_directions(
             groups[newest] = group
             rest = rest[groups[rest] < 0]
             near = torch.zeros_like(rest, dtype=torch.bool)
-            for some in torch.split(newest, max(1, max_pairs // max(1, len(rest)))):
+            for some in torch.split(newest, rows_at_once(len(rest))):
                 near |= (chord_table(centers[some], centers[rest]) <= longest).any(dim=0)
             newest = rest[near]
         group += 1
@@ -146,63 +129,49 @@ def merge_directions(
 
 
 def measure_spreads(
-    parts: Sequence[Tensor],
-    centers: Tensor,
-    *,
-    sample_size: int = 20_000,
-    seed: int = 0,
-    max_pairs: int = MAX_PAIRS,
-) -> Spreads:
-    """Measure mean pairwise angle and diameter of each cluster.
+    parts: Sequence[Tensor], centers: Tensor, *, sample_size: int = 20_000, seed: int = 0
+) -> tuple[Tensor, Tensor, int, bool]:
+    """Return mean angle over all pairs, and diameter, of the directions of each cluster, ``(M,)``.
 
-    Args:
-        parts: Directions of each cluster, M tensors of shape ``(n, 3)``, n >= 1.
-        centers: Centre of each cluster, shape ``(M, 3)``.
-        sample_size: Larger clusters, and larger sets of possible ends of a diameter, are
-            subsampled to this size.
-        seed: Seed of the subsamples.
-        max_pairs: Angles in memory at a time; changes the result by rounding only.
+    Larger clusters, and larger sets of possible ends of a diameter, are subsampled to
+    ``sample_size``; third and fourth are the clusters whose mean is of a subsample, and whether no
+    diameter is.
 
     Example:
         >>> axes = torch.eye(3, dtype=torch.float64)
-        >>> spreads = measure_spreads([axes[:1], axes[1:]], axes[:2])
-        >>> spreads.means.rad2deg().round().tolist(), spreads.num_sampled
+        >>> means, _, num_sampled, _ = measure_spreads([axes[:1], axes[1:]], axes[:2])
+        >>> means.rad2deg().round().tolist(), num_sampled
         ([0.0, 90.0], 0)
     """
     means, diameters, num_sampled, exact = [], [], 0, True
     for part, center in zip(parts, centers, strict=True):
         ends = _rim(part, center)
-        means.append(_mean_pairwise_angle(_subsample(part, sample_size, seed), max_pairs))
-        diameters.append(_diameter(_subsample(ends, sample_size, seed), max_pairs))
+        means.append(_mean_pairwise_angle(_subsample(part, sample_size, seed)))
+        angles = _upper_angles(_subsample(ends, sample_size, seed))
+        diameters.append(max((float(some.max()) for some in angles), default=0.0))
         num_sampled += len(part) > sample_size
         exact = exact and len(ends) <= sample_size
-    return Spreads(centers.new_tensor(means), centers.new_tensor(diameters), num_sampled, exact)
+    return centers.new_tensor(means), centers.new_tensor(diameters), num_sampled, exact
 
 
-def _mean_pairwise_angle(directions: Tensor, max_pairs: int) -> float:
+def _mean_pairwise_angle(directions: Tensor) -> float:
     """Return the mean angle over all pairs of directions (eq. 14); 0 for fewer than two."""
     count, total = len(directions), 0.0
-    for angles in _upper_angles(directions, max_pairs):
+    for angles in _upper_angles(directions):
         rows = len(angles)
         # The square at the diagonal holds each of its pairs twice.
         total += float(angles[:, rows:].sum() + angles[:, :rows].sum() / 2)
     return 2 * total / (count * (count - 1)) if count > 1 else 0.0
 
 
-def _diameter(directions: Tensor, max_pairs: int) -> float:
-    """Return the largest angle between two directions; 0 for fewer than two."""
-    largest = [float(angles.max()) for angles in _upper_angles(directions, max_pairs)]
-    return max(largest, default=0.0)
-
-
-def _upper_angles(directions: Tensor, max_pairs: int) -> Iterator[Tensor]:
+def _upper_angles(directions: Tensor) -> Iterator[Tensor]:
     """Yield the angles of some directions to themselves and to all later ones, ``(r, n)``."""
     count = len(directions)
     # Within 45 degrees of one of them no two are more than 90 degrees apart.
     aligned = bool(count) and float((directions @ directions[0]).min()) > 0.5**0.5
     start = 0
     while start < count:
-        rows = max(1, max_pairs // (count - start))
+        rows = rows_at_once(count - start)
         chords = chord_table(directions[start : start + rows], directions[start:], aligned=aligned)
         yield chord_to_angle(chords)
         start += rows

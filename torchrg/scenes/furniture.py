@@ -5,10 +5,9 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from torchrg.scenes.geometry import Frame, Triple
-from torchrg.scenes.round import Cone, Ring
 from torchrg.scenes.scene import Part
 from torchrg.scenes.shells import against
-from torchrg.scenes.surfaces import Ball, Block, Drum, Hole, rectangle
+from torchrg.scenes.surfaces import Ball, Block, Cone, Drum, Hole, Ring, rectangle
 
 SIDES = ("left", "right", "front", "back")
 """Left and right are across the first axis of a body, front and back across the second."""
@@ -25,15 +24,10 @@ def block(
     without: Collection[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> Part:
-    """Return a rectangular body standing on the origin of a frame, and its faces.
+    """Return a rectangular body, and its faces: :data:`SIDES`, "bottom" and "top".
 
-    Args:
-        kind: What it is.
-        frame: The third axis is up, the origin is the middle of the base.
-        size: Lengths along the three axes.
-        without: Faces left out because something covers all of them: of :data:`SIDES`, "bottom"
-            and "top".
-        kinds: Names of faces that are not called ``kind``.
+    The third axis of the frame is up, the origin the middle of the base. Faces that something
+    covers completely are left out by ``without``; ``kinds`` names those not called ``kind``.
     """
     x, y, z = size
     corners = {
@@ -96,11 +90,9 @@ def _board(kind: str, frame: Frame, size: Triple) -> Part:
     return block(kind, frame, size, without=["back"], kinds=names)
 
 
-def draw_table(
-    rng: np.random.Generator, frame: Frame, thickness: float, height: float | None
-) -> Part:
-    """Return a plate with all its faces on a square post, of random height unless one is given."""
-    height = between(rng, *_TABLE_HEIGHT) if height is None else height
+def draw_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part:
+    """Return a plate with all its faces on a square post."""
+    height = between(rng, *_TABLE_HEIGHT)
     length, width, post = between(rng, 1.25, 1.5), between(rng, 0.65, 0.8), between(rng, 0.2, 0.35)
     names = dict.fromkeys(SIDES, "table edge") | {"bottom": "table underside", "top": "table top"}
     under = height - thickness

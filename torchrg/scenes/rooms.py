@@ -12,13 +12,13 @@ from torchrg.errors import ConfigError
 from torchrg.scenes import furniture
 from torchrg.scenes.furniture import between
 from torchrg.scenes.geometry import Array, Frame, Triple
-from torchrg.scenes.sampling import Density, NoiseDirection, Order, sample_scene
 from torchrg.scenes.scene import (
     Part,
     Scene,
     SceneModel,
     is_occupied,
     plane_table,
+    sample_scene,
     seeded_generator,
 )
 from torchrg.scenes.shells import recess, room_walls, shell
@@ -41,8 +41,6 @@ _DOORWAY_AISLE = 1.6
 """From the middle of a doorway to what is on walls, metres."""
 _DOORWAY_SPACE = 1.9
 """From the middle of a doorway to what stands on the floor, for an open door, metres."""
-_EQUAL_TABLE_HEIGHT = 0.74
-"""Metres."""
 _TRIES = 1000
 """Draws of an object until none of its faces lies in the plane of another."""
 _PARALLEL = 1 - 0.02**2 / 2
@@ -87,8 +85,6 @@ class RoomLayout:
     """Least thickness of panels; each is up to twice as thick, so that no two are in one plane."""
     heading_deg: float = 0.0
     """How far the room is turned about the upward axis."""
-    equal_tables: bool = False
-    """Whether all table tops lie in one plane."""
     min_plane_gap: float = 0.005
     """Least distance of any face to the plane of another face that is parallel to it."""
     num_viewpoints: int = 1
@@ -115,39 +111,12 @@ class RoomLayout:
             )
 
 
-CURVED_LAYOUT = RoomLayout(
-    num_windows=1,
-    num_tables=4,
-    num_columns=2,
-    num_round_tables=2,
-    num_balls=2,
-    num_lamps=2,
-    num_bent_walls=1,
-)
-"""A room with columns, balls, lamps, round tables and a bent wall."""
-
-BENT_LAYOUT = RoomLayout(
-    num_doors=0, num_windows=0, num_cabinets=0, num_shelves=0, num_bent_walls=4
-)
-"""A room whose walls are all slightly bent."""
-
-THIN_LAYOUT = RoomLayout(
-    num_windows=2, num_cabinets=1, num_shelves=4, num_panels=3, plate_thickness=0.02
-)
-"""A room with many thin plates: tables and shelves of 2 cm, panels of 1.5 to 3 cm."""
-
-
 def make_room(
     num_points: int = 1_000_000,
     noise: float = 0.003,
     seed: int = 0,
     *,
     layout: RoomLayout | None = None,
-    noise_direction: NoiseDirection = "normal",
-    density: Density = "uniform",
-    outlier_fraction: float = 0.0,
-    order: Order = "random",
-    colors: bool = False,
 ) -> Scene:
     """Make a cloud of a furnished room with exact truth.
 
@@ -157,14 +126,9 @@ def make_room(
 
     Args:
         num_points: Number of points.
-        noise: Standard deviation of the noise, in metres.
+        noise: Standard deviation of the noise along the normals, in metres.
         seed: Two calls with equal arguments give equal clouds; see :func:`sample_scene`.
         layout: What is in the room. Default: ``RoomLayout()``.
-        noise_direction: See :func:`sample_scene`.
-        density: See :func:`sample_scene`.
-        outlier_fraction: Share of points that belong to no face.
-        order: See :func:`sample_scene`.
-        colors: Whether to colour the points by object.
 
     Returns:
         The cloud and its truth.
@@ -177,17 +141,7 @@ def make_room(
         >>> room.points.shape, len(room.kinds)
         (torch.Size([5000, 3]), 153)
     """
-    return sample_scene(
-        build_room(seed, layout=layout),
-        num_points,
-        noise=noise,
-        seed=seed,
-        noise_direction=noise_direction,
-        density=density,
-        outlier_fraction=outlier_fraction,
-        order=order,
-        colors=colors,
-    )
+    return sample_scene(build_room(seed, layout=layout), num_points, noise=noise, seed=seed)
 
 
 def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel:
@@ -222,14 +176,9 @@ def furnish(
     doorways: Sequence[tuple[int, Hole]] = (),
     with_floor: bool = True,
 ) -> tuple[Part, ...]:
-    """Return the parts of a room: its shell, then what is in it.
+    """Return the parts of a room, whose origin is a corner of the floor: its shell, then the rest.
 
-    Args:
-        layout: What there is to be.
-        room: Its origin is a corner of the floor.
-        rng: Source of sizes and places.
-        doorways: Holes in walls that are there already, each with its wall.
-        with_floor: Whether the room has a floor of its own.
+    ``doorways`` are holes in walls that are there already, each with its wall.
 
     Raises:
         ConfigError: If the room is too small for its furniture.
@@ -327,25 +276,20 @@ class _Furnisher:
 
     def place_table(self, *, with_box: bool) -> None:
         """Put a table on a free place of the floor, and on it perhaps a box."""
-        layout, middle = self.layout, _take(self.floor_places, "floor")
-        equal = layout.equal_tables
+        middle, thickness = _take(self.floor_places, "floor"), self.layout.plate_thickness
         desk = self._place(
             lambda: furniture.draw_table(
-                self.rng,
-                self._standing(middle, max_heading_deg=12),
-                layout.plate_thickness,
-                _EQUAL_TABLE_HEIGHT if equal else None,
-            ),
-            min_gap=0.0 if equal else None,
+                self.rng, self._standing(middle, max_heading_deg=12), thickness
+            )
         )
         if with_box:
             [top] = [surface for surface in desk.surfaces if surface.kind == "table top"]
             middle_of_top = Frame.upright(top.bounds.mean(axis=0))
             self._place(lambda: furniture.draw_small_box(self.rng, middle_of_top))
 
-    def _place(self, draw: Callable[[], Part], *, min_gap: float | None = None) -> Part:
+    def _place(self, draw: Callable[[], Part]) -> Part:
         """Add the first of several drawn objects that has no face in the plane of another."""
-        gap = self.layout.min_plane_gap if min_gap is None else min_gap
+        gap = self.layout.min_plane_gap
         for _ in range(_TRIES):
             part = draw()
             if not _shares_plane(part, self.parts, gap):

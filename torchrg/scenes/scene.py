@@ -1,9 +1,9 @@
-"""What a scene is made of, and what sampling it gives."""
+"""What a scene is made of, and clouds sampled from it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -14,8 +14,14 @@ from torchrg.errors import ConfigError
 from torchrg.scenes.geometry import Array, Floats
 from torchrg.scenes.surfaces import Solid, Surface
 
+NoiseDirection = Literal["normal", "isotropic"]
+
+PLACES, NOISE = range(2)
+"""What random numbers are drawn for: the same places whatever the noise."""
 _CLEARANCE = 1e-7
 """How far in front of a surface must be free for it to be seen, in sizes of the scene."""
+_SPARE = 1.02
+"""How many more points are tried than are expected to be needed: fewer repetitions."""
 
 
 class Scene(NamedTuple):
@@ -23,18 +29,16 @@ class Scene(NamedTuple):
 
     Attributes:
         points: Shape ``(N, 3)``, float32, metres.
-        labels: Row of each point's face in the tables below, shape ``(N,)``, int64;
-            ``torchrg.UNLABELED`` for outliers. Curved faces have labels too, see ``planar``.
+        labels: Row of each point's face in the tables below, shape ``(N,)``, int64. Curved faces
+            have labels too, see ``planar``.
         normals: Unit normals of the faces at the points before noise, towards free space, shape
-            ``(N, 3)``, float32; zero for outliers.
+            ``(N, 3)``, float32.
         planar: Whether each face lies in a plane, shape ``(M,)``, bool.
         face_normals: Normals of the planar faces, shape ``(M, 3)``, float64; zero for curved ones.
         face_offsets: Offsets of their planes, ``normal . x = offset``, shape ``(M,)``, float64.
         face_areas: Areas, covered parts included, shape ``(M,)``, float64.
         kinds: What each face is part of, as in ``"table edge"``, of length M.
         objects: Which object each face belongs to, shape ``(M,)``, int64.
-        colors: Colours of the objects with some variation, shape ``(N, 3)``, uint8; None unless
-            asked for.
     """
 
     points: Tensor
@@ -46,7 +50,6 @@ class Scene(NamedTuple):
     face_areas: Tensor
     kinds: tuple[str, ...]
     objects: Tensor
-    colors: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -86,11 +89,6 @@ class SceneModel:
         return np.repeat(np.arange(len(counts)), counts)
 
     @cached_property
-    def planes(self) -> tuple[Array, Array]:
-        """Normals ``(M, 3)`` and offsets ``(M,)`` of the faces; zero for curved ones."""
-        return plane_table(self.surfaces)
-
-    @cached_property
     def bounds(self) -> Array:
         """Lowest and highest coordinates of a box around all faces, shape ``(2, 3)``."""
         boxes = np.stack([surface.bounds for surface in self.surfaces])
@@ -124,6 +122,92 @@ class SceneModel:
         )
 
 
+def sample_scene(
+    model: SceneModel,
+    num_points: int,
+    *,
+    noise: float = 0.0,
+    seed: int = 0,
+    noise_direction: NoiseDirection = "normal",
+) -> Scene:
+    """Sample the visible surface of a scene.
+
+    Each point is drawn independently and evenly from all of the surface that has free space in
+    front of it, so the number of points of a face is proportional to its visible area. What other
+    objects hide from a scanner is sampled as well.
+
+    Convention:
+        The same seed gives the same places on the surface whatever the noise, so the noise of a
+        cloud is its difference to the cloud with ``noise=0``.
+
+    Args:
+        model: The scene.
+        num_points: Number of points.
+        noise: Standard deviation of the noise, in metres.
+        seed: Two calls with equal arguments give equal clouds; on another processor sines of
+            slanted and curved parts may differ in the last bit.
+        noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
+            every direction.
+
+    Returns:
+        The cloud and its truth, in random order.
+
+    Raises:
+        ConfigError: If a setting is not allowed.
+
+    Example:
+        >>> from torchrg.scenes import build_room
+        >>> sample_scene(build_room(seed=3), 1000, noise=0.002).points.shape
+        torch.Size([1000, 3])
+    """
+    if num_points < 1:
+        raise ConfigError(f"sample_scene: expected num_points >= 1, got {num_points}.")
+    if not 0 <= noise < float("inf"):
+        raise ConfigError(f"sample_scene: expected noise >= 0 metres, got {noise}.")
+    if noise_direction not in get_args(NoiseDirection):
+        options = ", ".join(get_args(NoiseDirection))
+        raise ConfigError(
+            f"sample_scene: expected noise_direction to be one of {options}, got "
+            f"{noise_direction!r}."
+        )
+    rng = seeded_generator(seed, PLACES)
+    points, normals, labels = _draw_places(model, num_points, rng)
+    if noise > 0:
+        shake = seeded_generator(seed, NOISE)
+        if noise_direction == "normal":
+            shifts = shake.standard_normal((num_points, 1), dtype=np.float32) * normals
+        else:
+            shifts = shake.standard_normal((num_points, 3), dtype=np.float32)
+        points += np.float32(noise) * shifts
+    rows = rng.permutation(num_points)
+    return label_points(model, points[rows], labels[rows], normals[rows])
+
+
+def _draw_places(
+    model: SceneModel, num_points: int, rng: np.random.Generator
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return points, normals and faces of exactly ``num_points`` places, face after face."""
+    areas = np.array([surface.area for surface in model.surfaces])
+    drawn: list[tuple[Floats, Floats, NDArray[np.int64]]] = []
+    missing, share_kept = num_points, 1.0
+    while missing > 0:
+        num_tried = int(missing / share_kept * _SPARE) + 16
+        num_kept = 0
+        for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
+            tried = model.surfaces[face].sample(rng, int(count))
+            outwards = model.surfaces[face].normals_at(tried)
+            kept = model.is_visible(face, tried, outwards)
+            points, normals = to_float32(tried[kept]), to_float32(outwards[kept])
+            drawn.append((points, normals, np.full(len(points), face)))
+            num_kept += len(points)
+        missing -= num_kept
+        share_kept = max(num_kept, 1) / num_tried
+    points, normals, labels = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    # A random subset: to keep the first would leave the last faces short of points.
+    chosen = np.sort(rng.permutation(len(labels))[:num_points])
+    return points[chosen], normals[chosen], labels[chosen]
+
+
 def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
     """Return which points of shape ``(N, 3)`` are inside a body."""
     inside = np.zeros(len(points), dtype=bool)
@@ -142,14 +226,10 @@ def plane_table(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
 
 
 def label_points(
-    model: SceneModel,
-    points: Floats,
-    labels: NDArray[np.int64],
-    normals: Floats,
-    colors: NDArray[np.uint8] | None = None,
+    model: SceneModel, points: Floats, labels: NDArray[np.int64], normals: Floats
 ) -> Scene:
     """Return points ``(N, 3)`` of known faces ``(N,)`` as a cloud with the tables of its scene."""
-    face_normals, face_offsets = model.planes
+    face_normals, face_offsets = plane_table(model.surfaces)
     return Scene(
         points=torch.from_numpy(points),
         labels=torch.from_numpy(labels),
@@ -160,16 +240,16 @@ def label_points(
         face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),
         kinds=tuple(surface.kind for surface in model.surfaces),
         objects=torch.from_numpy(model.objects),
-        colors=None if colors is None else torch.from_numpy(colors),
     )
 
 
 def seeded_generator(seed: int, purpose: int) -> np.random.Generator:
-    """Return one of several independent generators that belong to a seed, one for each purpose.
-
-    Raises:
-        ConfigError: If the seed is negative.
-    """
+    """Return one of several independent generators that belong to a seed, one for each purpose."""
     if seed < 0:
         raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
     return np.random.Generator(np.random.PCG64([seed, purpose]))
+
+
+def to_float32(values: Array) -> Floats:
+    """Return values rounded to float32, in rows of their own."""
+    return np.ascontiguousarray(values, dtype=np.float32)

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrg.scenes.geometry import Frame, Triple
-from torchrg.scenes.round import Cone
 from torchrg.scenes.scene import Part
-from torchrg.scenes.surfaces import Drum, Hole, Surface, rectangle
+from torchrg.scenes.surfaces import Cone, Drum, Hole, Surface, rectangle
 
 
 def shell(
@@ -18,15 +17,11 @@ def shell(
     bends: Sequence[float] = (0, 0, 0, 0),
     with_floor: bool = True,
 ) -> Part:
-    """Return floor, ceiling and four walls with holes in them.
+    """Return floor, which is the first face, ceiling and four walls with holes in them.
 
-    Args:
-        room: Its origin is a corner of the floor.
-        size: Length, width and height.
-        holes: Of each wall of :func:`room_walls`, in its first two axes.
-        bends: How far the middle of each wall bulges into the room; 0 for a flat wall. Bent walls
-            have no holes.
-        with_floor: Whether there is a floor; it is the first face.
+    The origin of ``room`` is a corner of the floor; ``holes`` are those of each wall of
+    :func:`room_walls`, in its first two axes; ``bends`` say how far the middle of each wall bulges
+    into the room, 0 for a flat wall. Bent walls have no holes.
     """
     length, width, height = size
     above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
@@ -71,13 +66,9 @@ def _bent_wall(wall: Frame, length: float, height: float, bend: float) -> tuple[
 
 
 def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
-    """Return what is behind a hole in a wall: a leaf, or a pane, and the four sides to it.
+    """Return what is behind a hole in a wall: a leaf ``depth`` behind it, and the four sides to it.
 
-    Args:
-        kind: What the leaf is; the sides are called ``kind`` and "frame".
-        wall: First axis along the wall, second up, third into the room.
-        hole: In the first two axes of the wall.
-        depth: How far behind the wall the leaf is.
+    The hole is in the first two axes of the wall, along it and up; the third is into the room.
     """
     left, right, low, high = hole
     leaf = rectangle(kind, wall.moved(left, low, -depth), right - left, high - low)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.scenes.geometry import Array, Frame, box_around
-from torchrg.scenes.round import Cone
-from torchrg.scenes.surfaces import Plane, Surface, plane_of, rectangle
+from torchrg.scenes.surfaces import Cone, Plane, Surface, plane_of, rectangle
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from torchrg.errors import ConfigError
 from torchrg.scenes import Scene, SceneModel
 from torchrg.scenes.geometry import Array, unit
-from torchrg.scenes.round import FULL_CIRCLE, AngleRange, Cone, Ring
-from torchrg.scenes.sampling import NOISE, PLACES, to_float32
-from torchrg.scenes.scene import label_points, seeded_generator
-from torchrg.scenes.surfaces import Flat
+from torchrg.scenes.scene import NOISE, PLACES, label_points, seeded_generator, to_float32
+from torchrg.scenes.surfaces import FULL_CIRCLE, AngleRange, Cone, Flat, Ring
 from torchrg.structures import UNLABELED
 
 _FLAT_SLACK = 1e-9

@@ -13,10 +13,8 @@ from torchrg.errors import ConfigError
 from torchrg.scenes import Scene, SceneModel, sample_scene
 from torchrg.scenes.furniture import block
 from torchrg.scenes.geometry import Array, Frame, unit
-from torchrg.scenes.round import Cone, Ring
-from torchrg.scenes.sampling import NoiseDirection
-from torchrg.scenes.scene import Part
-from torchrg.scenes.surfaces import Flat, Surface, rectangle
+from torchrg.scenes.scene import NoiseDirection, Part
+from torchrg.scenes.surfaces import Cone, Flat, Ring, Surface, rectangle
 
 _NODES = 96
 """Of the quadrature for the area."""
