@@ -30,7 +30,7 @@ from torchrg.metrics import score_labels, score_normals
 from torchrg.neighbors import search_knn
 from torchrg.normals.consensus import constants, estimate_consensus
 from torchrg.regions import grow_regions
-from torchrg.scenes import BENT_LAYOUT, CURVED_LAYOUT, THIN_LAYOUT, RoomLayout, make_room
+from torchrg.scenes import RoomLayout, make_room
 from torchrg.structures import Neighbors
 
 TOLERANCES = {"ARI": 1.0, "mean": 0.05, "RMS": 0.25}
@@ -253,12 +253,15 @@ _ROOMS = {
         ),
         0.003,
     ),
-    "thin plates": (_small(THIN_LAYOUT, num_shelves=2, num_panels=2, num_tables=1), 0.002),
+    "thin plates": (
+        _small(RoomLayout(plate_thickness=0.02), num_shelves=2, num_panels=2, num_tables=1),
+        0.002,
+    ),
     "curved room": (
-        _small(CURVED_LAYOUT, num_round_tables=1, num_bent_walls=2, num_windows=1),
+        _small(RoomLayout(), num_round_tables=1, num_bent_walls=2, num_windows=1),
         0.003,
     ),
-    "bent walls, exact": (_small(BENT_LAYOUT, num_bent_walls=4, num_tables=1), 0.0),
+    "bent walls, exact": (_small(RoomLayout(), num_bent_walls=4, num_tables=1), 0.0),
 }
 _SHAPES = {
     "cube, exact": ("cube", 0.0, 50, None),
