@@ -116,38 +116,16 @@ def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def spread_bits(values: Tensor) -> Tensor:
-    """Put two zero bits between the bits of numbers below 2**21, int64.
-
-    Example:
-        >>> spread_bits(torch.tensor([0b111])).tolist() == [0b1001001]
-        True
-    """
+    """Put two zero bits between the bits of numbers below 2**21, int64."""
     for shift, pattern in _SPREADS:
         values = (values | values << shift) & pattern
     return values
 
 
 def gather_bits(codes: Tensor) -> Tensor:
-    """Return every third bit of codes, the inverse of :func:`spread_bits`.
-
-    Example:
-        >>> gather_bits(spread_bits(torch.tensor([54321])) | 0b110).tolist()
-        [54321]
-    """
+    """Return every third bit of codes, the inverse of :func:`spread_bits`."""
     codes = codes & _SPREADS[-1][1]
     patterns = [pattern for _, pattern in _SPREADS[-2::-1]] + [2**_MORTON_BITS - 1]
     for (shift, _), pattern in zip(reversed(_SPREADS), patterns, strict=True):
         codes = (codes | codes >> shift) & pattern
     return codes
-
-
-def shift_codes(codes: Tensor, axis: int) -> Tensor:
-    """Return the codes of the cubes one further along an axis; past the last one comes the first.
-
-    Example:
-        >>> shift_codes(torch.tensor([0b000, 0b010, 0b101]), 0).tolist()
-        [1, 3, 12]
-    """
-    mask = _SPREADS[-1][1] << axis
-    moved = ((codes | ~mask) + (1 << axis)) & mask
-    return (codes & ~mask) | moved
