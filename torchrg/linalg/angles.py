@@ -112,14 +112,7 @@ _ASIN_SERIES = _asin_series(_ASIN_DEGREE)
 
 
 def above(values: Tensor, bounds: Tensor | float) -> Tensor:
-    """Return 1 where values exceed their bounds and 0 elsewhere.
-
-    Args:
-        values: Floating point, any shape.
-        bounds: A number, or a tensor that broadcasts to that shape.
-
-    Returns:
-        Same shape and dtype as ``values``, without gradient.
+    """Return 1 where values exceed their bounds and 0 elsewhere, in their dtype, without gradient.
 
     Example:
         >>> above(torch.tensor([1.0, 2.0, 3.0]), 2.0)

@@ -25,18 +25,11 @@ def fit_points(
     chunk_size: int = CHUNK_SIZE,
     **of_points: Tensor,
 ) -> NormalFit:
-    """Fit the neighbourhoods of some points of a cloud, with bounded memory.
+    """Fit the neighbourhoods of some points of a cloud ``(N, 3)``, by default of all of them.
 
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        fit: Estimator of patches.
-        rows: Points to fit, shape ``(n,)``. Default: all.
-        chunk_size: Patches in memory at a time; changes no result.
-        **of_points: Further keywords of ``fit`` that have a value for each point, shape ``(N,)``.
-
-    Returns:
-        The fit of those points, without ``sharp``.
+    Patches in memory at a time are ``chunk_size``, which changes no result. Further keywords are
+    those of ``fit`` that have a value for each point, shape ``(N,)``. Returns the fit of the given
+    rows, without ``sharp``.
     """
 
     def fit_chunk(chunk: slice) -> NormalFit:

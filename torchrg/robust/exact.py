@@ -44,11 +44,8 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
     Each of a fixed list of simplices spans a flat of every dimension. Where the next vertex of a
     simplex lies on the flat of those before it, which in general position never happens, the
     flat is a candidate; the points on it are counted, and the flat is fitted to them again.
-
-    Args:
-        columns: P coordinates of shape ``(K, M)``, about the middle of each lane.
-        tolerance: Largest distance that counts as on the flat, shape ``(M,)``.
-        size: Number of points that make a majority.
+    Columns ``(K, M)`` are about the middle of each lane; ``tolerance`` ``(M,)`` is the largest
+    distance that counts as on the flat.
     """
     parts = [
         _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)

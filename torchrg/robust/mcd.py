@@ -12,7 +12,6 @@ from torchrg.robust.lanes import (
     covariance_entries,
     determinant,
     fit_ellipsoid,
-    join_columns,
     smallest_points,
     sq_distances,
     take_lanes,
@@ -215,7 +214,7 @@ def _fit_mcd(
         return Estimate(
             *reweight(columns, distances, quantile, final_factor),
             sq_distances=distances,
-            raw_location=join_columns(ellipsoid.means),
+            raw_location=torch.stack(ellipsoid.means, dim=-1),
             raw_covariance=covariance * raw_factor,
             raw_support=members > 0,
             objective=sets.determinants.gather(0, best[None]).squeeze(0),

@@ -15,7 +15,6 @@ from torchrg.robust.lanes import (
     covariance_entries,
     determinant,
     fit_ellipsoid,
-    join_columns,
     map_values,
     median_points,
     smallest_points,
@@ -198,11 +197,11 @@ def _estimate(
         return covariance_entries(columns, shape.ellipsoid.means, shape.weights, denominator)
 
     return Estimate(
-        location=join_columns(final.ellipsoid.means),
+        location=torch.stack(final.ellipsoid.means, dim=-1),
         covariance=scatter(final),
         support=distances <= bound,
         sq_distances=distances,
-        raw_location=join_columns(raw.ellipsoid.means),
+        raw_location=torch.stack(raw.ellipsoid.means, dim=-1),
         raw_covariance=scatter(raw),
         raw_support=raw.weights > 0,
         objective=sq_scale.double() ** size,

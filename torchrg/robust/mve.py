@@ -8,7 +8,6 @@ from torchrg.robust.lanes import (
     covariance_entries,
     determinant,
     fit_ellipsoid,
-    join_columns,
     smallest_points,
     sorted_points,
     sq_distances,
@@ -87,7 +86,7 @@ def fit_mve(
         return Estimate(
             *final,
             sq_distances=distances,
-            raw_location=join_columns(ellipsoid.means),
+            raw_location=torch.stack(ellipsoid.means, dim=-1),
             raw_covariance=covariance * factor[:, None, None],
             raw_support=covered > 0,
             objective=best,

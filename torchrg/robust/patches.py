@@ -14,7 +14,6 @@ from torchrg.linalg import flatness_tolerance, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     covariance_entries,
-    join_columns,
     map_values,
     median_points,
     split_columns,
@@ -264,7 +263,10 @@ def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustF
     wide = [column.double() for column in columns]
     means = [sum_points(weights * column) / count for column in wide]
     covariance = covariance_entries(wide, means, weights, (count - 1).clamp(min=1)).to(dtype)
-    location, covariance = frame.point(join_columns(means).to(dtype)), frame.matrix(covariance)
+    location, covariance = (
+        frame.point(torch.stack(means, dim=-1).to(dtype)),
+        frame.matrix(covariance),
+    )
     support = members.t()
     valid = torch.ones(len(support), dtype=torch.bool, device=support.device)
     return RobustFit(
@@ -311,7 +313,7 @@ def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
     zoom = _power_of_two(extent)
     tolerance = flatness_tolerance(patches, extent) * zoom
     columns = [column * zoom for column in columns]
-    return columns, _Frame(join_columns(middle), unit, zoom), tolerance
+    return columns, _Frame(torch.stack(middle, dim=-1), unit, zoom), tolerance
 
 
 def _power_of_two(length: Tensor) -> Tensor:

@@ -221,12 +221,7 @@ def qn_of_sorted(rows: Tensor, *, finite_sample: bool) -> Tensor:
 
 
 def qn_sample_factor(n: int) -> float:
-    """Return the factor that makes Qn of ``n`` normal values unbiased (robustbase's revision).
-
-    Example:
-        >>> round(qn_sample_factor(50), 6)
-        0.930802
-    """
+    """Return the factor that makes Qn of ``n`` normal values unbiased (robustbase's revision)."""
     if n < 2:
         return 1.0
     if n <= 12:

@@ -302,15 +302,8 @@ def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tens
     """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
 
     The same sets serve every patch, so a patch's result depends on the seed and on nothing else
-    in its batch.
-
-    Returns:
-        Point indices, shape ``(S, size)``, int64: all sets in lexicographic order where there are
-        at most ``5 * num_sets``, otherwise ``num_sets`` of them.
-
-    Example:
-        >>> elemental_sets(4, 3, 1, 0).tolist()
-        [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
+    in its batch. Returns point indices ``(S, size)``: all sets in lexicographic order where there
+    are at most ``5 * num_sets``, otherwise ``num_sets`` of them.
     """
     if comb(num_points, size) <= 5 * num_sets:
         return torch.tensor(list(combinations(range(num_points), size)))
