@@ -200,9 +200,18 @@ def _kernel(
     rank_one = best < _NEARLY_EQUAL
     if bool(rank_one.any()):
         rows = torch.stack([*diagonal, *beside], dim=-1)[rank_one][:, [0, 5, 4, 5, 1, 3, 4, 3, 2]]
-        across = eigh3(rows.reshape(-1, 3, 3))[1][..., 0]
-        u[rank_one], v[rank_one], w[rank_one] = across.unbind(dim=-1)
+        u[rank_one], v[rank_one], w[rank_one] = _across(rows.reshape(-1, 3, 3)).unbind(dim=-1)
     return u, v, w
+
+
+def _across(matrices: Tensor) -> Tensor:
+    """Return a unit vector across the direction of rank-one matrices ``(n, 3, 3)``."""
+    largest = matrices.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    along = matrices[torch.arange(len(matrices), device=matrices.device), largest]
+    axis = torch.nn.functional.one_hot(along.abs().argmin(dim=-1), 3).to(along.dtype)
+    across = torch.linalg.cross(along, axis)
+    length = (across * across).sum(dim=-1, keepdim=True).sqrt()
+    return torch.where(length > 0, across / length, axis)
 
 
 def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int) -> None:

@@ -73,13 +73,12 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         rest = _reject(edge, axes)
         height = sum_squares(rest).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
-        found = _majorities(columns, origins, axes, candidates, reach, size)
-        if len(found.lanes):
-            lanes = take_lanes(columns, found.lanes)
-            on_flat = refine_flat(lanes, found.members, tolerance[found.lanes], len(axes))
+        lanes, near = _majorities(columns, origins, axes, candidates, reach, size)
+        if len(lanes):
+            on_flat = refine_flat(take_lanes(columns, lanes), near, tolerance[lanes], len(axes))
             kept = on_flat.sum(dim=0) >= size
-            dimension[found.lanes[kept]] = len(axes)
-            members[:, found.lanes[kept]] = on_flat[:, kept]
+            dimension[lanes[kept]] = len(axes)
+            members[:, lanes[kept]] = on_flat[:, kept]
         steep = steep & (height > _MIN_EDGE * extent)
         # A short edge is a poor ruler: what rounding moves at its ends grows with the distance.
         reach = torch.maximum(reach, 2 * tolerance * (1 + 2 * extent / height))
@@ -91,13 +90,6 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
     return Flats(dimension, members)
 
 
-class _Majorities(NamedTuple):
-    """Lanes ``(F,)`` with a candidate flat that enough points lie near, and these ``(K, F)``."""
-
-    lanes: Tensor
-    members: Tensor
-
-
 def _majorities(
     columns: list[Tensor],
     origins: list[Tensor],
@@ -105,8 +97,11 @@ def _majorities(
     candidates: Tensor,
     reach: Tensor,
     size: int,
-) -> _Majorities:
-    """Count the points near the first few candidates of each lane, and keep one full one."""
+) -> tuple[Tensor, Tensor]:
+    """Count the points near the first few candidates of each lane, and keep one full one.
+
+    Returns the lanes ``(F,)`` that have one, and the points near it ``(K, F)``.
+    """
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
     simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
@@ -125,7 +120,7 @@ def _majorities(
     order = order.masked_fill((ruler > best[place]) | ruler.isinf(), len(place))
     winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(0, place, order, "amin")
     winner = winner[winner < len(place)]
-    return _Majorities(lane[winner], near[:, winner])
+    return lane[winner], near[:, winner]
 
 
 def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimension: int) -> Tensor:
