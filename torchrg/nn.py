@@ -1,7 +1,7 @@
 """Module forms of the batched functions; they hold settings and nothing else."""
 
 from dataclasses import KW_ONLY, asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -19,13 +19,9 @@ class _Function(nn.Module):
     def __post_init__(self) -> None:
         super().__init__()
 
-    def settings(self) -> dict[str, Any]:
-        """Return the settings by name."""
-        return asdict(self)
-
     def extra_repr(self) -> str:
         """Return the settings as text."""
-        return ", ".join(f"{name}={value!r}" for name, value in self.settings().items())
+        return ", ".join(f"{name}={value!r}" for name, value in asdict(self).items())
 
 
 class Covariance(_Function):
@@ -81,7 +77,7 @@ class Qn(_Function):
 
     def forward(self, values: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the scale."""
-        return qn(values, mask=mask, **self.settings())
+        return qn(values, mask=mask, **asdict(self))
 
 
 @dataclass(eq=False, repr=False)
@@ -101,7 +97,7 @@ class DetMCD(_Function):
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
-        return fit_detmcd(patches, mask, **self.settings())
+        return fit_detmcd(patches, mask, **asdict(self))
 
 
 @dataclass(eq=False, repr=False)
@@ -126,7 +122,7 @@ class FastMCD(_Function):
         generator: torch.Generator | None = None,
     ) -> RobustFit:
         """Return the fits; the generator draws the starts."""
-        return fit_fastmcd(patches, mask, generator=generator, **self.settings())
+        return fit_fastmcd(patches, mask, generator=generator, **asdict(self))
 
 
 @dataclass(eq=False, repr=False)
@@ -144,4 +140,4 @@ class DetMM(_Function):
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
-        return fit_detmm(patches, mask, **self.settings())
+        return fit_detmm(patches, mask, **asdict(self))

@@ -17,10 +17,6 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg.eigen import smallest_eigenvector3
 
 
-def _add_rows(values: Tensor) -> Tensor:
-    return values.sum(dim=-1)
-
-
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     r"""Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
 
@@ -70,7 +66,7 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 def second_moments(
     columns: Sequence[Tensor],
     weights: Tensor | None = None,
-    add: Callable[[Tensor], Tensor] = _add_rows,
+    add: Callable[[Tensor], Tensor] = lambda column: column.sum(dim=-1),
     total: Tensor | float = 1.0,
 ) -> Tensor:
     """Return the second moments of weighted points about zero, shape ``(*, P, P)``.

@@ -65,13 +65,7 @@ def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
 
 
 def finite_rows(points: Tensor) -> Tensor:
-    """Return the rows of the finite points, in canonical order.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-
-    Returns:
-        Row numbers, shape ``(n,)``, int64.
+    """Return the rows of the finite ones of points ``(N, 3)``, in canonical order, int64.
 
     Example:
         >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
@@ -82,16 +76,7 @@ def finite_rows(points: Tensor) -> Tensor:
 
 
 def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
-    """Return values at the rows they belong to, and a filling at all others.
-
-    Args:
-        values: Shape ``(n, ...)``.
-        rows: Row of each value, shape ``(n,)``.
-        num_points: Length of the result.
-        fill: What the other rows hold.
-
-    Returns:
-        Shape ``(num_points, ...)``.
+    """Return values ``(n, ...)`` at the rows they belong to, and a filling at all others.
 
     Example:
         >>> restore_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()

@@ -29,9 +29,8 @@ _MIN_EDGE = 0.01
 class Flats(NamedTuple):
     """The flat of lowest dimension that holds a majority of each lane's points exactly.
 
-    Attributes:
-        dimension: 0 a place, 1 a line, ..., P - 1 a hyperplane, P none; shape ``(M,)``, int64.
-        members: The points on it, shape ``(K, M)``, bool; all False where there is none.
+    Dimension ``(M,)``: 0 a place, 1 a line, ..., P - 1 a hyperplane, P none; and the points on it,
+    ``(K, M)``, bool, all False where there is none.
     """
 
     dimension: Tensor
