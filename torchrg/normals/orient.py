@@ -16,8 +16,6 @@ from torchrg.neighbors import finite_rows, gather_patches, search_knn
 from torchrg.structures import Neighbors
 
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
-
-ORIENTATIONS: tuple[str, ...] = get_args(Orientation)
 """What normals can be turned towards."""
 
 _NUM_NEIGHBORS = 20
@@ -105,8 +103,8 @@ def orient_normals(
     check_shapes("orient_normals", points=(cloud, "N 3"), normals=(given, "N 3"))
     check_floating("orient_normals", points=cloud)
     check_floating("orient_normals", normals=given)
-    if towards not in ORIENTATIONS:
-        names = ", ".join(ORIENTATIONS)
+    if towards not in get_args(Orientation):
+        names = ", ".join(get_args(Orientation))
         raise ConfigError(
             f"orient_normals: expected towards to be one of {names}, got {towards!r}."
         )

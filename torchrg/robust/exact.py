@@ -4,7 +4,6 @@ import random
 from functools import lru_cache
 from itertools import combinations
 from math import comb
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,35 +25,27 @@ _MIN_EDGE = 0.01
 """Height, in extents of a patch, below which an edge is too short to span the next dimension."""
 
 
-class Flats(NamedTuple):
-    """The flat of lowest dimension that holds a majority of each lane's points exactly.
-
-    Dimension ``(M,)``: 0 a place, 1 a line, ..., P - 1 a hyperplane, P none; and the points on it,
-    ``(K, M)``, bool, all False where there is none.
-    """
-
-    dimension: Tensor
-    members: Tensor
-
-
-def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
-    """Look for the flats that hold at least ``size`` points of each lane.
+def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Look for the flat of lowest dimension that holds at least ``size`` points of each lane.
 
     Each of a fixed list of simplices spans a flat of every dimension. Where the next vertex of a
     simplex lies on the flat of those before it, which in general position never happens, the
     flat is a candidate; the points on it are counted, and the flat is fitted to them again.
     Columns ``(K, M)`` are about the middle of each lane; ``tolerance`` ``(M,)`` is the largest
     distance that counts as on the flat.
+
+    Returns its dimension ``(M,)``, 0 a place, 1 a line, ..., P - 1 a hyperplane, P none, and the
+    points on it ``(K, M)``, bool, all False where there is none.
     """
     parts = [
         _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
         for lanes in chunks_of(len(tolerance), _LANES)
     ]
     dimensions, members = zip(*parts, strict=True)
-    return Flats(torch.cat(dimensions), torch.cat(members, dim=1))
+    return torch.cat(dimensions), torch.cat(members, dim=1)
 
 
-def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
+def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Do as :func:`find_flats` for few enough lanes to fit the cache."""
     num_coordinates, (num_points, num_lanes) = len(columns), columns[0].shape
     dimension = torch.full((num_lanes,), num_coordinates, device=tolerance.device)
@@ -86,7 +77,7 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         spanned = dimension == num_coordinates
         dimension[spanned] = num_points - 1
         members[:, spanned] = True
-    return Flats(dimension, members)
+    return dimension, members
 
 
 def _majorities(

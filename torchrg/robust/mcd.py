@@ -42,12 +42,10 @@ _DIGITS = 24
 
 
 class _Concentrated(NamedTuple):
-    """The sets that concentration ended with.
+    """The sets that concentration ended with, 1 for a point in it, 0 for another, ``(K, S, M)``.
 
-    Attributes:
-        members: 1 for a point in the set, 0 for another, shape ``(K, S, M)``.
-        determinants: Of their scatter over h - 1, shape ``(S, M)``, float64; inf for a start that
-            repeats an earlier one of its lane.
+    The determinants ``(S, M)`` are those of their scatter over h - 1, float64; inf for a start that
+    repeats an earlier one of its lane.
     """
 
     members: Tensor

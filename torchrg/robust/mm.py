@@ -43,12 +43,9 @@ _CHECK_EVERY = 4
 
 
 class _Shape(NamedTuple):
-    """A weighted fit of each lane, its scatter scaled to determinant one.
+    """Weights ``(K, M)`` of the points of each lane, and their scatter scaled to determinant one.
 
-    Attributes:
-        weights: Of the points, shape ``(K, M)``.
-        ellipsoid: Their factored scatter.
-        distances: Squared distances to the scatter of determinant one, shape ``(K, M)``.
+    The distances are squared, and those to the scaled scatter, shape ``(K, M)``.
     """
 
     weights: Tensor

@@ -192,7 +192,7 @@ def _fit_chunk(
     subset = subset_size(num_points, size, support_fraction)
     enough = subset if majority is None else majority(num_points)
     columns, frame, tolerance = _to_lanes(patches)
-    flats = find_flats(columns, tolerance, enough)
+    dimension, members = find_flats(columns, tolerance, enough)
     out = _no_fit(patches)
 
     def lanes_of(rows: Tensor) -> list[Tensor]:
@@ -201,7 +201,7 @@ def _fit_chunk(
     def store_exact(rows: Tensor, members: Tensor) -> None:
         _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
 
-    regular = torch.nonzero(flats.dimension == size).squeeze(1)
+    regular = torch.nonzero(dimension == size).squeeze(1)
     if len(regular):
         estimate = estimator(lanes_of(regular), tolerance[regular] ** 2, subset)
         _store(out, regular, _general_fit(estimate, frame.of(regular)))
@@ -209,15 +209,15 @@ def _fit_chunk(
         thin = torch.nonzero(estimate.singular).squeeze(1)
         if len(thin):
             rows, chosen = regular[thin], estimate.raw_support[:, thin]
-            members = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
-            found = members.sum(dim=0) >= enough
-            store_exact(rows[found], members[:, found])
-    exact = torch.nonzero(flats.dimension == size - 1).squeeze(1)
+            on_plane = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
+            found = on_plane.sum(dim=0) >= enough
+            store_exact(rows[found], on_plane[:, found])
+    exact = torch.nonzero(dimension == size - 1).squeeze(1)
     if len(exact):
-        store_exact(exact, flats.members[:, exact])
-    lower = torch.nonzero(flats.dimension < size - 1).squeeze(1)
+        store_exact(exact, members[:, exact])
+    lower = torch.nonzero(dimension < size - 1).squeeze(1)
     if len(lower):
-        rest = ~flats.members[:, lower].t()
+        rest = ~members[:, lower].t()
         fit = _fit_groups(
             patches[lower],
             rest,
@@ -226,11 +226,11 @@ def _fit_chunk(
         )
         _store(out, lower, fit)
         lower = lower[~fit.valid]
-        lanes, every = lanes_of(lower), flats.members[:, lower] | True
+        lanes, every = lanes_of(lower), members[:, lower] | True
         plane = refine_flat(lanes, every, tolerance[lower], size - 1).all(dim=0)
         line = refine_flat(lanes, every, tolerance[lower], size - 2).all(dim=0)
         rows = lower[plane & ~line]
-        store_exact(rows, flats.members[:, rows] | True)
+        store_exact(rows, members[:, rows] | True)
     return out
 
 
