@@ -10,6 +10,7 @@ from torchrg.linalg import (
     covariance,
     deg_to_sq_chord,
     eigh3,
+    eigh3_of_few,
     flatness_tolerance,
     second_moments,
     smallest_eigenvector3,
@@ -17,6 +18,8 @@ from torchrg.linalg import (
     sq_chords,
     unsigned_angle_deg,
 )
+from torchrg.linalg.eigen import principal_frame
+from torchrg.linalg.moments import fit_planes, fit_planes_to_each, residuals, split_columns
 
 PACKAGE = Path(__file__).parents[1] / "torchrg"
 # The row of linalg itself, and the largest number that a file can hold.
@@ -88,6 +91,35 @@ def test_smallest_eigenvector_of_repeated_eigenvalues_is_one_of_theirs(dtype, di
     values, vector = smallest_eigenvector3(matrix)
     assert torch.allclose(values.double(), torch.tensor(diagonal).double().sort().values, atol=1e-3)
     assert torch.allclose(matrix @ vector, values[0] * vector, atol=1e-3)
+
+
+def test_a_matrix_that_is_not_finite_spoils_itself_alone():
+    matrices = torch.diag(torch.tensor([3.0, 1.0, 2.0])).repeat(2, 1, 1)
+    matrices[1, 0, 2] = torch.nan
+    values, vectors = eigh3_of_few(matrices)
+    assert values[0].tolist() == [1.0, 2.0, 3.0]
+    assert vectors[0, :, 0].abs().tolist() == [0.0, 1.0, 0.0]
+    assert values[1].isnan().all()
+    assert vectors[1].isnan().all()
+
+
+def test_gradient_of_the_smallest_eigenvalue_is_that_of_its_direction():
+    matrix = torch.diag(torch.tensor([3.0, 1.0, 2.0])).requires_grad_()
+    principal_frame(matrix).smallest.backward()
+    assert matrix.grad.diagonal().tolist() == [0.0, 1.0, 0.0]
+
+
+def test_planes_are_those_of_the_neighbors_with_a_weight():
+    columns = split_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
+    weights = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
+    normals, offsets, values = fit_planes(columns, weights[0])
+    assert normals.abs().tolist() == [[0.0, 0.0, 1.0]]
+    assert values[0, 0] == 0
+    assert residuals(columns, normals, offsets).abs().tolist() == [[0.0, 0.0, 0.0, 1.0]]
+    first, second = fit_planes_to_each(columns, weights)
+    assert torch.equal(first[0], normals)
+    assert second[0].abs().tolist() == [[0.0, 1.0, 0.0]]
+    assert not second[1].any()
 
 
 def test_eigenvectors_do_not_depend_on_the_batch(rng):

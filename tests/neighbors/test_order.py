@@ -1,9 +1,8 @@
-"""Morton codes hold the bits of three numbers, and find the next cube."""
+"""Morton codes hold the bits of three numbers."""
 
-import pytest
 import torch
 
-from torchrg.neighbors.order import gather_bits, shift_codes, spread_bits
+from torchrg.neighbors.order import gather_bits, spread_bits
 
 
 def test_morton_codes_hold_the_bits_of_three_numbers(rng):
@@ -15,15 +14,3 @@ def test_morton_codes_hold_the_bits_of_three_numbers(rng):
         )
         assert code == int(bits, 2)
     assert torch.equal(torch.stack([gather_bits(codes >> a) for a in range(3)], 1), numbers)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_shifted_codes_are_those_of_the_next_cube(rng, axis):
-    numbers = torch.randint(0, 2**21 - 1, (500, 3), generator=rng)
-
-    def encode(triples):
-        return sum(spread_bits(triples[:, a]) << a for a in range(3))
-
-    moved = numbers.clone()
-    moved[:, axis] += 1
-    assert torch.equal(shift_codes(encode(numbers), axis), encode(moved))

@@ -34,13 +34,9 @@ def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:
 
 
 def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
-    """Return the angle, in degrees, under which a chord of the unit sphere is seen.
+    """Return the angle under which a chord of the unit sphere of squared length 0 to 2 is seen.
 
-    Args:
-        sq_chord: Squared length of the chord, in [0, 2].
-
-    Returns:
-        Angles in [0, 90], same shape, right to 1e-7 (float32) or 1e-8 degrees (float64).
+    In [0, 90] degrees, right to 1e-7 (float32) or 1e-8 degrees (float64).
 
     Example:
         >>> sq_chord_to_deg(torch.tensor([0.0, 1.0, 2.0]))
@@ -70,15 +66,9 @@ def sq_chords(
     """Return the squared distance on the unit sphere between normals and those of the neighbours.
 
     Built from ``+ - *`` alone, hence the same to the last bit in every chunk; and exact where the
-    normals are equal, so that an angle limit of 0 accepts them. Without gradient.
-
-    Args:
-        normals: Unit normals of the points, three components of shape ``(n, 1)``.
-        neighbor_normals: Unit normals of their neighbours, three components of shape ``(n, K)``.
-        signed: Whether opposite normals are far apart (in [0, 4]) or equal (in [0, 2]).
-
-    Returns:
-        Shape ``(n, K)``.
+    normals are equal, so that an angle limit of 0 accepts them. Without gradient. Three components
+    of shape ``(n, 1)`` and three of ``(n, K)`` give ``(n, K)``, in [0, 2]; with ``signed`` opposite
+    normals are not equal but far apart, in [0, 4].
 
     Example:
         >>> a = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
@@ -112,14 +102,7 @@ _ASIN_SERIES = _asin_series(_ASIN_DEGREE)
 
 
 def above(values: Tensor, bounds: Tensor | float) -> Tensor:
-    """Return 1 where values exceed their bounds and 0 elsewhere.
-
-    Args:
-        values: Floating point, any shape.
-        bounds: A number, or a tensor that broadcasts to that shape.
-
-    Returns:
-        Same shape and dtype as ``values``, without gradient.
+    """Return 1 where values exceed their bounds and 0 elsewhere, in their dtype, without gradient.
 
     Example:
         >>> above(torch.tensor([1.0, 2.0, 3.0]), 2.0)

@@ -38,18 +38,9 @@ def smallest_normal(dtype: torch.dtype) -> float:
 
 
 def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
-    """Return the singular value, relative to the largest, at which a direction counts as flat.
+    """Return ``max(num_values, 3) * eps``, the tolerance of a matrix of so many points.
 
-    Args:
-        num_values: Number of points (or rows) that went into the matrix.
-        dtype: Working precision.
-
-    Returns:
-        ``max(num_values, 3) * eps``.
-
-    Example:
-        >>> rank_tolerance(50, torch.float64) < 1e-13
-        True
+    Of a singular value relative to the largest, at which a direction counts as flat.
     """
     return max(num_values, 3) * machine_epsilon(dtype)
 
@@ -65,19 +56,10 @@ def coordinate_resolution(points: Tensor) -> Tensor:
 
 
 def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
-    """Return how far from its plane rounding alone can move a point.
+    """Return how far from its plane rounding alone can move a point, shape ``(B,)``.
 
-    Args:
-        patches: The points as they were given, shape ``(B, K, P)``: their coordinates were
-            rounded where they are, however far from the origin.
-        extent: Largest coordinate of each patch about its own middle, shape ``(B,)``.
-
-    Returns:
-        A length in the unit of the points, shape ``(B,)``.
-
-    Example:
-        >>> flatness_tolerance(torch.ones(1, 5, 3), torch.ones(1)) < 2e-6
-        tensor([True])
+    The points ``(B, K, P)`` are as they were given: their coordinates were rounded where they are,
+    however far from the origin. ``extent`` is the largest coordinate about the patch's own middle.
     """
     coordinates = 2 * patches.abs().amax(dim=(1, 2))
     return machine_epsilon(patches.dtype) * (coordinates + _ROUNDED_STEPS * extent)
@@ -132,14 +114,7 @@ def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Do as :func:`eigh3`, one matrix at a time: the faster way for less than a thousand of them.
 
     A matrix that is not finite gives NaN.
-
-    Example:
-        >>> values, vectors = eigh3_of_few(torch.diag(torch.tensor([3.0, 1.0, 2.0])))
-        >>> values, vectors[:, 0].abs()
-        (tensor([1., 2., 3.]), tensor([0., 1., 0.]))
     """
-    check_shapes("eigh3_of_few", matrices=(matrices, "* 3 3"))
-    check_floating("eigh3_of_few", matrices=matrices)
     finite = matrices.isfinite().all(dim=(-2, -1))[..., None]
     values, vectors = torch.linalg.eigh(torch.where(finite[..., None], matrices, 0.0), UPLO="U")
     return torch.where(finite, values, torch.nan), torch.where(
@@ -156,24 +131,9 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     precision. Where the first two eigenvalues are equal to rounding, it is any vector across the
     third eigenvector.
 
-    Args:
-        matrices: Symmetric matrices without negative eigenvalues beyond rounding, shape
-            ``(*, 3, 3)``; only the upper triangle is read.
-
-    Returns:
-        Eigenvalues in ascending order ``(*, 3)``, not negative, right to 1e-8 of the largest or to
-        rounding, and unit eigenvectors of the first ``(*, 3)``. Signs are arbitrary.
-
-    Raises:
-        ShapeError: If the shape or dtype is not as above.
-
-    Example:
-        >>> values, normals = smallest_eigenvector3(torch.diag(torch.tensor([3.0, 1.0, 2.0])))
-        >>> values, normals.abs()
-        (tensor([1., 2., 3.]), tensor([0., 1., 0.]))
+    Returns ascending eigenvalues ``(*, 3)``, not negative, right to 1e-8 of the largest or to
+    rounding, and unit eigenvectors of the first ``(*, 3)``, of arbitrary sign.
     """
-    check_shapes("smallest_eigenvector3", matrices=(matrices, "* 3 3"))
-    check_floating("smallest_eigenvector3", matrices=matrices)
     scale = matrices.abs().amax(dim=(-2, -1))
     safe = torch.where(scale > 0, scale, 1.0)
     upper = [matrices[..., i, j] for i in range(3) for j in range(i, 3)]
@@ -298,12 +258,6 @@ def principal_frame(matrices: Tensor) -> PrincipalFrame:
     With the decomposition held constant, one step of perturbation theory changes nothing in value
     and everything in gradient: ``dn = sum_j v_j (v_j . dA n) / (l0 - l_j)``. Where two eigenvalues
     are equal, the turn between their vectors is left out.
-
-    Example:
-        >>> matrix = torch.diag(torch.tensor([3.0, 1.0, 2.0])).requires_grad_()
-        >>> principal_frame(matrix).smallest.backward()
-        >>> matrix.grad.diagonal()
-        tensor([0., 1., 0.])
     """
     with torch.no_grad():
         values, vectors = eigh3(matrices)

@@ -17,10 +17,6 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg.eigen import smallest_eigenvector3
 
 
-def _add_rows(values: Tensor) -> Tensor:
-    return values.sum(dim=-1)
-
-
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     r"""Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
 
@@ -70,25 +66,14 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 def second_moments(
     columns: Sequence[Tensor],
     weights: Tensor | None = None,
-    add: Callable[[Tensor], Tensor] = _add_rows,
+    add: Callable[[Tensor], Tensor] = lambda column: column.sum(dim=-1),
     total: Tensor | float = 1.0,
 ) -> Tensor:
     """Return the second moments of weighted points about zero, shape ``(*, P, P)``.
 
-    Args:
-        columns: P coordinates of the points, about their mean for a covariance.
-        weights: Weights of the points, of the shape of a column. Default: 1 each.
-        add: Takes a column to its sums, shape ``(*)``. Default: sums along the last axis.
-        total: What the sums are divided by; for a covariance the sum of the weights.
-
-    Returns:
-        The matrices.
-
-    Example:
-        >>> square = torch.tensor([[-1.0, -1, 1, 1]]), torch.tensor([[-2.0, 2, -2, 2]])
-        >>> second_moments(square, total=4)
-        tensor([[[1., 0.],
-                 [0., 4.]]])
+    Of P coordinates, about their mean for a covariance, with weights of the shape of a column (1
+    each by default). ``add`` takes a column to its sums, shape ``(*)``, by default along the last
+    axis; these are divided by ``total``, for a covariance the sum of the weights.
     """
     size = len(columns)
     weighted = columns if weights is None else [weights * column for column in columns]
@@ -200,13 +185,7 @@ def sq_lengths(columns: Columns) -> Tensor:
 
 
 def residuals(columns: Columns, normals: Tensor, offsets: Tensor) -> Tensor:
-    """Return signed distances of the neighbours to planes ``normal . q = offset``, ``(n, K)``.
-
-    Example:
-        >>> columns = split_columns(torch.tensor([[[0.0, 0, 0], [1, 2, 3]]]))
-        >>> residuals(columns, torch.tensor([[0.0, 0, 1]]), torch.tensor([1.0]))
-        tensor([[-1.,  2.]])
-    """
+    """Return signed distances of the neighbours to planes ``normal . q = offset``, ``(n, K)``."""
     return along(columns, normals).sub_(offsets[:, None])
 
 
@@ -219,23 +198,10 @@ def along(columns: Columns, axes: Tensor) -> Tensor:
 
 
 def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit a plane to each weighted neighbourhood by least squares.
+    """Fit a plane to each neighbourhood by least squares with weights ``(n, K)``, not negative.
 
-    Args:
-        columns: Coordinates about each point.
-        weights: Weights, shape ``(n, K)``, not negative.
-
-    Returns:
-        Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset``, and the
-        eigenvalues of the weighted covariance ``(n, 3)``, ascending.
-
-    Example:
-        >>> square = torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [5, 5, 5]]])
-        >>> normals, offsets, _ = fit_planes(
-        ...     split_columns(square), torch.tensor([[1.0, 1, 1, 0]])
-        ... )
-        >>> normals.abs(), offsets.abs()
-        (tensor([[0., 0., 1.]]), tensor([1.]))
+    Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset``, and the
+    eigenvalues of the weighted covariance ``(n, 3)``, ascending.
     """
     means, covariance = _moments(columns, weights)
     values, normals = smallest_eigenvector3(covariance)
@@ -243,20 +209,9 @@ def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Fit a plane to each of several groups of the neighbours; see :func:`fit_planes`.
+    """Fit a plane to the neighbours with each of several weights; see :func:`fit_planes`.
 
-    Args:
-        columns: Coordinates about each point.
-        groups: Weights of each group, shape ``(n, K)``.
-
-    Returns:
-        Unit normals ``(n, 3)`` and offsets ``(n,)`` for each group.
-
-    Example:
-        >>> square = torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]])
-        >>> groups = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
-        >>> [normals.abs() for normals, _ in fit_planes_to_each(split_columns(square), groups)]
-        [tensor([[0., 0., 1.]]), tensor([[0., 1., 0.]])]
+    Returns unit normals ``(n, 3)`` and offsets ``(n,)`` for each.
     """
     means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
     normals = smallest_eigenvector3(torch.stack(covariances))[1]

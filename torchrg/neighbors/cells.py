@@ -53,26 +53,11 @@ _MAX_KEY = 2.0**62
 def search_cells(
     points: NDArray[np.float64], k: int, reach: NDArray[np.float64], store: Store
 ) -> NDArray[np.int64]:
-    """Find the k nearest points of every point that cells of some size can answer for.
+    """Find the k nearest of distinct points ``(N, 3)`` for all that cells of some size answer for.
 
-    Args:
-        points: Distinct points, shape ``(N, 3)``.
-        k: Number of neighbours, the point itself included.
-        reach: Distances of the k-th neighbour of a sample of the points.
-        store: Called with the results, sorted by distance, then by row; by several threads, each
-            row once.
-
-    Returns:
-        Rows that are left, shape ``(m,)``, ascending.
-
-    Example:
-        >>> grid = np.argwhere(np.ones((50, 50, 1))) * 1.0
-        >>> found = {}
-        >>> def store(rows, distances, neighbors):
-        ...     found.update(zip(rows.tolist(), distances[:, -1].tolist()))
-        >>> left = search_cells(grid, 9, np.full(5, 1.5), store)
-        >>> len(left) + len(found), found[1225]
-        (2500, 1.4142135623730951)
+    The point itself counts. ``reach`` are distances of the k-th neighbour of a sample of the
+    points. ``store`` gets each answered row once, from several threads, its neighbours sorted by
+    distance, then by row. Returns the rows that are left, ascending.
     """
     left = np.arange(len(points))
     if _MIN_CANDIDATES * (k + _SPARE) <= _MAX_CANDIDATES:

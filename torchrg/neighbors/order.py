@@ -65,13 +65,7 @@ def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
 
 
 def finite_rows(points: Tensor) -> Tensor:
-    """Return the rows of the finite points, in canonical order.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-
-    Returns:
-        Row numbers, shape ``(n,)``, int64.
+    """Return the rows of the finite ones of points ``(N, 3)``, in canonical order, int64.
 
     Example:
         >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
@@ -82,16 +76,7 @@ def finite_rows(points: Tensor) -> Tensor:
 
 
 def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
-    """Return values at the rows they belong to, and a filling at all others.
-
-    Args:
-        values: Shape ``(n, ...)``.
-        rows: Row of each value, shape ``(n,)``.
-        num_points: Length of the result.
-        fill: What the other rows hold.
-
-    Returns:
-        Shape ``(num_points, ...)``.
+    """Return values ``(n, ...)`` at the rows they belong to, and a filling at all others.
 
     Example:
         >>> restore_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()
@@ -116,38 +101,16 @@ def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def spread_bits(values: Tensor) -> Tensor:
-    """Put two zero bits between the bits of numbers below 2**21, int64.
-
-    Example:
-        >>> spread_bits(torch.tensor([0b111])).tolist() == [0b1001001]
-        True
-    """
+    """Put two zero bits between the bits of numbers below 2**21, int64."""
     for shift, pattern in _SPREADS:
         values = (values | values << shift) & pattern
     return values
 
 
 def gather_bits(codes: Tensor) -> Tensor:
-    """Return every third bit of codes, the inverse of :func:`spread_bits`.
-
-    Example:
-        >>> gather_bits(spread_bits(torch.tensor([54321])) | 0b110).tolist()
-        [54321]
-    """
+    """Return every third bit of codes, the inverse of :func:`spread_bits`."""
     codes = codes & _SPREADS[-1][1]
     patterns = [pattern for _, pattern in _SPREADS[-2::-1]] + [2**_MORTON_BITS - 1]
     for (shift, _), pattern in zip(reversed(_SPREADS), patterns, strict=True):
         codes = (codes | codes >> shift) & pattern
     return codes
-
-
-def shift_codes(codes: Tensor, axis: int) -> Tensor:
-    """Return the codes of the cubes one further along an axis; past the last one comes the first.
-
-    Example:
-        >>> shift_codes(torch.tensor([0b000, 0b010, 0b101]), 0).tolist()
-        [1, 3, 12]
-    """
-    mask = _SPREADS[-1][1] << axis
-    moved = ((codes | ~mask) + (1 << axis)) & mask
-    return (codes & ~mask) | moved

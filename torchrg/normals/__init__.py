@@ -1,6 +1,7 @@
 """Normals and curvature of clouds: one call for every estimator."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,32 +15,23 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
-from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
+from torchrg.normals.jet import fit_normals_jet
 from torchrg.normals.orient import orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points
 from torchrg.normals.patches import Estimator, at_all_points
 from torchrg.normals.pca import fit_normals_pca
-from torchrg.normals.robust import (
-    fit_normals_detmcd,
-    fit_normals_detmm,
-    fit_normals_fastmcd,
-    fit_normals_mve,
-)
+from torchrg.normals.robust import fit_normals_robust
+from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
 from torchrg.structures import Neighbors, NormalFit
 
 __all__ = [
     "ESTIMATORS",
-    "JetFit",
     "estimate_normals",
     "find_sharp_points",
-    "fit_jet",
-    "fit_normals_detmcd",
-    "fit_normals_detmm",
-    "fit_normals_fastmcd",
     "fit_normals_irls",
     "fit_normals_jet",
-    "fit_normals_mve",
     "fit_normals_pca",
+    "fit_normals_robust",
     "orient_normals",
 ]
 
@@ -49,10 +41,12 @@ ESTIMATORS: dict[str, Estimator] = {
     "pca": at_all_points(fit_normals_pca),
     "jet": at_all_points(fit_normals_jet),
     "irls": estimate_irls,
-    "fastmcd": at_all_points(fit_normals_fastmcd, **_MCD),
-    "mve": at_all_points(fit_normals_mve, **_MCD),
-    "detmcd": at_all_points(fit_normals_detmcd, **_MCD),
-    "detmm": at_all_points(fit_normals_detmm, quantile="inlier_quantile"),
+    "fastmcd": at_all_points(partial(fit_normals_robust, estimator=fit_fastmcd), **_MCD),
+    "mve": at_all_points(partial(fit_normals_robust, estimator=fit_mve), **_MCD),
+    "detmcd": at_all_points(partial(fit_normals_robust, estimator=fit_detmcd), **_MCD),
+    "detmm": at_all_points(
+        partial(fit_normals_robust, estimator=fit_detmm), quantile="inlier_quantile"
+    ),
     "paper": estimate_paper,
     "consensus": estimate_consensus,
 }

@@ -2,7 +2,7 @@
 
 import math
 from itertools import product
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -16,13 +16,10 @@ from torchrg.neighbors import finite_rows, gather_patches, search_knn
 from torchrg.structures import Neighbors
 
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
-
-ORIENTATIONS: tuple[str, ...] = get_args(Orientation)
 """What normals can be turned towards."""
 
 _NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""
-
 
 _NUM_LINKS = 12
 """Nearest neighbours over which signs spread: enough to cross from face to face of a thin plate."""
@@ -106,8 +103,8 @@ def orient_normals(
     check_shapes("orient_normals", points=(cloud, "N 3"), normals=(given, "N 3"))
     check_floating("orient_normals", points=cloud)
     check_floating("orient_normals", normals=given)
-    if towards not in ORIENTATIONS:
-        names = ", ".join(ORIENTATIONS)
+    if towards not in get_args(Orientation):
+        names = ", ".join(get_args(Orientation))
         raise ConfigError(
             f"orient_normals: expected towards to be one of {names}, got {towards!r}."
         )
@@ -184,21 +181,9 @@ def _sum_by(groups: Tensor, values: Tensor) -> Tensor:
     return values.new_zeros(num_groups, *values.shape[1:]).index_add(0, groups, values)
 
 
-class Signs(NamedTuple):
-    """Signs that make normals agree within each patch of points.
-
-    Attributes:
-        signs: 1 or -1 for each point, shape ``(N,)``.
-        patches: The patch that each point belongs to, 0 to M-1, shape ``(N,)``, int64.
-    """
-
-    signs: Tensor
-    patches: Tensor
-
-
 def propagate_signs(
     points: Tensor, normals: Tensor, neighbors: Neighbors, *, max_bend: float = 4.0
-) -> Signs:
+) -> tuple[Tensor, Tensor]:
     r"""Find signs by which neighbouring normals agree, along a minimum spanning tree [1].
 
     Two normals agree if one and the mirror image of the other in the plane halfway between the two
@@ -207,8 +192,11 @@ def propagate_signs(
     trusted is its bend ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle
     and ``u`` the direction of the link: 0 on a plane, 1 over a right-angled edge, 2 through a
     plate. The tree takes the links of least bend, those of more than ``max_bend`` not at all;
-    memory and time are those of a sparse graph. The first point of each patch has sign 1. Points
-    are in canonical order if ties are to be independent of it.
+    memory and time are those of a sparse graph. Points are in canonical order if ties are to be
+    independent of it.
+
+    Returns signs ``(N,)``, 1 or -1, and the connected patch that each point belongs to, 0 to M-1,
+    whose first point has sign 1.
 
     References:
         [1] H. Hoppe et al. Surface reconstruction from unorganized points. SIGGRAPH, 1992.
@@ -221,7 +209,7 @@ def propagate_signs(
 
     num_points = len(points)
     if num_points == 0:
-        return Signs(normals.new_ones(0), torch.zeros(0, dtype=torch.int64, device=points.device))
+        return normals.new_ones(0), torch.zeros(0, dtype=torch.int64, device=points.device)
     starts, ends, bends = _links(points, normals, neighbors)
     kept = bends <= max_bend
     # A weight of zero would be no link, so every link weighs one more than its bend.
@@ -242,7 +230,7 @@ def propagate_signs(
     parents = parents[:num_points].copy()
     parents[first] = first
     signs = _signs_to_root(points, normals, torch.from_numpy(parents).long().to(points.device))
-    return Signs(signs, torch.from_numpy(patches).long().to(points.device))
+    return signs, torch.from_numpy(patches).long().to(points.device)
 
 
 def _links(

@@ -12,7 +12,7 @@ from torchrg.errors import ConfigError
 from torchrg.linalg import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
 from torchrg.normals.patches import fit_points, replace_rows
 from torchrg.normals.pca import fit_normals_pca
-from torchrg.normals.robust import fit_normals_detmcd
+from torchrg.normals.robust import fit_normals_robust
 from torchrg.robust.scale import QN_FACTOR, qn_exceeds
 from torchrg.structures import Neighbors, NormalFit
 
@@ -118,7 +118,7 @@ def estimate_paper(
     )
     rows = sharp.nonzero().squeeze(-1)
     robust = partial(
-        fit_normals_detmcd,
+        fit_normals_robust,
         support_fraction=config.support_fraction,
         quantile=config.inlier_quantile,
     )

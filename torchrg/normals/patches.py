@@ -25,18 +25,11 @@ def fit_points(
     chunk_size: int = CHUNK_SIZE,
     **of_points: Tensor,
 ) -> NormalFit:
-    """Fit the neighbourhoods of some points of a cloud, with bounded memory.
+    """Fit the neighbourhoods of some points of a cloud ``(N, 3)``, by default of all of them.
 
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        fit: Estimator of patches.
-        rows: Points to fit, shape ``(n,)``. Default: all.
-        chunk_size: Patches in memory at a time; changes no result.
-        **of_points: Further keywords of ``fit`` that have a value for each point, shape ``(N,)``.
-
-    Returns:
-        The fit of those points, without ``sharp``.
+    Patches in memory at a time are ``chunk_size``, which changes no result. Further keywords are
+    those of ``fit`` that have a value for each point, shape ``(N,)``. Returns the fit of the given
+    rows, without ``sharp``.
     """
 
     def fit_chunk(chunk: slice) -> NormalFit:
@@ -71,17 +64,17 @@ def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
     return estimate
 
 
-def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the first point of each patch that counts, and all points relative to it.
+def about_first(patches: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the points of each patch relative to the first of them that counts.
 
     Zero where no point counts, and for points that do not; these may hold NaN.
     """
     if mask is None:
-        return patches[..., 0, :], patches - patches[..., :1, :]
+        return patches - patches[..., :1, :]
     first = mask.to(torch.uint8).argmax(dim=-1)[..., None, None]
     place = patches.gather(-2, first.expand(*first.shape[:-1], 3))
     place = torch.where(mask.any(dim=-1)[..., None, None], place, 0.0)
-    return place.squeeze(-2), torch.where(mask[..., None], patches - place, 0.0)
+    return torch.where(mask[..., None], patches - place, 0.0)
 
 
 def replace_rows(fit: NormalFit, rows: Tensor, refined: NormalFit) -> NormalFit:

@@ -4,7 +4,6 @@ import random
 from functools import lru_cache
 from itertools import combinations
 from math import comb
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,39 +25,27 @@ _MIN_EDGE = 0.01
 """Height, in extents of a patch, below which an edge is too short to span the next dimension."""
 
 
-class Flats(NamedTuple):
-    """The flat of lowest dimension that holds a majority of each lane's points exactly.
-
-    Attributes:
-        dimension: 0 a place, 1 a line, ..., P - 1 a hyperplane, P none; shape ``(M,)``, int64.
-        members: The points on it, shape ``(K, M)``, bool; all False where there is none.
-    """
-
-    dimension: Tensor
-    members: Tensor
-
-
-def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
-    """Look for the flats that hold at least ``size`` points of each lane.
+def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Look for the flat of lowest dimension that holds at least ``size`` points of each lane.
 
     Each of a fixed list of simplices spans a flat of every dimension. Where the next vertex of a
     simplex lies on the flat of those before it, which in general position never happens, the
     flat is a candidate; the points on it are counted, and the flat is fitted to them again.
+    Columns ``(K, M)`` are about the middle of each lane; ``tolerance`` ``(M,)`` is the largest
+    distance that counts as on the flat.
 
-    Args:
-        columns: P coordinates of shape ``(K, M)``, about the middle of each lane.
-        tolerance: Largest distance that counts as on the flat, shape ``(M,)``.
-        size: Number of points that make a majority.
+    Returns its dimension ``(M,)``, 0 a place, 1 a line, ..., P - 1 a hyperplane, P none, and the
+    points on it ``(K, M)``, bool, all False where there is none.
     """
     parts = [
         _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
         for lanes in chunks_of(len(tolerance), _LANES)
     ]
     dimensions, members = zip(*parts, strict=True)
-    return Flats(torch.cat(dimensions), torch.cat(members, dim=1))
+    return torch.cat(dimensions), torch.cat(members, dim=1)
 
 
-def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
+def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Do as :func:`find_flats` for few enough lanes to fit the cache."""
     num_coordinates, (num_points, num_lanes) = len(columns), columns[0].shape
     dimension = torch.full((num_lanes,), num_coordinates, device=tolerance.device)
@@ -76,13 +63,12 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         rest = _reject(edge, axes)
         height = sum_squares(rest).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
-        found = _majorities(columns, origins, axes, candidates, reach, size)
-        if len(found.lanes):
-            lanes = take_lanes(columns, found.lanes)
-            on_flat = refine_flat(lanes, found.members, tolerance[found.lanes], len(axes))
+        lanes, near = _majorities(columns, origins, axes, candidates, reach, size)
+        if len(lanes):
+            on_flat = refine_flat(take_lanes(columns, lanes), near, tolerance[lanes], len(axes))
             kept = on_flat.sum(dim=0) >= size
-            dimension[found.lanes[kept]] = len(axes)
-            members[:, found.lanes[kept]] = on_flat[:, kept]
+            dimension[lanes[kept]] = len(axes)
+            members[:, lanes[kept]] = on_flat[:, kept]
         steep = steep & (height > _MIN_EDGE * extent)
         # A short edge is a poor ruler: what rounding moves at its ends grows with the distance.
         reach = torch.maximum(reach, 2 * tolerance * (1 + 2 * extent / height))
@@ -91,14 +77,7 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> Flats:
         spanned = dimension == num_coordinates
         dimension[spanned] = num_points - 1
         members[:, spanned] = True
-    return Flats(dimension, members)
-
-
-class _Majorities(NamedTuple):
-    """Lanes ``(F,)`` with a candidate flat that enough points lie near, and these ``(K, F)``."""
-
-    lanes: Tensor
-    members: Tensor
+    return dimension, members
 
 
 def _majorities(
@@ -108,8 +87,11 @@ def _majorities(
     candidates: Tensor,
     reach: Tensor,
     size: int,
-) -> _Majorities:
-    """Count the points near the first few candidates of each lane, and keep one full one."""
+) -> tuple[Tensor, Tensor]:
+    """Count the points near the first few candidates of each lane, and keep one full one.
+
+    Returns the lanes ``(F,)`` that have one, and the points near it ``(K, F)``.
+    """
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
     simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
@@ -128,7 +110,7 @@ def _majorities(
     order = order.masked_fill((ruler > best[place]) | ruler.isinf(), len(place))
     winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(0, place, order, "amin")
     winner = winner[winner < len(place)]
-    return _Majorities(lane[winner], near[:, winner])
+    return lane[winner], near[:, winner]
 
 
 def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimension: int) -> Tensor:

@@ -21,11 +21,6 @@ def split_columns(patches: Tensor) -> list[Tensor]:
     return list(patches.permute(2, 1, 0).contiguous().unbind(0))
 
 
-def join_columns(columns: list[Tensor]) -> Tensor:
-    """Stack values ``(*)`` of P columns into ``(*, P)``."""
-    return torch.stack(columns, dim=-1)
-
-
 def take_lanes(columns: list[Tensor], lanes: Tensor) -> list[Tensor]:
     """Take the given lanes of each ``(K, M)``; much faster than ``column[:, lanes]``."""
     return [column.index_select(1, lanes) for column in columns]
@@ -121,15 +116,9 @@ def fit_ellipsoid(
     of residuals instead of a difference of large numbers: the error in a thin direction grows
     with the ratio of extent to thickness, not with its square, which float32 could not bear.
 
-    Args:
-        columns: P coordinates of shape ``(K, M)``.
-        weights: Weights of the points, shape ``(K, M)``, at least 0.
-        total: Sum of the weights, number or shape ``(M,)``.
-        floor: Least variance in any direction, shape ``(M,)``, above 0: what rounding leaves of
-            an exact plane. It keeps distances finite.
-
-    Returns:
-        The factored scatter of each lane.
+    ``total`` is the sum of the weights ``(K, M)``. ``floor`` is the least variance in any
+    direction, shape ``(M,)``, above 0: what rounding leaves of an exact plane. It keeps distances
+    finite.
     """
     means = [sum_points(weights * column) / total for column in columns]
     residuals = [column - mean for column, mean in zip(columns, means, strict=True)]

@@ -12,7 +12,6 @@ from torchrg.robust.lanes import (
     covariance_entries,
     determinant,
     fit_ellipsoid,
-    join_columns,
     smallest_points,
     sq_distances,
     take_lanes,
@@ -43,12 +42,10 @@ _DIGITS = 24
 
 
 class _Concentrated(NamedTuple):
-    """The sets that concentration ended with.
+    """The sets that concentration ended with, 1 for a point in it, 0 for another, ``(K, S, M)``.
 
-    Attributes:
-        members: 1 for a point in the set, 0 for another, shape ``(K, S, M)``.
-        determinants: Of their scatter over h - 1, shape ``(S, M)``, float64; inf for a start that
-            repeats an earlier one of its lane.
+    The determinants ``(S, M)`` are those of their scatter over h - 1, float64; inf for a start that
+    repeats an earlier one of its lane.
     """
 
     members: Tensor
@@ -215,7 +212,7 @@ def _fit_mcd(
         return Estimate(
             *reweight(columns, distances, quantile, final_factor),
             sq_distances=distances,
-            raw_location=join_columns(ellipsoid.means),
+            raw_location=torch.stack(ellipsoid.means, dim=-1),
             raw_covariance=covariance * raw_factor,
             raw_support=members > 0,
             objective=sets.determinants.gather(0, best[None]).squeeze(0),

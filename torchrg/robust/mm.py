@@ -1,22 +1,20 @@
-"""S and MM estimates of location and scatter from deterministic starts."""
+"""MM-estimates of location and scatter, and the S-estimates they start from."""
 
 from collections.abc import Callable
 from functools import lru_cache
 from math import exp, lgamma, log
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.errors import ConfigError
 from torchrg.linalg import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,
     determinant,
     fit_ellipsoid,
-    join_columns,
     map_values,
     median_points,
     smallest_points,
@@ -28,14 +26,11 @@ from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, check_starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
-Target = Literal["shape", "location"]
-"""What the efficiency of 95 % at the normal distribution refers to."""
-
 _BREAKDOWN = 0.5
 """Share of the points that may be arbitrary."""
 
 _EFFICIENCY = 0.95
-"""Of the MM-estimate for normal data."""
+"""Of the MM-estimate's shape for normal data: what normals want, and what R's rrcov has."""
 
 _MAX_STEPS = 300
 """Reweightings after which weights that have not settled are left as they are."""
@@ -48,12 +43,9 @@ _CHECK_EVERY = 4
 
 
 class _Shape(NamedTuple):
-    """A weighted fit of each lane, its scatter scaled to determinant one.
+    """Weights ``(K, M)`` of the points of each lane, and their scatter scaled to determinant one.
 
-    Attributes:
-        weights: Of the points, shape ``(K, M)``.
-        ellipsoid: Their factored scatter.
-        distances: Squared distances to the scatter of determinant one, shape ``(K, M)``.
+    The distances are squared, and those to the scaled scatter, shape ``(K, M)``.
     """
 
     weights: Tensor
@@ -61,81 +53,34 @@ class _Shape(NamedTuple):
     distances: Tensor
 
 
-def fit_dets(
-    patches: Tensor,
-    mask: Tensor | None = None,
-    *,
-    quantile: float = 0.975,
-    starts: Starts = "robustbase",
-    chunk_size: int = 2048,
-) -> RobustFit:
-    r"""Fit location and scatter of each patch by the deterministic S-estimator.
-
-    The scatter is the one of least volume for which the mean bisquare loss of the distances is
-    half of its maximum, so that half of the points may be arbitrary. Each deterministic start is
-    iterated to a local minimum, and the smallest wins [1].
-
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        quantile: Level of the chi-square distribution within which points are inliers.
-        starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
-        chunk_size: Patches worked on together.
-
-    Returns:
-        The fits. Location and covariance are the estimate itself, not reweighted, and the same as
-        the raw ones; ``raw_support`` are the points with a weight above zero; ``log_det`` is that
-        of the covariance. More than half of the points on one plane are an exact fit.
-
-    References:
-        [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
-        multivariate location and scatter. Computational Statistics & Data Analysis 81, 2015.
-
-    Example:
-        >>> points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
-        >>> points[:, 2] *= 0.01
-        >>> points[:20, 2] += 1.0
-        >>> fit_dets(points).support[:20].any().item()
-        False
-    """
-    check_starts("fit_dets", starts)
-
-    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
-        shape, scale = _best_s_estimate(columns, floor, size, starts)
-        return _estimate(columns, shape, shape, scale, quantile)
-
-    return fit_patchwise(
-        "fit_dets", patches, mask, 0.5, quantile, chunk_size, estimator, majority=half_size
-    )
-
-
 def fit_detmm(
     patches: Tensor,
     mask: Tensor | None = None,
     *,
     quantile: float = 0.975,
-    tuned_for: Target = "shape",
     starts: Starts = "robustbase",
     chunk_size: int = 2048,
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic MM-estimator.
 
-    The scale of the S-estimate is kept, and location and shape are iterated on with a wider
-    bisquare that is 95 % efficient for normal data [1].
+    The S-estimate (DetS) has the scatter of least volume for which the mean bisquare loss of the
+    distances is half of its maximum, so that half of the points may be arbitrary. Each
+    deterministic start is iterated to a local minimum, and the smallest wins. Its scale is kept,
+    and location and shape are iterated on with a wider bisquare whose shape is 95 % efficient for
+    normal data (cut-off 6.0963 for P = 3) [1].
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
         mask: Which points count, shape ``(*, K)``, bool. Default: all.
         quantile: Level of the chi-square distribution within which points are inliers.
-        tuned_for: Whether the efficiency is that of the ``"shape"`` (cut-off 6.0963 for P = 3),
-            as normals want and R's rrcov has it, or of the ``"location"`` (5.4902).
         starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
         chunk_size: Patches worked on together.
 
     Returns:
         The fits. Location and covariance are the MM-estimate, ``raw_*`` the S-estimate it started
-        from; distances and ``support`` belong to the MM-estimate; ``log_det`` is that of its
-        covariance. More than half of the points on one plane are an exact fit.
+        from, with the points of a weight above zero; distances and ``support`` belong to the
+        MM-estimate; ``log_det`` is that of both covariances. More than half of the points on one
+        plane are an exact fit.
 
     References:
         [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
@@ -149,14 +94,10 @@ def fit_detmm(
         False
     """
     check_starts("fit_detmm", starts)
-    if tuned_for not in ("shape", "location"):
-        raise ConfigError(
-            f"fit_detmm: expected tuned_for to be shape or location, got {tuned_for!r}."
-        )
 
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         first, scale = _best_s_estimate(columns, floor, size, starts)
-        cutoff = efficiency_constant(len(columns), tuned_for)
+        cutoff = _efficiency_constant(len(columns))
         weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
         final = _shape_of(columns, weights, floor)
         sq_unit = cutoff * cutoff * scale * scale
@@ -175,7 +116,7 @@ def _best_s_estimate(
 ) -> tuple[_Shape, Tensor]:
     """Iterate every start of each lane to an S-estimate, and keep that of the smallest scale."""
     num_points, num_lanes = columns[0].shape
-    cutoff = breakdown_constant(len(columns))
+    cutoff = _breakdown_constant(len(columns))
     weights, scales = [], []
     for initial, count in initial_sets(columns, size, starts):
         num_starts = initial.shape[1]
@@ -209,11 +150,11 @@ def _estimate(
         return covariance_entries(columns, shape.ellipsoid.means, shape.weights, denominator)
 
     return Estimate(
-        location=join_columns(final.ellipsoid.means),
+        location=torch.stack(final.ellipsoid.means, dim=-1),
         covariance=scatter(final),
         support=distances <= bound,
         sq_distances=distances,
-        raw_location=join_columns(raw.ellipsoid.means),
+        raw_location=torch.stack(raw.ellipsoid.means, dim=-1),
         raw_covariance=scatter(raw),
         raw_support=raw.weights > 0,
         objective=sq_scale.double() ** size,
@@ -308,13 +249,8 @@ def _bisquare_loss(sq_ratios: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def breakdown_constant(num_coordinates: int) -> float:
-    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal.
-
-    Example:
-        >>> round(breakdown_constant(3), 6)
-        3.452882
-    """
+def _breakdown_constant(num_coordinates: int) -> float:
+    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal."""
 
     def excess(cutoff: float) -> float:
         moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
@@ -325,15 +261,8 @@ def breakdown_constant(num_coordinates: int) -> float:
 
 
 @lru_cache(maxsize=64)
-def efficiency_constant(num_coordinates: int, target: Target) -> float:
-    """Cut-off with 95 % efficiency at the normal distribution.
-
-    For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
-
-    Example:
-        >>> round(efficiency_constant(3, "shape"), 5), round(efficiency_constant(3, "location"), 5)
-        (6.09627, 5.49025)
-    """
+def _efficiency_constant(num_coordinates: int) -> float:
+    """Cut-off with 95 % efficiency of the scatter's shape for normal data (Tyler 1983)."""
     p = num_coordinates
 
     def excess(cutoff: float) -> float:
@@ -342,12 +271,8 @@ def efficiency_constant(num_coordinates: int, target: Target) -> float:
             return sum(a * _moment(m, p, cutoff) / cutoff**m for m, a in coefficients.items())
 
         # With u = d / cutoff: psi(d) = d (1 - u^2)^2 and psi'(d) = (1 - u^2) (1 - 5 u^2).
-        if target == "location":
-            spread = cutoff**2 * mean({2: 1, 4: -4, 6: 6, 8: -4, 10: 1}) / p
-            slope = mean({0: 1, 2: -2 - 4 / p, 4: 1 + 4 / p})
-        else:
-            spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
-            slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
+        spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
+        slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
         return slope**2 / spread - _EFFICIENCY
 
     return _root(excess)

@@ -14,7 +14,6 @@ from torchrg.linalg import flatness_tolerance, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     covariance_entries,
-    join_columns,
     map_values,
     median_points,
     split_columns,
@@ -193,7 +192,7 @@ def _fit_chunk(
     subset = subset_size(num_points, size, support_fraction)
     enough = subset if majority is None else majority(num_points)
     columns, frame, tolerance = _to_lanes(patches)
-    flats = find_flats(columns, tolerance, enough)
+    dimension, members = find_flats(columns, tolerance, enough)
     out = _no_fit(patches)
 
     def lanes_of(rows: Tensor) -> list[Tensor]:
@@ -202,7 +201,7 @@ def _fit_chunk(
     def store_exact(rows: Tensor, members: Tensor) -> None:
         _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
 
-    regular = torch.nonzero(flats.dimension == size).squeeze(1)
+    regular = torch.nonzero(dimension == size).squeeze(1)
     if len(regular):
         estimate = estimator(lanes_of(regular), tolerance[regular] ** 2, subset)
         _store(out, regular, _general_fit(estimate, frame.of(regular)))
@@ -210,15 +209,15 @@ def _fit_chunk(
         thin = torch.nonzero(estimate.singular).squeeze(1)
         if len(thin):
             rows, chosen = regular[thin], estimate.raw_support[:, thin]
-            members = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
-            found = members.sum(dim=0) >= enough
-            store_exact(rows[found], members[:, found])
-    exact = torch.nonzero(flats.dimension == size - 1).squeeze(1)
+            on_plane = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
+            found = on_plane.sum(dim=0) >= enough
+            store_exact(rows[found], on_plane[:, found])
+    exact = torch.nonzero(dimension == size - 1).squeeze(1)
     if len(exact):
-        store_exact(exact, flats.members[:, exact])
-    lower = torch.nonzero(flats.dimension < size - 1).squeeze(1)
+        store_exact(exact, members[:, exact])
+    lower = torch.nonzero(dimension < size - 1).squeeze(1)
     if len(lower):
-        rest = ~flats.members[:, lower].t()
+        rest = ~members[:, lower].t()
         fit = _fit_groups(
             patches[lower],
             rest,
@@ -227,11 +226,11 @@ def _fit_chunk(
         )
         _store(out, lower, fit)
         lower = lower[~fit.valid]
-        lanes, every = lanes_of(lower), flats.members[:, lower] | True
+        lanes, every = lanes_of(lower), members[:, lower] | True
         plane = refine_flat(lanes, every, tolerance[lower], size - 1).all(dim=0)
         line = refine_flat(lanes, every, tolerance[lower], size - 2).all(dim=0)
         rows = lower[plane & ~line]
-        store_exact(rows, flats.members[:, rows] | True)
+        store_exact(rows, members[:, rows] | True)
     return out
 
 
@@ -264,7 +263,10 @@ def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustF
     wide = [column.double() for column in columns]
     means = [sum_points(weights * column) / count for column in wide]
     covariance = covariance_entries(wide, means, weights, (count - 1).clamp(min=1)).to(dtype)
-    location, covariance = frame.point(join_columns(means).to(dtype)), frame.matrix(covariance)
+    location, covariance = (
+        frame.point(torch.stack(means, dim=-1).to(dtype)),
+        frame.matrix(covariance),
+    )
     support = members.t()
     valid = torch.ones(len(support), dtype=torch.bool, device=support.device)
     return RobustFit(
@@ -311,7 +313,7 @@ def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
     zoom = _power_of_two(extent)
     tolerance = flatness_tolerance(patches, extent) * zoom
     columns = [column * zoom for column in columns]
-    return columns, _Frame(join_columns(middle), unit, zoom), tolerance
+    return columns, _Frame(torch.stack(middle, dim=-1), unit, zoom), tolerance
 
 
 def _power_of_two(length: Tensor) -> Tensor:

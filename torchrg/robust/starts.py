@@ -124,8 +124,8 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order.
     """
     ranks = [_double_ranks(column) for column in columns]
-    scores = _normal_scores(len(columns[0]), columns[0])
     norms = sum_squares(columns)
+    scores = norms.new_tensor(_score_table(len(norms)))
     half = smallest_points(norms, -(-len(norms) // 2))
     lengths = norms.sqrt()
     lengths = torch.where(lengths > machine_epsilon(norms.dtype), lengths, 1.0)
@@ -222,10 +222,6 @@ def _score_table(count: int) -> tuple[float, ...]:
     return (scores[0], *scores)
 
 
-def _normal_scores(count: int, like: Tensor) -> Tensor:
-    return torch.tensor(_score_table(count), dtype=like.dtype, device=like.device)
-
-
 def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
     """Choose the sets nearest to the best of 64 planes through P points each.
 
@@ -274,8 +270,6 @@ def _across(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
     if size == 3:
         (u0, u1, u2), (v0, v1, v2) = edges
         normal = [u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0]
-    elif size == 2:
-        normal = [-edges[0][1], edges[0][0]]
     else:
         matrix = torch.stack([torch.stack(edge, dim=-1) for edge in edges], dim=-2)
         minors = []
@@ -302,15 +296,8 @@ def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tens
     """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
 
     The same sets serve every patch, so a patch's result depends on the seed and on nothing else
-    in its batch.
-
-    Returns:
-        Point indices, shape ``(S, size)``, int64: all sets in lexicographic order where there are
-        at most ``5 * num_sets``, otherwise ``num_sets`` of them.
-
-    Example:
-        >>> elemental_sets(4, 3, 1, 0).tolist()
-        [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
+    in its batch. Returns point indices ``(S, size)``: all sets in lexicographic order where there
+    are at most ``5 * num_sets``, otherwise ``num_sets`` of them.
     """
     if comb(num_points, size) <= 5 * num_sets:
         return torch.tensor(list(combinations(range(num_points), size)))

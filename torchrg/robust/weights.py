@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most
-from torchrg.robust.lanes import covariance_entries, join_columns
+from torchrg.robust.lanes import covariance_entries
 from torchrg.robust.scale import sum_points
 
 
@@ -17,10 +17,6 @@ def subset_size(num_points: int, num_coordinates: int, support_fraction: float) 
 
     Between the smallest size with the highest breakdown point, ``(n + p + 1) // 2``, at a support
     fraction of 0.5 and all n points at 1.
-
-    Example:
-        >>> subset_size(50, 3, 0.5), subset_size(50, 3, 0.75), subset_size(50, 3, 1.0)
-        (27, 38, 50)
     """
     half = (num_points + num_coordinates + 1) // 2
     size = 2 * half - num_points + 2 * (num_points - half) * support_fraction
@@ -30,12 +26,7 @@ def subset_size(num_points: int, num_coordinates: int, support_fraction: float) 
 
 @lru_cache(maxsize=1024)
 def chi2_quantile(probability: float, degrees: int) -> float:
-    """Quantile of the chi-square distribution.
-
-    Example:
-        >>> round(chi2_quantile(0.975, 3), 6)
-        9.348404
-    """
+    """Quantile of the chi-square distribution; scipy.stats takes half a second to import."""
     from scipy.special import gammaincinv
 
     return 2 * float(gammaincinv(degrees / 2, probability))
@@ -43,12 +34,7 @@ def chi2_quantile(probability: float, degrees: int) -> float:
 
 @lru_cache(maxsize=4096)
 def consistency_factor(fraction: float, num_coordinates: int) -> float:
-    """Factor that makes the scatter of the innermost ``fraction`` of normal data consistent.
-
-    Example:
-        >>> round(consistency_factor(27 / 50, 3), 6), round(consistency_factor(0.975, 3), 7)
-        (2.283636, 1.0784787)
-    """
+    """Factor that makes the scatter of the innermost ``fraction`` of normal data consistent."""
     from scipy.special import gammainc
 
     if fraction >= 1:
@@ -69,13 +55,6 @@ def small_sample_factor(
 
     For the raw scatter or the reweighted one. Where the published formula has its pole (five points
     and fewer) or is negative (six), the factor is 1.
-
-    Raises:
-        ConfigError: If ``num_coordinates`` is not 3: no others are known.
-
-    Example:
-        >>> round(small_sample_factor(50, 3, 0.5, reweighted=False), 4)
-        1.1863
     """
     if num_coordinates != 3:
         raise ConfigError(
@@ -123,10 +102,7 @@ def reweight(
     """Take mean and covariance of the points within a chi-square quantile of a raw fit.
 
     The covariance has its consistency factor, and neither that nor the small-sample factor where
-    no point is left out.
-
-    Returns:
-        Location, covariance and support, as in :class:`Estimate`.
+    no point is left out. Returns location, covariance and support, as in :class:`Estimate`.
     """
     size = len(columns)
     bound = distances.new_tensor([chi2_quantile(quantile, size)])
@@ -137,4 +113,4 @@ def reweight(
     factor = consistency_factor(quantile, size) * small_sample
     whole = count == len(distances)
     covariance = torch.where(whole[:, None, None], covariance, covariance * factor)
-    return join_columns(means), covariance, weights > 0
+    return torch.stack(means, dim=-1), covariance, weights > 0
