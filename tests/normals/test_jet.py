@@ -7,14 +7,16 @@ import pytest
 import torch
 
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.normals import fit_normals_jet, fit_normals_pca
+from torchrg.normals import fit_jet, fit_normals_jet, fit_normals_pca
 from torchrg.normals.jet import least_squares
-from torchrg.structures import NormalFit
 
 # Sums of CGAL lose digits far from the origin; the frame of exact planes and lines is arbitrary.
 LOSES_DIGITS = ("utm", "off1e4")
 NO_FRAME = {"exact", "line"}
 ANGLE_DEG = {torch.float64: 1e-5, torch.float32: 0.01}
+RELATIVE = {torch.float64: 1e-7, torch.float32: 1e-3}
+# Of curvatures times the size of the patch, for patches that are flat but for noise.
+ABSOLUTE = {torch.float64: 1e-12, torch.float32: 1e-6}
 
 
 def cgal_cases(folder):
@@ -29,52 +31,79 @@ def cgal_cases(folder):
                 yield name, patches[name], known
 
 
-def test_normals_are_those_of_cgal(oracles_folder, dtype):
+def test_normals_and_curvatures_are_those_of_cgal(oracles_folder, dtype):
     compared = 0
     for name, patch, known in cgal_cases(oracles_folder):
         if dtype == torch.float32 and name.endswith("aniso_units"):
             continue
         local = torch.from_numpy(patch - patch[0])
         size = local.abs().max()
-        fit = fit_normals_jet((local / size).to(dtype))
+        fit = fit_jet((local / size).to(dtype))
         assert fit.valid, name
         normal = torch.tensor(known["normal"], dtype=torch.float64)
         assert unsigned_angle_deg(fit.normals.double(), normal) < ANGLE_DEG[dtype], name
+        turned = fit.normals.double() @ normal < 0
+        mine = fit.principal_curvatures.double() / size
+        mine = -mine.flip(0) if turned else mine
+        expected = torch.tensor([known["k1"], known["k2"]], dtype=torch.float64)
+        largest = expected.abs().max()
+        assert (mine - expected).abs().max() <= RELATIVE[dtype] * largest + ABSOLUTE[
+            dtype
+        ] / size, name
+        if (expected[0] - expected[1]) > 0.01 * largest:
+            first = fit.principal_directions.double()[1 if turned else 0]
+            direction = torch.tensor(known["d1"], dtype=torch.float64)
+            assert unsigned_angle_deg(first, direction) < 10 * ANGLE_DEG[dtype], name
+        foot = torch.tensor(known["origin"], dtype=torch.float64) - torch.from_numpy(patch[0])
+        assert (fit.foot.double() * size - foot).abs().max() < RELATIVE[dtype] * size, name
         compared += 1
     assert compared > 55
 
 
-def test_normal_of_a_sphere_is_its_radius(rng):
+def test_curvatures_of_a_sphere_are_those_of_its_radius(rng):
     directions = torch.randn(30, 40, 3, generator=rng, dtype=torch.float64) * 0.05
     directions[..., 2] = 1
     directions[:, 0, :2] = 0
     sphere = 2 * torch.nn.functional.normalize(directions, dim=-1)
-    fit = fit_normals_jet(sphere)
+    fit = fit_jet(sphere)
     outwards = torch.tensor([0.0, 0, 1], dtype=torch.float64)
     assert unsigned_angle_deg(fit.normals, outwards).max() < 0.05
+    assert torch.allclose(fit.principal_curvatures.abs(), torch.tensor(0.5).double(), rtol=0.02)
     assert fit_normals_pca(sphere).normals.sub(fit.normals).norm() > 0
 
 
-def test_residual_scales_with_the_unit(rng):
+def test_curvature_is_positive_where_the_surface_bends_towards_the_normal():
+    u, v = torch.meshgrid(torch.arange(-3.0, 4), torch.arange(-3.0, 4), indexing="ij")
+    saddle = torch.stack([u, v, (2 * u * u - v * v) / 50], dim=-1).reshape(49, 3).roll(-24, dims=0)
+    fit = fit_jet(saddle)
+    expected = torch.tensor([0.08, -0.04]) * fit.normals[2].sign()
+    assert torch.allclose(
+        fit.principal_curvatures, expected.sort(descending=True).values, atol=1e-5
+    )
+    steep = 0 if fit.normals[2] > 0 else 1
+    assert fit.principal_directions[steep, 0].abs() > 0.999
+
+
+def test_curvatures_scale_with_the_unit(rng):
     patch = torch.randn(30, 3, generator=rng, dtype=torch.float64) * torch.tensor([1, 1, 0.1])
-    small, large = fit_normals_jet(patch), fit_normals_jet(patch * 1000)
-    assert torch.allclose(small.residual_rms * 1000, large.residual_rms)
+    small, large = fit_jet(patch), fit_jet(patch * 1000)
+    assert torch.allclose(small.principal_curvatures, large.principal_curvatures * 1000)
     assert torch.allclose(small.normals, large.normals)
 
 
 def test_fewer_than_six_points_give_the_plane(rng, dtype):
     for count in (3, 4, 5):
         patch = torch.randn(count, 3, generator=rng, dtype=torch.float64).to(dtype)
-        fit, plane = fit_normals_jet(patch), fit_normals_pca(patch)
-        assert unsigned_angle_deg(fit.normals, plane.normals) < 0.01
-        assert torch.allclose(fit.residual_rms, plane.residual_rms, atol=1e-3)
+        fit = fit_jet(patch)
+        assert unsigned_angle_deg(fit.normals, fit_normals_pca(patch).normals) < 0.01
+        assert not fit.principal_curvatures.any()
 
 
 def test_two_scan_lines_leave_out_what_they_do_not_determine(rng):
     u = torch.rand(20, generator=rng, dtype=torch.float64)
     v = torch.arange(20) % 2
     patch = torch.stack([u, 0.1 * v, 0.1 * u * u], dim=-1)
-    fit = fit_normals_jet(patch)
+    fit = fit_jet(patch)
     slope = torch.stack([-0.2 * u[0], torch.zeros(()), torch.ones(())]).double()
     assert fit.valid
     # Height is no exact quadratic of the tilted frame, and the lines are a tenth apart.
@@ -94,8 +123,9 @@ def test_query_is_the_first_point_that_counts(rng):
     u, v = torch.rand(2, 40, generator=rng, dtype=torch.float64)
     bowl = torch.stack([u, v, 0.3 * u * u], dim=-1)
     mask = torch.arange(40) >= 7
-    fit = fit_normals_jet(torch.where(mask[:, None], bowl, torch.nan), mask)
-    assert torch.allclose(fit.normals, fit_normals_jet(bowl[7:]).normals)
+    fit = fit_jet(torch.where(mask[:, None], bowl, torch.nan), mask)
+    assert torch.allclose(fit.normals, fit_jet(bowl[7:]).normals)
+    assert torch.allclose(fit.foot, fit_jet(bowl[7:]).foot)
 
 
 def test_gradients_are_right(rng):
@@ -103,8 +133,14 @@ def test_gradients_are_right(rng):
     mask = torch.arange(12) != 4
 
     def fit(points):
-        found = fit_normals_jet(points, mask.expand(2, 12))
-        return found.normals, found.curvature, found.residual_rms
+        found = fit_jet(points, mask.expand(2, 12))
+        return (
+            found.normals,
+            found.foot,
+            found.principal_curvatures,
+            found.curvature,
+            found.residual_rms,
+        )
 
     assert torch.autograd.gradcheck(fit, patch.requires_grad_())
 
@@ -122,16 +158,17 @@ def test_gradients_are_right(rng):
 )
 def test_gradients_are_finite_at_repeated_eigenvalues(points):
     points = points.clone().requires_grad_()
-    fit = fit_normals_jet(points)
-    sum(part.sum() for part in (fit.normals, fit.curvature, fit.residual_rms)).backward()
+    fit = fit_jet(points)
+    parts = (fit.normals, fit.foot, fit.principal_curvatures, fit.curvature, fit.residual_rms)
+    sum(part.sum() for part in parts).backward()
     assert points.grad.isfinite().all()
 
 
 def test_vmap_is_the_batch(rng):
     patches = torch.randn(6, 20, 3, generator=rng)
-    mapped = torch.vmap(fit_normals_jet, out_dims=NormalFit(0, 0, 0, 0, None))(patches)
-    for found, expected in zip(mapped[:4], fit_normals_jet(patches)[:4], strict=True):
-        assert torch.equal(found, expected)
+    mapped, fit = torch.vmap(fit_jet)(patches), fit_jet(patches)
+    for name, value in fit._asdict().items():
+        assert torch.equal(getattr(mapped, name), value), name
 
 
 def test_least_squares_is_that_of_numpy(rng):

@@ -15,7 +15,7 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
-from torchrg.normals.jet import fit_normals_jet
+from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points
 from torchrg.normals.patches import Estimator, at_all_points
@@ -26,8 +26,10 @@ from torchrg.structures import Neighbors, NormalFit
 
 __all__ = [
     "ESTIMATORS",
+    "JetFit",
     "estimate_normals",
     "find_sharp_points",
+    "fit_jet",
     "fit_normals_irls",
     "fit_normals_jet",
     "fit_normals_pca",

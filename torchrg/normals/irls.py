@@ -192,7 +192,7 @@ def _fit_rows(
     others = mask & ~itself
     plane = fit_normals_pca(patches, mask, resolution=resolution)
     start = fit_normals_pca(patches, others, resolution=resolution)
-    offsets = about_first(patches, mask)
+    _, offsets = about_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
     noise = torch.maximum(noise, _LEAST_NOISE * radius)
     is_flat = start.residual_rms <= noise

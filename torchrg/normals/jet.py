@@ -1,4 +1,4 @@
-"""Quadratic height fields: normals of curved surfaces.
+"""Quadratic height fields: normals and curvatures of curved surfaces.
 
 Two solvers, as they are for two ends. Jets are for all points of a cloud, in float64 as exact as
 CGAL's, with gradients: they are fitted by orthogonalisation. The paraboloids of the consensus need
@@ -8,6 +8,7 @@ take half the time.
 
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,18 +31,62 @@ normal equations in float32 have the root of it, three parts in a thousand, righ
 def fit_normals_jet(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
 ) -> NormalFit:
-    r"""Fit a quadratic height field to each patch, a jet of degree 2 [1]: its normal at the point.
+    """Fit a quadratic surface to each patch and return its normal at the point itself.
+
+    See :func:`fit_jet`, which gives the principal curvatures too. ``curvature`` is the surface
+    variation of PCA, so that regions grow in the same order; ``residual_rms`` belongs to the
+    quadratic surface.
+
+    Example:
+        >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
+        >>> bowl = torch.stack([x, y, (x**2 + y**2) / 9], dim=-1).reshape(25, 3)
+        >>> fit_normals_jet(bowl.roll(13, dims=0)).normals.abs().round(decimals=4)
+        tensor([0., 0., 1.])
+    """
+    fit = fit_jet(patches, mask, resolution=resolution)
+    return NormalFit(fit.normals, fit.curvature, fit.valid, fit.residual_rms)
+
+
+class JetFit(NamedTuple):
+    """A quadratic surface through each neighbourhood; see :func:`fit_jet`.
+
+    Attributes:
+        normals: Unit normals of the surface at the point itself, shape ``(*, 3)``; zero where not
+            ``valid``. The sign is arbitrary.
+        foot: Point of the surface above or below it, shape ``(*, 3)``.
+        principal_curvatures: The larger and the smaller one, shape ``(*, 2)``, in 1 / unit of the
+            cloud; positive where the surface bends towards ``normals``.
+        principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
+            two orthogonal ones where the two curvatures are equal.
+        curvature: Surface variation, as of :func:`fit_normals_pca`, shape ``(*)``.
+        valid: Whether there is a plane, shape ``(*)``, bool; all else is zero where not.
+        residual_rms: Root mean square distance of the points to the surface along the normal of
+            their plane, shape ``(*)``.
+    """
+
+    normals: Tensor
+    foot: Tensor
+    principal_curvatures: Tensor
+    principal_directions: Tensor
+    curvature: Tensor
+    valid: Tensor
+    residual_rms: Tensor
+
+
+def fit_jet(
+    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
+) -> JetFit:
+    r"""Fit a quadratic height field to each patch: a jet of degree 2 [1].
 
     In the frame of the patch's PCA about the point itself, the first of the patch that counts, the
-    height ``w`` is fitted by least squares as ``a0 + a1 u + a2 v + a3 u^2 + a4 u v + a5 v^2``. The
-    normal at the point is ``(-a1, -a2, 1)`` turned back. This is what CGAL's
-    ``jet_estimate_normals`` does in degree 2.
+    height ``w`` is fitted by least squares as ``a0 + a1 u + a2 v + a3 u^2/2 + a4 u v + a5 v^2/2``.
+    The normal at the point is ``(-a1, -a2, 1)`` turned back, and the principal curvatures are the
+    eigenvalues of the shape operator there. This is what CGAL's ``jet_estimate_normals`` does in
+    degree 2.
 
     Convention:
-        ``curvature`` is the surface variation of PCA, so that regions grow in the same order;
-        ``residual_rms`` is the distance of the points to the quadratic surface along the normal of
-        their plane. Gradients flow through all of it, and are finite where two eigenvalues are
-        equal.
+        Gradients flow through everything but the principal directions, and are finite where two
+        eigenvalues are equal.
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, 3)``, the point itself first.
@@ -63,24 +108,30 @@ def fit_normals_jet(
         osculating jets. Computer Aided Geometric Design 22(2), 2005.
 
     Example:
-        >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
-        >>> bowl = torch.stack([x, y, (x**2 + y**2) / 9], dim=-1).reshape(25, 3)
-        >>> fit_normals_jet(bowl.roll(13, dims=0)).normals.abs().round(decimals=4)
-        tensor([0., 0., 1.])
+        >>> angle = torch.linspace(-0.3, 0.3, 7)
+        >>> angle, along = torch.meshgrid(angle.roll(4), torch.arange(3.0) / 10, indexing="ij")
+        >>> pipe = torch.stack([2 * angle.sin(), along, 2 * angle.cos()], dim=-1).reshape(21, 3)
+        >>> fit_jet(pipe).principal_curvatures.abs().amax()
+        tensor(0.5...)
     """
-    check_patches("fit_normals_jet", patches, mask, resolution)
+    check_patches("fit_jet", patches, mask, resolution)
     plane, frame = fit_plane(patches, mask, resolution)
+    place, offsets = about_first(patches, mask)
     axes = _tangent_axes(frame)
-    u, v, w = (about_first(patches, mask) @ axes).unbind(dim=-1)
+    u, v, w = (offsets @ axes).unbind(dim=-1)
     rounding = patch_resolution(patches, mask) if resolution is None else resolution
-    slope_u, slope_v, residual = _fit_height(u, v, w, mask, rounding)
-    length = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()
-    tilted = torch.stack([-slope_u, -slope_v, torch.ones_like(slope_u)], dim=-1)
-    normals = (axes @ (tilted / length[..., None])[..., None]).squeeze(-1)
+    (height, *derivatives), residual = _fit_height(u, v, w, mask, rounding)
+    normal, curvatures, directions = _principal_curvatures(*derivatives)
     count = residual.shape[-1] if mask is None else mask.sum(dim=-1).clamp(min=1)
-    return plane._replace(
-        normals=torch.where(plane.valid[..., None], normals, 0.0),
-        residual_rms=torch.where(plane.valid, root((residual * residual).sum(dim=-1) / count), 0.0),
+    valid = plane.valid
+    return JetFit(
+        torch.where(valid[..., None], (axes @ normal[..., None]).squeeze(-1), 0.0),
+        torch.where(valid[..., None], place + height[..., None] * axes[..., 2], 0.0),
+        torch.where(valid[..., None], curvatures, 0.0),
+        torch.where(valid[..., None, None], directions @ axes.mT, 0.0),
+        plane.curvature,
+        valid,
+        torch.where(valid, root((residual * residual).sum(dim=-1) / count), 0.0),
     )
 
 
@@ -90,8 +141,8 @@ def fit_paraboloids(
     r"""Fit ``h(u, v) = a + b u + c v + d u^2 + e u v + f v^2`` over a plane through each point.
 
     The normal at the point is that of the height field at ``u = v = 0``: the 2-jet of
-    :func:`fit_normals_jet` in another frame, by normal equations. Terms that the neighbours cannot
-    tell from the ones before, as on two scan lines, are left out. The heights are along ``normals``
+    :func:`fit_jet` in another frame, by normal equations. Terms that the neighbours cannot tell
+    from the ones before, as on two scan lines, are left out. The heights are along ``normals``
     ``(n, 3)``, within some 60 degrees of the surface normal; ``counted`` are weights 0 or 1.
 
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``,
@@ -129,9 +180,13 @@ def _tangent_axes(frame: PrincipalFrame) -> Tensor:
 
 
 def _fit_height(
-    u: Tensor, v: Tensor, w: Tensor, mask: Tensor | None, rounding: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both slopes at ``u = v = 0``, shape ``(*)`` each, and the residuals ``(*, K)``."""
+    u: Tensor,
+    v: Tensor,
+    w: Tensor,
+    mask: Tensor | None,
+    rounding: Tensor,
+) -> tuple[list[Tensor], Tensor]:
+    """Return height, slopes and second derivatives, shape ``(*)`` each, and the residuals."""
     count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)
     ones = torch.ones_like(u) if mask is None else mask.to(u.dtype)
     sides = [_mean_size(u), _mean_size(v)]
@@ -149,11 +204,10 @@ def _fit_height(
     )
     terms = _quadratic_terms(ones, u / sides[0], v / sides[1])
     coefficients, residual = least_squares(list(zip(terms, shares, strict=True)), w)
-    slope_u, slope_v = (
-        (coefficient / side).squeeze(-1)
-        for coefficient, side in zip(coefficients[1:3], sides, strict=True)
-    )
-    return slope_u, slope_v, residual
+    p, q = sides
+    units = (torch.ones_like(p), p, q, p * p / 2, p * q, q * q / 2)
+    derivatives = [(c / unit).squeeze(-1) for c, unit in zip(coefficients, units, strict=True)]
+    return derivatives, residual
 
 
 def _mean_size(values: Tensor) -> Tensor:
@@ -201,6 +255,41 @@ def least_squares(
         )
         coefficients.insert(0, (projections[row] - known) / mixing[row][row])
     return coefficients, target
+
+
+def _principal_curvatures(
+    slope_u: Tensor, slope_v: Tensor, uu: Tensor, uv: Tensor, vv: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return unit normals of height fields, principal curvatures and their directions.
+
+    From first and second derivatives: normals of positive height ``(*, 3)``, curvatures ``(*, 2)``,
+    larger first, and directions ``(*, 2, 3)``, these without gradient. They are the eigenvalues of
+    the shape operator, of entries aa, ab, bb in an orthonormal basis of tangents.
+    """
+    one = torch.ones_like(slope_u)
+    gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()
+    normal = torch.stack([-slope_u, -slope_v, one], dim=-1) / gradient[..., None]
+    length = (slope_u * slope_u + 1).sqrt()
+    first = torch.stack([one, torch.zeros_like(one), slope_u], dim=-1) / length[..., None]
+    second = torch.linalg.cross(normal, first)
+    au, bu, bv = first[..., 0], second[..., 0], second[..., 1]
+    aa = au * au * uu / gradient
+    ab = au * (bu * uu + bv * uv) / gradient
+    bb = (bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv) / gradient
+    middle, half = (aa + bb) / 2, (aa - bb) / 2
+    radius = root(half * half + ab * ab)
+    values = torch.stack([middle + radius, middle - radius], dim=-1)
+    with torch.no_grad():
+        # Of the two rows of (S - k1), the longer one is orthogonal to the first direction.
+        a = torch.where(half >= 0, half + radius, ab)
+        b = torch.where(half >= 0, ab, radius - half)
+        size = root(a * a + b * b)
+        umbilic = size == 0
+        a = torch.where(umbilic, 1.0, a / torch.where(umbilic, 1.0, size))
+        b = torch.where(umbilic, 0.0, b / torch.where(umbilic, 1.0, size))
+        turn = torch.stack([torch.stack([a, b], dim=-1), torch.stack([-b, a], dim=-1)], dim=-2)
+        directions = turn @ torch.stack([first, second], dim=-2)
+    return normal, values, directions
 
 
 def _tangents(normals: Tensor) -> tuple[Tensor, Tensor]:

@@ -64,17 +64,17 @@ def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
     return estimate
 
 
-def about_first(patches: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the points of each patch relative to the first of them that counts.
+def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the first point of each patch that counts, and all points relative to it.
 
     Zero where no point counts, and for points that do not; these may hold NaN.
     """
     if mask is None:
-        return patches - patches[..., :1, :]
+        return patches[..., 0, :], patches - patches[..., :1, :]
     first = mask.to(torch.uint8).argmax(dim=-1)[..., None, None]
     place = patches.gather(-2, first.expand(*first.shape[:-1], 3))
     place = torch.where(mask.any(dim=-1)[..., None, None], place, 0.0)
-    return torch.where(mask[..., None], patches - place, 0.0)
+    return place.squeeze(-2), torch.where(mask[..., None], patches - place, 0.0)
 
 
 def replace_rows(fit: NormalFit, rows: Tensor, refined: NormalFit) -> NormalFit:
