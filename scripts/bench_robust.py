@@ -21,7 +21,7 @@ from torch import Tensor
 
 import torchrg
 from torchrg.linalg import covariance, eigh3
-from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve, qn, qn_exceeds
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn, qn_exceeds
 
 K = 50
 R_SCRIPT = """
@@ -83,6 +83,7 @@ def time_torchrg(patches: Tensor) -> None:
         ("DetMCD, published starts", fit_detmcd, patches),
         ("DetMCD, starts from planes", lambda p: fit_detmcd(p, starts="planes"), patches),
         ("DetMCD, more starts", lambda p: fit_detmcd(p, starts="more"), some),
+        ("DetS", fit_dets, some),
         ("DetMM", fit_detmm, some),
         ("FastMCD, 500 starts", fit_fastmcd, few),
         ("MVE, 500 starts", fit_mve, few),
@@ -168,7 +169,7 @@ def print_breakdown(count: int) -> None:
         "more": lambda p: fit_detmcd(p, starts="more").covariance,
         "FastMCD": lambda p: fit_fastmcd(p).covariance,
         "MVE": lambda p: fit_mve(p).covariance,
-        "DetS": lambda p: fit_detmm(p).raw_covariance,
+        "DetS": lambda p: fit_dets(p).covariance,
         "DetMM": lambda p: fit_detmm(p).covariance,
     }
     print("Angle of the normal, degrees: median / 90th percentile")

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 import torchrg
 from tests.robust.oracle_cases import angle_deg, fit_all, load_oracles, local_float32, normal_of
-from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
 
 ESTIMATORS = {
     "paper": fit_detmcd,
@@ -14,6 +14,7 @@ ESTIMATORS = {
     "more": lambda patches, **k: fit_detmcd(patches, starts="more", **k),
     "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=20, **k),
     "mve": lambda patches, **k: fit_mve(patches, num_starts=20, **k),
+    "dets": fit_dets,
     "detmm": fit_detmm,
 }
 
@@ -115,7 +116,7 @@ def test_half_of_the_points_on_a_plane_is_no_exact_mcd(rng):
     assert not fit.exact_fit
     assert fit.valid
     assert angle_deg(normal_of(fit.covariance), NORMAL) < 1
-    assert fit_detmm(patch).exact_fit
+    assert fit_dets(patch).exact_fit
 
 
 def test_all_points_on_a_line_or_in_one_place_have_no_fit(estimator, dtype, rng):
@@ -231,7 +232,7 @@ any_patch = given(
 
 
 def check_degenerate_patch(patch, name, fraction, dtype):
-    options = {} if name == "detmm" else {"support_fraction": fraction}
+    options = {} if name in ("dets", "detmm") else {"support_fraction": fraction}
     points = torch.from_numpy(patch).to(dtype)
     fit = ESTIMATORS[name](points[None], **options)
     assert_sound(fit)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve, qn
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
 from torchrg.robust.lanes import smallest_points
 from torchrg.robust.scale import sum_points
 
@@ -10,6 +10,7 @@ ESTIMATORS = {
     "planes": lambda patches, **k: fit_detmcd(patches, starts="planes", **k),
     "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=30, **k),
     "mve": lambda patches, **k: fit_mve(patches, num_starts=30, **k),
+    "dets": fit_dets,
     "detmm": fit_detmm,
 }
 
@@ -98,7 +99,7 @@ def test_other_units_and_far_origins_change_no_inlier(estimator, patches, unit):
     assert torch.equal(estimator(patches + 4e6).support, fit.support)
 
 
-@pytest.mark.parametrize("name", ["paper", "detmm"])
+@pytest.mark.parametrize("name", ["paper", "dets", "detmm"])
 def test_order_of_the_points_changes_nothing(name, patches, rng):
     order = torch.randperm(40, generator=rng)
     fit, shuffled = ESTIMATORS[name](patches), ESTIMATORS[name](patches[:, order])

@@ -12,7 +12,7 @@ from tests.robust.oracle_cases import (
     normal_of,
 )
 from torchrg.errors import ConfigError
-from torchrg.robust import fit_detmm
+from torchrg.robust import fit_detmm, fit_dets
 from torchrg.robust.mm import _breakdown_constant, _efficiency_constant
 
 
@@ -31,12 +31,6 @@ def regular_fits(folder, fit, families, convert=torch.from_numpy, without=()):
 def assert_same_scatter(found, expected, tolerance, name):
     error = eigenvalue_error(found.covariance, expected, found.covariance.dtype)
     assert error < tolerance, name
-
-
-def fit_dets(batch):
-    """The S-estimate that the MM-estimate starts from, which has its scale."""
-    fit = fit_detmm(batch)
-    return fit._replace(location=fit.raw_location, covariance=fit.raw_covariance)
 
 
 def scale_of(fit):
@@ -119,5 +113,5 @@ def test_mm_is_more_efficient_than_s_for_clean_points(rng):
 
 
 def test_refusals():
-    with pytest.raises(ConfigError, match="fit_detmm: expected starts to be one of paper"):
-        fit_detmm(torch.zeros(5, 3), starts="none")
+    with pytest.raises(ConfigError, match="fit_dets: expected starts to be one of paper"):
+        fit_dets(torch.zeros(5, 3), starts="none")

@@ -22,12 +22,11 @@ far, 45 %      63.5 / 82.9   0.5 / 0.8   0.5 / 0.8     0.5 / 0.8    0.5 / 0.8   
 
 The published starts of DetMCD, DetS and DetMM look along the coordinate axes, and a cluster can
 draw them all. Where FastMCD fails it has found a smaller determinant than the plane's: 22 points in
-one place and five others. ``planes`` is :func:`fit_detmcd` with ``starts="planes"``, and DetS the
-raw fit of :func:`fit_detmm`.
+one place and five others. ``planes`` is :func:`fit_detmcd` with ``starts="planes"``.
 """
 
 from torchrg.robust.mcd import fit_detmcd, fit_fastmcd
-from torchrg.robust.mm import fit_detmm
+from torchrg.robust.mm import fit_detmm, fit_dets
 from torchrg.robust.mve import fit_mve
 from torchrg.robust.patches import RobustFit
 from torchrg.robust.scale import median, qn, qn_exceeds
@@ -36,6 +35,7 @@ __all__ = [
     "RobustFit",
     "fit_detmcd",
     "fit_detmm",
+    "fit_dets",
     "fit_fastmcd",
     "fit_mve",
     "median",

@@ -1,4 +1,4 @@
-"""MM-estimates of location and scatter, and the S-estimates they start from."""
+"""S and MM estimates of location and scatter from deterministic starts."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -53,6 +53,54 @@ class _Shape(NamedTuple):
     distances: Tensor
 
 
+def fit_dets(
+    patches: Tensor,
+    mask: Tensor | None = None,
+    *,
+    quantile: float = 0.975,
+    starts: Starts = "robustbase",
+    chunk_size: int = 2048,
+) -> RobustFit:
+    r"""Fit location and scatter of each patch by the deterministic S-estimator.
+
+    The scatter is the one of least volume for which the mean bisquare loss of the distances is
+    half of its maximum, so that half of the points may be arbitrary. Each deterministic start is
+    iterated to a local minimum, and the smallest wins [1].
+
+    Args:
+        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
+        mask: Which points count, shape ``(*, K)``, bool. Default: all.
+        quantile: Level of the chi-square distribution within which points are inliers.
+        starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
+        chunk_size: Patches worked on together.
+
+    Returns:
+        The fits. Location and covariance are the estimate itself, not reweighted, and the same as
+        the raw ones; ``raw_support`` are the points with a weight above zero; ``log_det`` is that
+        of the covariance. More than half of the points on one plane are an exact fit.
+
+    References:
+        [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
+        multivariate location and scatter. Computational Statistics & Data Analysis 81, 2015.
+
+    Example:
+        >>> points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+        >>> points[:, 2] *= 0.01
+        >>> points[:20, 2] += 1.0
+        >>> fit_dets(points).support[:20].any().item()
+        False
+    """
+    check_starts("fit_dets", starts)
+
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+        shape, scale = _best_s_estimate(columns, floor, size, starts)
+        return _estimate(columns, shape, shape, scale, quantile)
+
+    return fit_patchwise(
+        "fit_dets", patches, mask, 0.5, quantile, chunk_size, estimator, majority=half_size
+    )
+
+
 def fit_detmm(
     patches: Tensor,
     mask: Tensor | None = None,
@@ -63,11 +111,8 @@ def fit_detmm(
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic MM-estimator.
 
-    The S-estimate (DetS) has the scatter of least volume for which the mean bisquare loss of the
-    distances is half of its maximum, so that half of the points may be arbitrary. Each
-    deterministic start is iterated to a local minimum, and the smallest wins. Its scale is kept,
-    and location and shape are iterated on with a wider bisquare whose shape is 95 % efficient for
-    normal data (cut-off 6.0963 for P = 3) [1].
+    The scale of the S-estimate is kept, and location and shape are iterated on with a wider
+    bisquare whose shape is 95 % efficient for normal data (cut-off 6.0963 for P = 3) [1].
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
@@ -78,9 +123,8 @@ def fit_detmm(
 
     Returns:
         The fits. Location and covariance are the MM-estimate, ``raw_*`` the S-estimate it started
-        from, with the points of a weight above zero; distances and ``support`` belong to the
-        MM-estimate; ``log_det`` is that of both covariances. More than half of the points on one
-        plane are an exact fit.
+        from; distances and ``support`` belong to the MM-estimate; ``log_det`` is that of its
+        covariance. More than half of the points on one plane are an exact fit.
 
     References:
         [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
