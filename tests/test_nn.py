@@ -22,7 +22,7 @@ def test_modules_are_the_functions(rng):
     [
         (modules.DetMCD, fit_detmcd, {"support_fraction": 0.75, "starts": "robustbase"}),
         (modules.FastMCD, fit_fastmcd, {"num_starts": 20, "quantile": 0.9}),
-        (modules.DetMM, fit_detmm, {"quantile": 0.9, "starts": "paper"}),
+        (modules.DetMM, fit_detmm, {"quantile": 0.9, "tuned_for": "location"}),
     ],
 )
 def test_fits_are_those_of_the_functions(rng, module, function, settings):

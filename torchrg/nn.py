@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance, eigh3
 from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, qn
+from torchrg.robust.mm import Target
 from torchrg.robust.starts import Starts
 
 
@@ -137,6 +138,7 @@ class DetMM(_Function):
     _: KW_ONLY
     quantile: float = 0.975
     starts: Starts = "robustbase"
+    tuned_for: Target = "shape"
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""

@@ -13,7 +13,7 @@ from tests.robust.oracle_cases import (
 )
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_detmm, fit_dets
-from torchrg.robust.mm import _breakdown_constant, _efficiency_constant
+from torchrg.robust.mm import breakdown_constant, efficiency_constant
 
 
 def regular_fits(folder, fit, families, convert=torch.from_numpy, without=()):
@@ -46,11 +46,16 @@ def test_dets_is_that_of_rrcov_and_of_the_reference(oracles_folder):
             assert_same_scatter(fit, ours["dets_mm"]["s_cov"], 1e-6, name)
 
 
-def test_detmm_is_that_of_rrcov_and_of_the_reference(oracles_folder):
-    for name, fit, rrcov, ours in regular_fits(oracles_folder, fit_detmm, ["r_rrcov", "ref_numpy"]):
-        known = [ours.get("dets_mm", {}).get("mm_shape_cov")]
+@pytest.mark.parametrize(("target", "short"), [("shape", "shape"), ("location", "loc")])
+def test_detmm_is_that_of_rrcov_and_of_the_reference(oracles_folder, target, short):
+    for name, fit, rrcov, ours in regular_fits(
+        oracles_folder,
+        lambda batch: fit_detmm(batch, tuned_for=target),
+        ["r_rrcov", "ref_numpy"],
+    ):
+        known = [ours.get("dets_mm", {}).get(f"mm_{short}_cov")]
         if name not in WRONG_RRCOV:
-            known.append(rrcov["detmm_shape_tight"].get("cov"))
+            known.append(rrcov[f"detmm_{short}_tight"].get("cov"))
         for expected in known:
             if expected is not None:
                 assert_same_scatter(fit, expected, 1e-5, name)
@@ -87,9 +92,11 @@ def test_float32_agrees(oracles_folder):
 
 
 def test_tuning_constants_are_those_of_the_literature():
-    assert _breakdown_constant(1) == pytest.approx(1.547645, abs=1e-6)
-    assert _breakdown_constant(3) == pytest.approx(3.4528816505, abs=1e-9)
-    assert _efficiency_constant(3) == pytest.approx(6.096266441, abs=1e-6)
+    assert breakdown_constant(1) == pytest.approx(1.547645, abs=1e-6)
+    assert breakdown_constant(3) == pytest.approx(3.4528816505, abs=1e-9)
+    assert efficiency_constant(1, "location") == pytest.approx(4.685065, abs=1e-6)
+    assert efficiency_constant(3, "shape") == pytest.approx(6.096266441, abs=1e-6)
+    assert efficiency_constant(3, "location") == pytest.approx(5.490249172, abs=1e-6)
 
 
 def test_mm_is_affine_equivariant_from_equal_starts(rng):
@@ -113,5 +120,7 @@ def test_mm_is_more_efficient_than_s_for_clean_points(rng):
 
 
 def test_refusals():
+    with pytest.raises(ConfigError, match="fit_detmm: expected tuned_for to be shape or location"):
+        fit_detmm(torch.zeros(5, 3), tuned_for="scale")
     with pytest.raises(ConfigError, match="fit_dets: expected starts to be one of paper"):
         fit_dets(torch.zeros(5, 3), starts="none")

@@ -7,9 +7,6 @@ from tests.robust.oracle_cases import FRACTIONS, load_oracles, points_of
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_mve
 
-ALL = 10**6
-"""More random sets than there are sets of four points, so that all of them are taken."""
-
 
 def compare(folder, names):
     patches, cases, ours, mass = load_oracles(folder, "ref_numpy", "r_mass")
@@ -19,7 +16,7 @@ def compare(folder, names):
             if cases[name][f"exact_fit_{level}"] or not answer:
                 continue
             fit = fit_mve(
-                torch.from_numpy(patches[name]), support_fraction=fraction, num_starts=ALL
+                torch.from_numpy(patches[name]), support_fraction=fraction, exhaustive=True
             )
             # In exact arithmetic ours is right to 1e-11 there, and MASS; the reference is not.
             tolerance = 1e-6 if name == "planar_very_fine" else 1e-7

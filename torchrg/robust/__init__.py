@@ -29,7 +29,7 @@ from torchrg.robust.mcd import fit_detmcd, fit_fastmcd
 from torchrg.robust.mm import fit_detmm, fit_dets
 from torchrg.robust.mve import fit_mve
 from torchrg.robust.patches import RobustFit
-from torchrg.robust.scale import median, qn, qn_exceeds
+from torchrg.robust.scale import mad, median, qn, qn_exceeds, tau
 
 __all__ = [
     "RobustFit",
@@ -38,7 +38,9 @@ __all__ = [
     "fit_dets",
     "fit_fastmcd",
     "fit_mve",
+    "mad",
     "median",
     "qn",
     "qn_exceeds",
+    "tau",
 ]

@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from functools import lru_cache
 from math import exp, lgamma, log
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg.errors import ConfigError
 from torchrg.linalg import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
@@ -26,11 +27,14 @@ from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, check_starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
+Target = Literal["shape", "location"]
+"""What the efficiency of 95 % at the normal distribution refers to."""
+
 _BREAKDOWN = 0.5
 """Share of the points that may be arbitrary."""
 
 _EFFICIENCY = 0.95
-"""Of the MM-estimate's shape for normal data: what normals want, and what R's rrcov has."""
+"""Of the MM-estimate for normal data."""
 
 _MAX_STEPS = 300
 """Reweightings after which weights that have not settled are left as they are."""
@@ -106,18 +110,21 @@ def fit_detmm(
     mask: Tensor | None = None,
     *,
     quantile: float = 0.975,
+    tuned_for: Target = "shape",
     starts: Starts = "robustbase",
     chunk_size: int = 2048,
 ) -> RobustFit:
     r"""Fit location and scatter of each patch by the deterministic MM-estimator.
 
     The scale of the S-estimate is kept, and location and shape are iterated on with a wider
-    bisquare whose shape is 95 % efficient for normal data (cut-off 6.0963 for P = 3) [1].
+    bisquare that is 95 % efficient for normal data [1].
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
         mask: Which points count, shape ``(*, K)``, bool. Default: all.
         quantile: Level of the chi-square distribution within which points are inliers.
+        tuned_for: Whether the efficiency is that of the ``"shape"`` (cut-off 6.0963 for P = 3),
+            as normals want and R's rrcov has it, or of the ``"location"`` (5.4902).
         starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
         chunk_size: Patches worked on together.
 
@@ -138,10 +145,14 @@ def fit_detmm(
         False
     """
     check_starts("fit_detmm", starts)
+    if tuned_for not in ("shape", "location"):
+        raise ConfigError(
+            f"fit_detmm: expected tuned_for to be shape or location, got {tuned_for!r}."
+        )
 
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         first, scale = _best_s_estimate(columns, floor, size, starts)
-        cutoff = _efficiency_constant(len(columns))
+        cutoff = efficiency_constant(len(columns), tuned_for)
         weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
         final = _shape_of(columns, weights, floor)
         sq_unit = cutoff * cutoff * scale * scale
@@ -160,7 +171,7 @@ def _best_s_estimate(
 ) -> tuple[_Shape, Tensor]:
     """Iterate every start of each lane to an S-estimate, and keep that of the smallest scale."""
     num_points, num_lanes = columns[0].shape
-    cutoff = _breakdown_constant(len(columns))
+    cutoff = breakdown_constant(len(columns))
     weights, scales = [], []
     for initial, count in initial_sets(columns, size, starts):
         num_starts = initial.shape[1]
@@ -293,8 +304,13 @@ def _bisquare_loss(sq_ratios: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def _breakdown_constant(num_coordinates: int) -> float:
-    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal."""
+def breakdown_constant(num_coordinates: int) -> float:
+    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal.
+
+    Example:
+        >>> round(breakdown_constant(3), 6)
+        3.452882
+    """
 
     def excess(cutoff: float) -> float:
         moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
@@ -305,8 +321,15 @@ def _breakdown_constant(num_coordinates: int) -> float:
 
 
 @lru_cache(maxsize=64)
-def _efficiency_constant(num_coordinates: int) -> float:
-    """Cut-off with 95 % efficiency of the scatter's shape for normal data (Tyler 1983)."""
+def efficiency_constant(num_coordinates: int, target: Target) -> float:
+    """Cut-off with 95 % efficiency at the normal distribution.
+
+    For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
+
+    Example:
+        >>> round(efficiency_constant(3, "shape"), 5), round(efficiency_constant(3, "location"), 5)
+        (6.09627, 5.49025)
+    """
     p = num_coordinates
 
     def excess(cutoff: float) -> float:
@@ -315,8 +338,12 @@ def _efficiency_constant(num_coordinates: int) -> float:
             return sum(a * _moment(m, p, cutoff) / cutoff**m for m, a in coefficients.items())
 
         # With u = d / cutoff: psi(d) = d (1 - u^2)^2 and psi'(d) = (1 - u^2) (1 - 5 u^2).
-        spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
-        slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
+        if target == "location":
+            spread = cutoff**2 * mean({2: 1, 4: -4, 6: 6, 8: -4, 10: 1}) / p
+            slope = mean({0: 1, 2: -2 - 4 / p, 4: 1 + 4 / p})
+        else:
+            spread = p * (p + 2) * cutoff**4 * mean({4: 1, 6: -4, 8: 6, 10: -4, 12: 1})
+            slope = cutoff**2 * mean({2: p + 2, 4: -2 * (p + 4), 6: p + 6})
         return slope**2 / spread - _EFFICIENCY
 
     return _root(excess)

@@ -1,4 +1,4 @@
-"""Median and robust scales, Qn and tau, of many short rows, from sorted rows.
+"""Robust scales of many short rows: median absolute deviation, Qn, tau; all from sorted rows.
 
 The constants make the scales consistent for the standard deviation of normal data.
 """
@@ -43,23 +43,39 @@ _TAU_SCALE_CUT = 3.0
 def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Return the median along an axis, the mean of the middle two for an even count.
 
-    Arguments and errors are those of :func:`qn`.
+    Args:
+        x: Values, floating point, any shape.
+        dim: Axis to reduce.
+        mask: Which values count, same shape as ``x``, bool. Default: all.
 
     Returns:
         Medians, the shape of ``x`` without ``dim``; NaN where no value counts or one that counts
         is NaN.
 
+    Raises:
+        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
+
     Example:
         >>> median(torch.tensor([4.0, 1.0, 3.0, 2.0])).item()
         2.5
     """
+    return _per_count("median", x, dim, mask, _sorted_median)
 
-    def of_sorted(rows: Tensor) -> Tensor:
-        if rows.shape[1] == 0:
-            return rows.new_full((len(rows),), torch.nan)
-        return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
 
-    return _per_count("median", x, dim, mask, of_sorted)
+def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """Return the median absolute deviation from the median, times 1.4826.
+
+    Arguments and errors are those of :func:`median`.
+
+    Returns:
+        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
+        NaN where no value counts or one that counts is NaN.
+
+    Example:
+        >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
+        1.4825999736785889
+    """
+    return _per_count("mad", x, dim, mask, lambda rows: MAD_FACTOR * _median_deviation(rows))
 
 
 def qn(
@@ -100,7 +116,7 @@ def qn(
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
 
-    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`qn`.
+    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`.
 
     Returns:
         The same as ``qn(x, dim=dim, mask=mask) > threshold``, bool; False where Qn is NaN.
@@ -119,6 +135,29 @@ def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | Non
         return (count < comb(half_size(n), 2)) & ~rows[:, -1].isnan()
 
     return _per_count("qn_exceeds", x, dim, mask, of_sorted)
+
+
+def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    r"""Return the tau scale of Maronna and Zamar: a truncated standard deviation.
+
+    With :math:`s_0` the median of the deviations from the median: the centre is the mean with
+    bisquare weights that vanish at :math:`4.5 s_0`, and the scale the root of the mean square
+    about it, each deviation cut at :math:`3 s_0` [1]. Cheaper than Qn for long rows, linear but
+    for a sort. Arguments and errors are those of :func:`median`.
+
+    Returns:
+        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
+        NaN where no value counts or one that counts is NaN.
+
+    References:
+        [1] R. A. Maronna, R. H. Zamar. Robust estimates of location and dispersion for
+        high-dimensional datasets. Technometrics 44, 2002.
+
+    Example:
+        >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
+        tensor(1.7441)
+    """
+    return _per_count("tau", x, dim, mask, tau_of_sorted)
 
 
 def _per_count(
@@ -143,11 +182,14 @@ def _per_count(
     broken = (rows.isnan() & counted).any(dim=1)
     ascending = sort_rows(torch.where(counted, rows, torch.inf))
     counts = counted.sum(dim=1)
-    results = of_sorted(rows[:, :0])
-    for count in sorted(set(counts.tolist())):
+    out = rows.new_full((len(rows),), torch.nan)
+    results: Tensor | None = None
+    for count in sorted(set(counts.tolist())) or [n]:
         chosen = (counts == count) & ~broken
-        results[chosen] = of_sorted(ascending[chosen][:, :count].contiguous())
-    return results.reshape(shape)
+        found = of_sorted(ascending[chosen][:, :count].contiguous())
+        results = out.to(found.dtype) if results is None else results
+        results[chosen] = found
+    return (out if results is None else results).reshape(shape)
 
 
 def sort_rows(rows: Tensor) -> Tensor:
@@ -164,18 +206,26 @@ def median_of_sorted(rows: Tensor) -> Tensor:
     return low if count % 2 else low + (high - low) / 2
 
 
-def tau_of_sorted(rows: Tensor) -> Tensor:
-    """Tau scale of Maronna and Zamar (2002) of each sorted row of ``(B, n)``, shape ``(B,)``.
+def _sorted_median(rows: Tensor) -> Tensor:
+    """Median of each sorted row; NaN where the row is empty or has a NaN, which sorts last."""
+    if rows.shape[1] == 0:
+        return rows.new_full((len(rows),), torch.nan)
+    return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
 
-    With s the median of the deviations from the median: the centre is the mean with bisquare
-    weights that vanish at 4.5 s, and the scale the root of the mean square about it, each deviation
-    cut at 3 s. Cheaper than Qn for long rows, linear but for a sort; 0 where more than half of the
-    values are equal.
-    """
-    lanes, middle = rows.t().contiguous(), median_of_sorted(rows)
-    spread = median_of_sorted(sort_rows((rows - middle[:, None]).abs()))
+
+def _median_deviation(rows: Tensor) -> Tensor:
+    """Median of the absolute deviations of each sorted row from its median."""
+    return _sorted_median(sort_rows((rows - _sorted_median(rows)[:, None]).abs()))
+
+
+def tau_of_sorted(rows: Tensor) -> Tensor:
+    """Tau scale of each sorted row of ``(B, n)``, shape ``(B,)``."""
+    if rows.shape[1] == 0:
+        return rows.new_full((len(rows),), torch.nan)
+    lanes = rows.t().contiguous()
+    spread = _median_deviation(rows)
     unit = torch.where(spread > 0, spread, 1.0)
-    standard = (lanes - middle) / unit
+    standard = (lanes - _sorted_median(rows)) / unit
     weights = (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
     center = sum_points(weights * standard) / sum_points(weights)
     squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
