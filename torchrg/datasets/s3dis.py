@@ -43,7 +43,7 @@ class S3DIS(SceneDataset):
     """The rooms of S3DIS, read from ``ROOT/Area_i/<room>/Annotations/*.txt``, aligned or not.
 
     A sample has ``coord`` ``(N, 3)`` float32 in metres, ``color`` ``(N, 3)`` uint8, ``segment``
-    ``(N,)`` int64 (a place in :attr:`classes`), ``instance`` ``(N,)`` int64 (the object, counted
+    ``(N,)`` int64 (a place in ``classes``), ``instance`` ``(N,)`` int64 (the object, counted
     from zero in natural order of the file names), and ``name``, as in ``Area_1/office_1``. Points
     are in the order of the objects, not in that of the room's own text file.
 

@@ -29,9 +29,10 @@ class LabelScore(NamedTuple):
         precision_iou50: Regions with a face at IoU > 0.5, of all regions.
         recall_iou50: Faces with a region at IoU > 0.5, of all faces.
         precision_iou80: The same at IoU > 0.8; so is ``recall_iou80``.
-        correct: As in :class:`SegCompCounts` at 80 %; so are ``over_segmented``,
-            ``under_segmented``, ``missed`` and ``noise``.
-        evops_precision: As in :class:`EvopsScore`; so are the other ``evops_*``.
+        correct: As in :class:`torchrg.metrics.protocols.SegCompCounts` at 80 %; so are
+            ``over_segmented``, ``under_segmented``, ``missed`` and ``noise``.
+        evops_precision: As in :class:`torchrg.metrics.protocols.EvopsScore`; so are the other
+            ``evops_*``.
         share_labeled: Scored points that lie in a region.
         covering: Segmentation covering: mean best IoU weighted by the size of the face.
         ari: Adjusted Rand index.

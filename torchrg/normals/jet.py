@@ -58,7 +58,7 @@ class JetFit(NamedTuple):
             cloud; positive where the surface bends towards ``normals``.
         principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
             two orthogonal ones where the two curvatures are equal.
-        curvature: Surface variation, as of :func:`fit_normals_pca`, shape ``(*)``.
+        curvature: Surface variation, as of :func:`torchrg.normals.fit_normals_pca`, shape ``(*)``.
         valid: Whether there is a plane, shape ``(*)``, bool; all else is zero where not.
         residual_rms: Root mean square distance of the points to the surface along the normal of
             their plane, shape ``(*)``.
@@ -98,7 +98,7 @@ def fit_jet(
     Returns:
         The fit. Terms that the points do not determine are left out, the last ones first: two
         straight scan lines have no ``v^2``; fewer than six points have no quadratic terms, which
-        leaves the plane of PCA. ``valid`` is that of :func:`fit_normals_pca`.
+        leaves the plane of PCA. ``valid`` is that of :func:`torchrg.normals.fit_normals_pca`.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.

@@ -39,7 +39,8 @@ class RobustFit(NamedTuple):
     with a non-finite coordinate never do. ``quantile`` is the level of the chi-square distribution
     within which points are inliers: 0.975 means a squared distance of 9.3484 for P = 3.
     ``chunk_size`` bounds the memory and never changes a result. Another shape, dtype or device is a
-    :class:`torchrg.ShapeError`, a setting out of range a :class:`torchrg.ConfigError`.
+    :class:`torchrg.errors.ShapeError`, a setting out of range a
+    :class:`torchrg.errors.ConfigError`.
 
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
