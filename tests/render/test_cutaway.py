@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from torchrg.render.cutaway import SideView, find_outer_surface, main_directions
+from torchrg.render.cutaway import SideView, choose_viewpoint, find_outer_surface, main_directions
 from torchrg.render.grid import build_grid, surface_cells
-from torchrg.render.views import choose_viewpoint
 
 SIZE = (6.0, 4.0, 2.5)
 UP = torch.tensor([0.0, 0, 1])

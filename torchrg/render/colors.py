@@ -1,4 +1,4 @@
-"""OKLab, a space in which the distance of two colours is about how different they look."""
+"""Colours for planes, normals, curvature and sharp points, chosen by how different they look."""
 
 import math
 from typing import Any
@@ -31,12 +31,6 @@ _TO_LAB = (
 def rgb_to_oklab(colors: Tensor) -> Tensor:
     """Convert colours from sRGB to OKLab [1].
 
-    Args:
-        colors: sRGB in [0, 1], shape ``(*, 3)``.
-
-    Returns:
-        Lightness in [0, 1] and the two opponent axes, shape ``(*, 3)``.
-
     References:
         [1] B. Ottosson. A perceptual color space for image processing. 2020.
 
@@ -51,12 +45,6 @@ def rgb_to_oklab(colors: Tensor) -> Tensor:
 
 def oklab_to_rgb(colors: Tensor) -> Tensor:
     """Convert colours from OKLab to sRGB; values outside [0, 1] are colours no screen shows.
-
-    Args:
-        colors: OKLab, shape ``(*, 3)``.
-
-    Returns:
-        sRGB, shape ``(*, 3)``.
 
     Example:
         >>> oklab_to_rgb(torch.tensor([0.5, 0.0, 0.0])).round(decimals=3)
@@ -113,19 +101,11 @@ def make_palette() -> tuple[Tensor, int]:
 def choose_colors(
     sizes: Tensor, pairs: Tensor, weights: Tensor, *, fixed: Tensor | None = None
 ) -> Tensor:
-    """Choose a colour for each plane, the largest first, far from those chosen before.
+    """Choose a row of the palette for each plane, the largest first, far from those before.
 
-    Each chosen colour repels with the inverse square of its distance in OKLab: that of a neighbour
-    with its weight, any other with a little.
-
-    Args:
-        sizes: Points of each plane, shape ``(M,)``.
-        pairs: Planes that are neighbours, shape ``(E, 2)``.
-        weights: How much they are, shape ``(E,)``.
-        fixed: Rows of the palette that are chosen already, shape ``(M,)``; negative: free.
-
-    Returns:
-        Rows of :func:`make_palette`, shape ``(M,)``, int64.
+    Each chosen colour repels with the inverse square of its distance in OKLab: that of a neighbour,
+    in ``pairs`` ``(E, 2)``, with its weight, any other with a little. Where ``fixed`` is not
+    negative it is the choice.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))

@@ -1,7 +1,7 @@
-"""Which surfaces to leave out so that one sees into a room from outside."""
+"""From where to look at a cloud, and which surfaces to leave out so that one sees into a room."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -55,17 +55,10 @@ class SideView:
     def share_at_height(
         self, pixels: Tensor, heights: Tensor, counted: Tensor, *, size: int, step: float
     ) -> Tensor:
-        """Return the share of pixels around each point that hold a point about as high.
+        """Return the share of pixels around each point that hold a counted point about as high.
 
-        Args:
-            pixels: Of the points, shape ``(N,)``, at least one.
-            heights: Along the direction, shape ``(N,)``.
-            counted: The points that are looked for, shape ``(N,)``, bool.
-            size: Edge, odd, of the square of pixels around a point.
-            step: What is about as high: in the same layer of this thickness, or in the next ones.
-
-        Returns:
-            Shape ``(N,)``, in [0, 1].
+        Around is a square of ``size`` pixels, odd; about as high is what lies in the same layer of
+        thickness ``step``, or in the next ones.
         """
         layers = ((heights - heights.amin()) / step).long()
         stack = torch.zeros(int(layers.amax()) + 3, self._shape[0] * self._shape[1])
@@ -128,15 +121,9 @@ def find_outer_surface(cells: Cells, direction: Tensor, *, is_ceiling: bool) -> 
 
     A cell is outer if its plane faces that side, nothing is in front of it, and far behind it
     there is something: the floor below a ceiling, the opposite wall behind a wall. The cells around
-    it at about its height vote, so that windows and recesses are no exceptions.
-
-    Args:
-        cells: Pieces of surface, at least one.
-        direction: Unit vector from the inside to the outside, shape ``(3,)``.
-        is_ceiling: Whether all that is above goes with the surface, as in a section of a building.
-
-    Returns:
-        The surface; None if it covers so little of the side that it does not close it.
+    it at about its height vote, so that windows and recesses are no exceptions. With a ceiling goes
+    all that is above, as in a section of a building. None if what there is covers so little of the
+    side that it does not close it.
     """
     thickness, view = 1.25 * cells.size, SideView(cells.centers, direction, 1.5 * cells.size)
     height, pixels = cells.centers @ direction, view.pixels(cells.centers)
@@ -167,15 +154,7 @@ def find_outer_surface(cells: Cells, direction: Tensor, *, is_ceiling: bool) -> 
 
 
 def main_directions(cells: Cells, *, max_directions: int = 10) -> Tensor:
-    """Return the normals of the largest groups of parallel cells.
-
-    Args:
-        cells: Pieces of surface.
-        max_directions: Most groups.
-
-    Returns:
-        Unit vectors of arbitrary sign, the largest group first, shape ``(D, 3)``.
-    """
+    """Return the normals ``(D, 3)`` of the largest groups of parallel cells, the largest first."""
     normals = cells.normals[(cells.normals != 0).any(dim=-1)]
     bins = _hemisphere(200).to(normals)
     near = (normals @ bins.T).abs() > _SPREAD
@@ -205,3 +184,105 @@ def _hemisphere(count: int) -> Tensor:
     turn = step * (math.pi * (3 - math.sqrt(5)))
     radius = (1 - height * height).sqrt()
     return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=-1)
+
+
+View = Literal["cutaway", "above", "outside", "sensor"]
+
+_AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
+_LEAST_FACING = {"cutaway": 0.1, "above": 0.7}  # least cosine to the viewer of what is cut away
+
+
+class Viewpoint(NamedTuple):
+    """A direction to look from.
+
+    Attributes:
+        toward: From the cloud to the viewer, shape ``(3,)``.
+        up: Up in the picture, shape ``(3,)``.
+        cut: What is left out.
+    """
+
+    toward: Tensor
+    up: Tensor
+    cut: tuple[OuterSurface, ...]
+
+    def keeps(self, points: Tensor) -> Tensor:
+        """Return which points are not left out, shape ``(N,)``, bool."""
+        kept = torch.ones_like(points[:, 0], dtype=torch.bool)
+        for surface in self.cut:
+            kept &= ~surface.covers(points)
+        return kept
+
+
+def choose_viewpoint(
+    cells: Cells,
+    view: View,
+    up: Tensor,
+    *,
+    azimuth_deg: float | None = None,
+    elevation_deg: float | None = None,
+) -> Viewpoint:
+    """Choose the direction from which most surface is seen.
+
+    The azimuth is the angle about ``up`` from the normal of the largest walls: by default the best
+    of eight, equal ones decided by the angle, and from above the one that lays the cloud across the
+    picture. The elevation is the angle over the horizon: by default 35, from above 90.
+    """
+    directions = main_directions(cells)
+    heading = _heading(directions, up)
+    if elevation_deg is None:
+        elevation_deg = 90.0 if view == "above" else 35.0
+    azimuths = _AZIMUTHS_DEG if azimuth_deg is None else (azimuth_deg,)
+    if azimuth_deg is None and view == "above":
+        azimuths = (-90.0,) if _is_longer(cells.centers, heading, up) else (0.0,)
+    surfaces = []
+    if view in _LEAST_FACING:
+        sides = torch.stack([directions, -directions], dim=1).flatten(0, 1)
+        found = [
+            find_outer_surface(cells, side, is_ceiling=float(side @ up) > 0.9) for side in sides
+        ]
+        surfaces = [surface for surface in found if surface is not None]
+    viewpoints = []
+    for azimuth in azimuths:
+        toward = _turned(heading, up, azimuth, elevation_deg)
+        cut = tuple(s for s in surfaces if float(s.direction @ toward) > _LEAST_FACING[view])
+        picture_up = _turned(heading, up, azimuth + 180, 90 - elevation_deg)
+        viewpoints.append(Viewpoint(toward, picture_up, cut))
+    if len(viewpoints) == 1:
+        return viewpoints[0]
+    return max(viewpoints, key=lambda viewpoint: _count_seen(cells, viewpoint))
+
+
+def _heading(directions: Tensor, up: Tensor) -> Tensor:
+    """Return the horizontal normal of the largest walls, or any direction if there are none."""
+    walls = directions[(directions @ up).abs() < 0.3]
+    if len(walls):
+        axis = walls[0]
+    else:
+        axis = torch.zeros_like(up)
+        axis[up.abs().argmin()] = 1
+    return functional.normalize(axis - (axis @ up) * up, dim=0)
+
+
+def _is_longer(centers: Tensor, heading: Tensor, up: Tensor) -> bool:
+    """Return whether a cloud is longer along its heading than across it."""
+    along, across = centers @ heading, centers @ torch.linalg.cross(up, heading)
+    return float(along.amax() - along.amin()) > float(across.amax() - across.amin())
+
+
+def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: float) -> Tensor:
+    """Return the direction at angles about the upward axis and over the horizon."""
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    level = math.cos(azimuth) * heading + math.sin(azimuth) * torch.linalg.cross(up, heading)
+    turned: Tensor = math.cos(elevation) * level + math.sin(elevation) * up
+    return turned
+
+
+def _count_seen(cells: Cells, viewpoint: Viewpoint) -> int:
+    """Return how many of the kept cells nothing hides from far away."""
+    centers = cells.centers[viewpoint.keeps(cells.centers)]
+    if len(centers) == 0:
+        return 0
+    picture = SideView(centers, viewpoint.toward, 1.5 * cells.size)
+    pixels, height = picture.pixels(centers), centers @ viewpoint.toward
+    front = picture.largest(pixels, height)
+    return int((height >= front[pixels] - 2 * cells.size).sum())

@@ -74,13 +74,7 @@ class Cells(NamedTuple):
 
 
 def build_grid(points: Tensor) -> CloudGrid:
-    """Sort the finite points of a cloud into voxels and cubes.
-
-    Args:
-        points: Points, shape ``(N, 3)``, float32 or float64.
-
-    Returns:
-        The grid; without levels if no point is finite.
+    """Sort the finite points of a cloud into voxels and cubes; without levels if there are none.
 
     Example:
         >>> grid = build_grid(torch.tensor([[8.0, 0, 0], [torch.nan, 0, 0], [4, 1, 0]]))
@@ -181,13 +175,6 @@ def surface_cells(grid: CloudGrid, *, max_cells: int = 60_000) -> Cells:
 
     The level is the finest one of at most ``max_cells`` cubes whose voxels are mostly in cubes with
     enough of them; in noisy clouds, one of the next two, where more cubes are flat.
-
-    Args:
-        grid: The cloud, of at least one finite point.
-        max_cells: Most cells.
-
-    Returns:
-        The cells, along the curve.
     """
     start = next(
         number

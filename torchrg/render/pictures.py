@@ -16,6 +16,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path
 from torchrg.metrics.contingency import INTEGERS
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
+from torchrg.render.cutaway import View, choose_viewpoint
 from torchrg.render.grid import CloudGrid, build_grid, local_spacing, surface_cells
 from torchrg.render.raster import (
     DepthBuffer,
@@ -24,7 +25,6 @@ from torchrg.render.raster import (
     light_colors,
     shade_hollows,
 )
-from torchrg.render.views import View, choose_viewpoint
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera

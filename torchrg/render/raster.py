@@ -130,15 +130,8 @@ def close_gaps(keys: Tensor, *, reach: int, thickness: float) -> Tensor:
     """Fill gaps through which one sees past a surface, up to ``2 * reach`` pixels wide.
 
     The morphological closing of the inverse depth tells where they are. A gap takes the nearest
-    key of its surroundings that is not in front of the closing.
-
-    Args:
-        keys: Of a depth buffer, shape ``(H, W)``.
-        reach: In pixels.
-        thickness: A pixel this much farther than the closing is a gap, in the unit of the cloud.
-
-    Returns:
-        Keys, shape ``(H, W)``.
+    key of its surroundings that is not in front of the closing. A pixel is a gap if it is farther
+    than the closing by more than ``thickness``, in the unit of the cloud.
     """
     depth, _ = depth_and_colors(keys)
     closed = -_largest_around(-_largest_around(depth, reach), reach)
@@ -178,13 +171,7 @@ _NOISE = 0.35  # a bend over one disc radius that is not shown, as a tangent
 def light_colors(colors: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
     """Shade colours softly by the angle between surface and light.
 
-    Args:
-        colors: Shape ``(N, 3)``, uint8.
-        normals: In the axes of the camera, of arbitrary sign, shape ``(N, 3)``; zero where unknown.
-        positions: In the axes of the camera, shape ``(N, 3)``.
-
-    Returns:
-        Shape ``(N, 3)``, uint8.
+    Normals, of arbitrary sign and zero where unknown, and positions are in the axes of the camera.
 
     Example:
         >>> wall = torch.tensor([[0.0, 0, 1], [0, 0, -1]])
@@ -202,15 +189,8 @@ def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tens
     """Return how bright each pixel is: creases, and what lies behind an edge, are darker.
 
     Eye-dome lighting [1] on the inverse depth, which is linear over the picture of a plane: only
-    its second difference counts, so that tilted planes stay clean.
-
-    Args:
-        inverse_depth: Shape ``(H, W)``; 0: nothing.
-        focal: Focal length in pixels.
-        radius: Usual radius of a disc in pixels; finer steps are noise.
-
-    Returns:
-        Shape ``(H, W)``, in (0, 1]; 1 where there is nothing.
+    its second difference counts, so that tilted planes stay clean. Pixels are 0 where there is
+    nothing; steps finer than ``radius``, the usual one of a disc in pixels, are noise.
 
     References:
         [1] C. Boucheny, A. Ribes. Eye-dome lighting: a non-photorealistic shading technique. 2011.
