@@ -1,4 +1,4 @@
-"""Colours: OKLab against published values, planes that touch against brute force."""
+"""Colours: planes that touch against brute force."""
 
 import pytest
 import torch
@@ -7,36 +7,20 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions.adjacency import count_contacts
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.colors import oklab_to_rgb, rgb_to_oklab
+from torchrg.render.colors import rgb_to_lab
 from torchrg.scenes import make_room
 
-CLEARLY = 0.08  # in OKLab; neighbouring tones of a good screen differ by about 0.02
+CLEARLY = 20.0  # in Lab; 2.3 is just noticeable
 
 
 def lab_of(colors):
-    return rgb_to_oklab(colors.double() / 255)
+    return rgb_to_lab(colors.double() / 255)
 
 
-@pytest.mark.parametrize(
-    ("rgb", "lab"),
-    [
-        ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0)),
-        ((1.0, 0.0, 0.0), (0.62796, 0.22486, 0.12585)),
-        ((0.0, 1.0, 0.0), (0.86644, -0.23389, 0.17950)),
-        ((0.0, 0.0, 1.0), (0.45201, -0.03246, -0.31153)),
-        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    ],
-)
-def test_oklab_has_the_published_values(rgb, lab):
-    color = torch.tensor(rgb, dtype=torch.float64)
-    torch.testing.assert_close(
-        rgb_to_oklab(color), torch.tensor(lab, dtype=torch.float64), atol=2e-5, rtol=0
-    )
-
-
-def test_oklab_and_back_is_the_same_color(rng):
-    colors = torch.rand(500, 3, generator=rng, dtype=torch.float64)
-    torch.testing.assert_close(oklab_to_rgb(rgb_to_oklab(colors)), colors, atol=1e-7, rtol=0)
+def test_lab_has_the_published_value_of_red():
+    red = torch.tensor([[[255, 0, 0]]], dtype=torch.uint8)
+    expected = torch.tensor([[[53.24, 80.09, 67.20]]], dtype=torch.float64)
+    torch.testing.assert_close(lab_of(red), expected, atol=0.02, rtol=0)
 
 
 def test_planes_that_touch_look_clearly_different():
@@ -48,7 +32,7 @@ def test_planes_that_touch_look_clearly_different():
     distances = (lab_of(table[first]) - lab_of(table[second])).norm(dim=1)
     assert len(distances) > 200
     assert float(distances.amin()) > CLEARLY
-    assert float(distances.median()) > 0.2
+    assert float(distances.median()) > 60
 
 
 def test_colors_do_not_depend_on_the_order_of_the_points():
@@ -66,7 +50,7 @@ def test_equal_labels_have_equal_colors_and_no_plane_is_gray():
     gray = torch.full((3,), 176, dtype=torch.uint8)
     assert bool((colors[labels == -1] == gray).all())
     distances = (lab_of(colors[labels >= 0]) - lab_of(gray)).norm(dim=1)
-    assert float(distances.amin()) > 0.05
+    assert float(distances.amin()) > 10
 
 
 def test_matched_planes_have_the_colors_of_the_reference(rng):

@@ -16,62 +16,45 @@ from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
 from torchrg.regions.adjacency import count_contacts
 
-_TO_CONES = (
-    (0.4122214708, 0.5363325363, 0.0514459929),
-    (0.2119034982, 0.6806995451, 0.1073969566),
-    (0.0883024619, 0.2817188376, 0.6299787005),
-)
-_TO_LAB = (
-    (0.2104542553, 0.7936177850, -0.0040720468),
-    (1.9779984951, -2.4285922050, 0.4505937099),
-    (0.0259040371, 0.7827717662, -0.8086757660),
-)
 
-
-def rgb_to_oklab(colors: Tensor) -> Tensor:
-    """Convert colours from sRGB to OKLab [1].
-
-    References:
-        [1] B. Ottosson. A perceptual color space for image processing. 2020.
+def rgb_to_lab(colors: Tensor) -> Tensor:
+    """Convert sRGB in [0, 1], shape ``(*, 3)``, to CIE Lab, whose distances tell how much differs.
 
     Example:
-        >>> rgb_to_oklab(torch.tensor([1.0, 1.0, 1.0])).round(decimals=3).abs()
-        tensor([1., 0., 0.])
+        >>> rgb_to_lab(torch.tensor([1.0, 1.0, 1.0])).round().abs()
+        tensor([100.,   0.,   0.])
     """
-    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    cones = linear @ _matrix(_TO_CONES, colors).T
-    return cones ** (1 / 3) @ _matrix(_TO_LAB, colors).T
+    from kornia.color import rgb_to_lab as of_image
+
+    lab: Tensor = of_image(_as_image(colors))[0, :, :, 0].T.reshape(colors.shape)
+    return lab
 
 
-def oklab_to_rgb(colors: Tensor) -> Tensor:
-    """Convert colours from OKLab to sRGB; values outside [0, 1] are colours no screen shows.
+def _lab_to_rgb(colors: Tensor) -> Tensor:
+    """Convert CIE Lab to sRGB; values outside [0, 1] are colours no screen shows."""
+    from kornia.color import lab_to_rgb as of_image
 
-    Example:
-        >>> oklab_to_rgb(torch.tensor([0.5, 0.0, 0.0])).round(decimals=3)
-        tensor([0.3890, 0.3890, 0.3890])
-    """
-    cones = colors @ torch.linalg.inv(_matrix(_TO_LAB, colors)).T
-    linear = cones**3 @ torch.linalg.inv(_matrix(_TO_CONES, colors)).T
-    bright = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= 0.0031308, linear * 12.92, bright)
+    rgb: Tensor = of_image(_as_image(colors), clip=False)[0, :, :, 0].T.reshape(colors.shape)
+    return rgb
 
 
-def to_bytes(colors: Tensor) -> Tensor:
+def _as_image(colors: Tensor) -> Tensor:
+    """Return colours ``(*, 3)`` as an image of one column ``(1, 3, N, 1)``."""
+    return colors.reshape(-1, 3).T[None, :, :, None]
+
+
+def _to_bytes(colors: Tensor) -> Tensor:
     """Return sRGB colours in [0, 1] as uint8, what is outside cut off."""
     return (colors.clamp(0, 1) * 255).round().to(torch.uint8)
-
-
-def _matrix(rows: tuple[tuple[float, ...], ...], like: Tensor) -> Tensor:
-    return torch.tensor(rows, dtype=like.dtype, device=like.device)
 
 
 UNLABELED_GRAY = 176
 """Red, green and blue of points that belong to no plane."""
 
-_CALM = ((0.78, 0.88), (0.07, 0.095), 24)  # lightness, chroma, number of hues
-_VIVID = ((0.62, 0.70, 0.78), (0.13, 0.165), 36)
+_CALM = ((74.5, 86.0), (24.0, 32.0), 24)  # lightness, chroma, number of hues
+_VIVID = ((56.0, 65.0, 74.5), (44.0, 56.0), 36)
 _LARGE = 0.03  # share of all: planes that get a calm colour
-_ALIKE = 0.0005  # squared OKLab distance of colours that look about the same
+_ALIKE = 58.0  # squared Lab distance of colours that look about the same
 _ELSEWHERE = 0.005  # how much a plane that is not next to another one counts for it
 
 
@@ -93,9 +76,9 @@ def make_palette() -> tuple[Tensor, int]:
             indexing="ij",
         )
         lab = torch.stack([light, strength * hue.cos(), strength * hue.sin()], dim=-1)
-        colors = oklab_to_rgb(lab.view(-1, 3))
+        colors = _lab_to_rgb(lab.view(-1, 3))
         groups.append(colors[((colors >= 0) & (colors <= 1)).all(dim=-1)])
-    return to_bytes(torch.cat(groups)), len(groups[0])
+    return _to_bytes(torch.cat(groups)), len(groups[0])
 
 
 def choose_colors(
@@ -103,7 +86,7 @@ def choose_colors(
 ) -> Tensor:
     """Choose a row of the palette for each plane, the largest first, far from those before.
 
-    Each chosen colour repels with the inverse square of its distance in OKLab: that of a neighbour,
+    Each chosen colour repels with the inverse square of its distance in Lab: that of a neighbour,
     in ``pairs`` ``(E, 2)``, with its weight, any other with a little. Where ``fixed`` is not
     negative it is the choice.
 
@@ -114,7 +97,7 @@ def choose_colors(
     """
     palette, num_calm = make_palette()
     gray = palette.new_full((1, 3), UNLABELED_GRAY)
-    lab = rgb_to_oklab(torch.cat([palette, gray]).double() / 255)
+    lab = rgb_to_lab(torch.cat([palette, gray]).double() / 255)
     distances = (lab[:, None] - lab).square().sum(dim=-1)
     repulsion = (1 / (distances + _ALIKE)).numpy()[:, :-1]
     share = (sizes / sizes.sum()).numpy()
@@ -139,13 +122,13 @@ def choose_colors(
     return torch.from_numpy(choices)
 
 
-_LEVEL_LIGHTNESS, _UPRIGHT_LIGHTNESS, _CHROMA = 0.86, 0.66, 0.13
-_RAMP = (  # OKLab: light gray, yellow, orange, red, violet; darker all the way
-    (0.90, 0.00, 0.00),
-    (0.87, 0.02, 0.10),
-    (0.74, 0.11, 0.12),
-    (0.55, 0.18, 0.06),
-    (0.32, 0.13, -0.06),
+_LEVEL_LIGHTNESS, _UPRIGHT_LIGHTNESS, _CHROMA = 84.0, 60.5, 42.0
+_RAMP = (  # Lab: light gray, yellow, orange, red, violet; darker all the way
+    (88.4, 0.0, 0.0),
+    (84.6, 6.8, 41.2),
+    (68.1, 39.9, 53.7),
+    (45.1, 60.6, 25.3),
+    (19.0, 44.1, -21.7),
 )
 _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
 
@@ -187,7 +170,7 @@ def color_normals(
     lab = torch.stack([lightness, _CHROMA * (x * x - y * y), 2 * _CHROMA * x * y], dim=-1)
     missing = (tensor == 0).all(dim=-1, keepdim=True)
     gray = torch.tensor(UNLABELED_GRAY, dtype=torch.uint8, device=tensor.device)
-    return torch.where(missing, gray, to_bytes(oklab_to_rgb(lab)))
+    return torch.where(missing, gray, _to_bytes(_lab_to_rgb(lab)))
 
 
 def color_curvature(
@@ -222,7 +205,7 @@ def color_curvature(
     before = place.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)
     lab = torch.lerp(ramp[before], ramp[before + 1], (place - before)[..., None])
-    return to_bytes(oklab_to_rgb(lab))
+    return _to_bytes(_lab_to_rgb(lab))
 
 
 def color_sharp(sharp: Tensor | NDArray[Any]) -> Tensor:
