@@ -17,7 +17,7 @@ import torchrg
 from torchrg.config import preset_names
 
 PACKAGE = Path(torchrg.__file__).parent
-NUM_POINTS = 20_000
+NUM_POINTS = 8_000
 """Enough for neighbours by cells, several chunks and every kind of surface."""
 
 LONGEST = {"classic": 18, "paper": 28, "consensus": 26}

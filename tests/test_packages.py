@@ -38,13 +38,16 @@ def test_built_package_runs_in_a_fresh_environment(distributions, tmp_path, suff
     # The dependencies are those of this environment; torchrg itself must come from the package.
     folders = [folder for folder in sys.path if folder.endswith("site-packages")]
     Path(target, "dependencies.pth").write_text("\n".join(folders))
-    run = [binaries / "python", "-m", "torchrg"]
     clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     options = {"cwd": tmp_path, "check": True, "capture_output": True, "text": True, "env": clean}
-    subprocess.run([*run, "sample", "room.npz", "--num-points", "5000"], **options)
-    subprocess.run([*run, "segment", "room.npz", "--out", "seg.npz"], **options)
+    script = (
+        "import torchrg, torchrg.cli as cli\n"
+        "cli.main(['sample', 'room.npz', '--num-points', '5000'])\n"
+        "cli.main(['segment', 'room.npz', '--out', 'seg.npz'])\n"
+        "print(torchrg.__file__)"
+    )
+    where = subprocess.run([binaries / "python", "-c", script], **options)
+    run = [binaries / "python", "-m", "torchrg"]
     done = subprocess.run([*run, "score", "seg.npz", "room.npz", "--json"], **options)
     assert '"f1"' in done.stdout
-    where = "import torchrg; print(torchrg.__file__)"
-    done = subprocess.run([binaries / "python", "-c", where], **options)
-    assert done.stdout.startswith(str(tmp_path))
+    assert where.stdout.splitlines()[-1].startswith(str(tmp_path))
