@@ -1,12 +1,22 @@
-"""Work on many rows: chunks that fit the cache, on as many threads as torch may use."""
+"""Work on many rows: chunks that fit the cache, on as many threads as torch may use.
 
-from collections.abc import Callable, Sequence
+A thread here takes whole tasks and works alone on each operation. Threads of OpenMP, which torch
+would use within an operation, wait for each other while they compute: where another process wants
+a core, that takes ten times as long and more.
+"""
+
+import ctypes
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 Task = TypeVar("Task")
@@ -62,7 +72,7 @@ def map_chunks(
         >>> map_chunks(lambda rows: rows, 0, 3, torch.device("cpu"))
         [slice(0, 0, None)]
     """
-    num_threads = torch.get_num_threads() if device.type == "cpu" else 1
+    num_threads = _allowed_threads() if device.type == "cpu" else 1
     # All threads have equally many slices.
     num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
     size = max(-(-num_rows // max(num_chunks, 1)), min(least, chunk_size))
@@ -83,13 +93,9 @@ def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int
 def map_tasks(
     work: Callable[[Task], Result], tasks: Sequence[Task], device: torch.device
 ) -> list[Result]:
-    """Return what ``work`` returns for each task, on a CPU on ``torch.get_num_threads()`` threads.
+    """Return what ``work`` returns for each task, on a CPU on as many threads as torch may use.
 
-    Threads that each take whole tasks need no synchronisation between operations, which costs more
-    than the operations themselves on tensors that fit the cache. A single task is worked on by one
-    thread too: threads that wait for each other within an operation make it many times slower where
-    another process wants a core. Every task writes its own rows, so the result does not depend on
-    the number of threads.
+    Every task writes its own rows, so the result does not depend on the number of threads.
 
     Example:
         >>> map_tasks(len, ["a", "bc"], torch.device("cpu"))
@@ -98,25 +104,91 @@ def map_tasks(
     if device.type != "cpu":
         return [work(task) for task in tasks]
     _keep_freed_memory()
-    setting = torch.get_num_threads()
-    num_threads = min(setting, len(tasks))
-    try:
-        # The setting is one of each thread, and the default of those that start later.
-        torch.set_num_threads(1)
+    num_threads = min(_allowed_threads(), len(tasks))
+    with sequential_operations():
         if num_threads < 2:
             return [work(task) for task in tasks]
         with ThreadPoolExecutor(
             num_threads, initializer=_begin_thread, initargs=(torch.is_grad_enabled(),)
         ) as pool:
             return list(pool.map(work, tasks))
+
+
+@contextmanager
+def sequential_operations() -> Iterator[None]:
+    """Let each operation of torch run on this thread alone; also a decorator.
+
+    :func:`map_tasks` goes on to use as many threads as torch might before. Nothing changes for
+    other threads: :func:`torch.set_num_threads` would also set the number of those that start
+    meanwhile.
+
+    Example:
+        >>> before = torch.get_num_threads()
+        >>> with sequential_operations():
+        ...     print(torch.get_num_threads())
+        1
+        >>> torch.get_num_threads() == before
+        True
+    """
+    if _THREADS.get() is not None:
+        yield
+        return
+    token = _THREADS.set(torch.get_num_threads())
+    before = _set_own_threads([1] * (1 + len(_openmp_libraries())))
+    try:
+        yield
     finally:
-        torch.set_num_threads(setting)
+        _set_own_threads(before)
+        _THREADS.reset(token)
+
+
+_THREADS: ContextVar[int | None] = ContextVar("threads", default=None)
+"""How many threads the tasks of this call may use; None outside of calls."""
+
+
+def _allowed_threads() -> int:
+    """Return on how many threads tasks may run."""
+    return _THREADS.get() or torch.get_num_threads()
 
 
 def _begin_thread(grad_enabled: bool) -> None:
-    """Give a thread the settings of the one that started it."""
-    torch.set_num_threads(1)
+    """Let a thread work alone on each operation, with the setting of the one that started it."""
+    # Torch gives a thread its number of threads when the thread first asks for it.
+    torch.get_num_threads()
+    _set_own_threads([1] * (1 + len(_openmp_libraries())))
     torch.set_grad_enabled(grad_enabled)
+
+
+def _set_own_threads(numbers: Sequence[int]) -> list[int]:
+    """Set on how many threads the operations of this thread run; return what it was.
+
+    The first number is that of MKL (0: what it takes by default), the others are those of each
+    OpenMP library.
+    """
+    mkl, libraries = _mkl_setter(), _openmp_libraries()
+    before = [mkl(numbers[0]), *(library.num_threads for library in libraries)]
+    for library, number in zip(libraries, numbers[1:], strict=True):
+        library.set_num_threads(number)
+    return before
+
+
+@lru_cache(maxsize=1)
+def _openmp_libraries() -> list[Any]:
+    """Return the OpenMP libraries of this process, whose setting is one of each thread."""
+    return list(ThreadpoolController().select(user_api="openmp").lib_controllers)
+
+
+@lru_cache(maxsize=1)
+def _mkl_setter() -> Callable[[int], int]:
+    """Return what sets and returns MKL's number of threads for this thread.
+
+    Torch sets it too, and MKL asks OpenMP only where it is 0; without MKL it stays 0.
+    """
+    for library in Path(torch.__file__).parent.glob("lib/*torch_cpu.*"):
+        setter = getattr(ctypes.CDLL(str(library)), "MKL_Set_Num_Threads_Local", None)
+        if setter is not None:
+            return lambda number: int(setter(number))
+    return lambda number: 0
 
 
 @lru_cache(maxsize=1)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import sequential_operations
 from torchrg.config import PipelineConfig, load_config
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals import ESTIMATORS
@@ -15,6 +16,7 @@ from torchrg.regions import grow_regions, summarize_planes
 from torchrg.structures import UNLABELED, Neighbors, Segmentation
 
 
+@sequential_operations()
 def segment_planes(
     points: Tensor | NDArray[np.floating],
     config: PipelineConfig | None = None,

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
 from torchrg.depth.camera import depth_to_points, has_depth
 from torchrg.depth.growth import InverseCloud, grow_pixels
@@ -13,6 +14,7 @@ from torchrg.structures import Segmentation
 
 
 @torch.no_grad()
+@sequential_operations()
 def segment_depth(
     depth: Tensor,
     intrinsics: Tensor,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of, sequential_operations
 from torchrg.errors import ShapeError
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
 from torchrg.neighbors.order import canonical_order
@@ -20,6 +20,7 @@ _SAMPLE_SIZE = 400
 """Points that tell how far the k-th neighbour is."""
 
 
+@sequential_operations()
 def search_knn(
     points: Tensor | NDArray[np.floating],
     k: int,

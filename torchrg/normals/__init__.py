@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import CHUNK_SIZE
+from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
@@ -55,6 +55,7 @@ ESTIMATORS: dict[str, Estimator] = {
 """Estimators by name: points, their neighbours, settings, chunk size -> fit."""
 
 
+@sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],
     *,

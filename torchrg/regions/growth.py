@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._parallel import CHUNK_SIZE
+from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import canonical_order
 from torchrg.regions.criteria import GrowingCloud
@@ -25,6 +25,7 @@ _LONG_QUEUE = 32
 """From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
 
 
+@sequential_operations()
 def grow_regions(
     points: Tensor | NDArray[np.floating],
     normals: Tensor | NDArray[np.floating],

@@ -1,0 +1,61 @@
+"""A file that cannot be read gives back its memory, however often it is tried."""
+
+import gc
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrg.errors import FormatError
+from torchrg.io import FORMATS, read_cloud, write_cloud
+from torchrg.structures import Cloud
+
+NUM_POINTS = 20_000
+NUM_READS = 10_000
+MOST_KEPT_BYTES = 10_000_000
+"""A kilobyte a read."""
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
+
+
+def resident_bytes():
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def damaged_files(whole):
+    flipped = [bytearray(whole) for _ in range(4)]
+    for data, place in zip(flipped, (0.02, 0.1, 0.5, 0.999), strict=True):
+        data[int(len(data) * place)] ^= 4
+    return [*map(bytes, flipped), whole[: len(whole) // 2], whole[:-1]]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("suffix", list(FORMATS))
+def test_failed_reads_keep_no_memory(tmp_path, suffix):
+    pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
+    points = np.random.default_rng(0).random((NUM_POINTS, 3))
+    write_cloud(tmp_path / f"whole{suffix}", Cloud(points))
+    paths = []
+    for number, data in enumerate(damaged_files((tmp_path / f"whole{suffix}").read_bytes())):
+        path = tmp_path / f"{number}{suffix}"
+        path.write_bytes(data)
+        try:
+            read_cloud(path)
+        except FormatError:
+            paths.append(path)
+    if not paths:
+        pytest.skip("text and bare arrays do not notice such damage")
+
+    def fail(count):
+        for number in range(count):
+            with pytest.raises(FormatError):
+                read_cloud(paths[number % len(paths)])
+
+    fail(100)
+    before = resident_bytes()
+    fail(NUM_READS)
+    assert resident_bytes() - before < MOST_KEPT_BYTES
