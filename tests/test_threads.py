@@ -17,7 +17,7 @@ def work(room, side):
     for preset in ("classic", "detmm", "paper", "consensus"):
         torchrg.segment_planes(room.points, torchrg.load_config(preset))
     torchrg.normals.orient_normals(room.points, room.normals)
-    depth = torch.full((side, side), 2.0)
+    depth = torch.tensor(2.0).expand(side, side)
     camera = torch.tensor([[300.0, 0, side / 2], [0, 300, side / 2], [0, 0, 1]])
     torchrg.depth.segment_depth(depth, camera)
 
