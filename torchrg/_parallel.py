@@ -21,6 +21,7 @@ from torch import Tensor
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 
 CACHE_BYTES = 2**22
 """Bytes of one array that a thread works on at a time, so that it stays in the cache."""
@@ -72,7 +73,7 @@ def map_chunks(
         >>> map_chunks(lambda rows: rows, 0, 3, torch.device("cpu"))
         [slice(0, 0, None)]
     """
-    num_threads = _allowed_threads() if device.type == "cpu" else 1
+    num_threads = allowed_threads() if device.type == "cpu" else 1
     # All threads have equally many slices.
     num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
     size = max(-(-num_rows // max(num_chunks, 1)), min(least, chunk_size))
@@ -104,7 +105,7 @@ def map_tasks(
     if device.type != "cpu":
         return [work(task) for task in tasks]
     _keep_freed_memory()
-    num_threads = min(_allowed_threads(), len(tasks))
+    num_threads = min(allowed_threads(), len(tasks))
     with sequential_operations():
         if num_threads < 2:
             return [work(task) for task in tasks]
@@ -112,6 +113,19 @@ def map_tasks(
             num_threads, initializer=_begin_thread, initargs=(torch.is_grad_enabled(),)
         ) as pool:
             return list(pool.map(work, tasks))
+
+
+def run_beside(
+    first: Callable[[], Result], second: Callable[[], Other], device: torch.device
+) -> tuple[Result, Other]:
+    """Return the results of two calls, run side by side if there are threads.
+
+    Example:
+        >>> run_beside(lambda: 1, lambda: "a", torch.device("cpu"))
+        (1, 'a')
+    """
+    results: list[Any] = map_tasks(lambda call: call(), [first, second], device)
+    return results[0], results[1]
 
 
 @contextmanager
@@ -146,7 +160,7 @@ _THREADS: ContextVar[int | None] = ContextVar("threads", default=None)
 """How many threads the tasks of this call may use; None outside of calls."""
 
 
-def _allowed_threads() -> int:
+def allowed_threads() -> int:
     """Return on how many threads tasks may run."""
     return _THREADS.get() or torch.get_num_threads()
 

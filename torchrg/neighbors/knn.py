@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of, sequential_operations
+from torchrg._parallel import ROWS_AT_ONCE, allowed_threads, chunks_of, sequential_operations
 from torchrg.errors import ShapeError
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
 from torchrg.neighbors.order import canonical_order
@@ -162,7 +162,7 @@ def _query(
     left, width = np.arange(len(queries)), k + 1
     while len(left):
         ranks = np.arange(1, min(width, tree.n) + 1)
-        near, found = tree.query(queries[left], ranks, workers=torch.get_num_threads())
+        near, found = tree.query(queries[left], ranks, workers=allowed_threads())
         sort_ties(near, found, near[:, 1:] == near[:, :-1])
         distances[left], rows[left] = near[:, :k], found[:, :k]
         is_open = (near[:, k - 1] == near[:, -1]) & (width < tree.n)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import chunks_of, map_tasks, places_of
+from torchrg._parallel import allowed_threads, chunks_of, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.regions.criteria import (
@@ -151,7 +151,7 @@ def _pack(
     starts: NDArray[np.signedinteger]
     starts = np.zeros(num_points + 1, dtype=np.int32 if len(targets) < 2**31 else np.int64)
     chunks = chunks_of(num_points, chunk_size)
-    at_once = _CHUNKS_A_THREAD * max(torch.get_num_threads(), 1)
+    at_once = _CHUNKS_A_THREAD * allowed_threads()
     used = 0
     for first in range(0, len(chunks), at_once):
         group = chunks[first : first + at_once]

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import run_beside
 from torchrg.errors import ConfigError
 from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
-from torchrg.regions.measures import covered_areas, fit_rectangles, trace_outline
+from torchrg.regions.measures import Rectangles, covered_areas, fit_rectangles, trace_outline
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 
@@ -120,8 +121,19 @@ def summarize_planes(
     places, centers = segments.take_columns(points), segments.spread_columns(fit.center)
     centered = [place - center for place, center in zip(places, centers, strict=True)]
     u, v = (_sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
-    boxes = fit_rectangles(segments, u, v)
-    area, width = covered_areas(segments, u, v, boxes)
+
+    def measure() -> tuple[Rectangles, Tensor, Tensor]:
+        boxes = fit_rectangles(segments, u, v)
+        return boxes, *covered_areas(segments, u, v, boxes)
+
+    def meet() -> PlaneAdjacency | None:
+        if neighbors is None:
+            return None
+        return find_adjacency(
+            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
+        )
+
+    (boxes, area, width), found = run_beside(measure, meet, points.device)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)
     axes = boxes.directions @ torch.stack([first, second], dim=1)
 
@@ -145,10 +157,7 @@ def summarize_planes(
     if outline:
         frame = (fit.center, first, second)
         planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
-    if neighbors is not None:
-        found = find_adjacency(
-            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
-        )
+    if found is not None:
         lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
     return planes
