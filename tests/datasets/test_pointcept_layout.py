@@ -59,7 +59,7 @@ def test_types_and_shapes_are_pointcepts(sample, seg, tmp_path):
         "instance": ("<i2", (3000, 1)),
         "superpoint": ("<i4", (3000,)),
         "plane": ("<i4", (3000,)),
-        "curvature": ("<f4", (3000,)),
+        "curvature": ("<f4", (3000, 1)),
     }
     found = {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in expected}
     assert {name: (a.dtype.str, a.shape) for name, a in found.items()} == expected
@@ -79,6 +79,7 @@ def test_a_scene_reads_as_it_was_written(sample, seg, tmp_path):
         assert found[name].dtype == sample[name].dtype
         assert torch.equal(found[name], sample[name])
     assert torch.equal(found["plane"], seg.labels)
+    assert torch.equal(found["curvature"], seg.curvature)
 
 
 def test_the_table_describes_the_labels(sample, seg, tmp_path):
