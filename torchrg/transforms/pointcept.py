@@ -68,32 +68,30 @@ def point_collate_fn(batch: Sequence[Mapping[str, Any]], mix_prob: float = 0) ->
 
     Of each pair the planes of the second are numbered after those of the first.
     """
-    joined: dict[str, Any] = _Pointcept.point_collate_fn(batch, mix_prob=mix_prob)
+    joined: dict[str, Any] = _OWN["point_collate_fn"](batch, mix_prob=mix_prob)
+    labels = [joined[name] for name in _LABELS if name in joined]
+    if not labels or "offset" not in joined:
+        return joined
     sizes = [size for sample in batch for size in np.diff(sample["offset"], prepend=0).tolist()]
     if len(joined["offset"]) == len(sizes):
         return joined
     ends = np.cumsum(sizes)
-    for first_row, middle, end in zip([0, *ends[1::2]], ends[::2], ends[1::2], strict=False):
-        for labels in (joined[name] for name in _LABELS if name in joined):
-            first, second = labels[first_row:middle], labels[middle:end]
+    for start, middle, end in zip([0, *ends[1::2]], ends[::2], ends[1::2], strict=False):
+        for values in labels:
+            first, second = values[start:middle], values[middle:end]
             second[second >= 0] += int(first.max()) + 1
     return joined
 
 
 _TRANSFORMS = (CenterCloud, EstimateNormals, GrowRegions, KeepFinite, SampleVoxels, SegmentPlanes)
-
-
-class _Pointcept:
-    """Pointcept's own functions, behind those that take their places."""
-
-    point_collate_fn: Callable[..., dict[str, Any]]
-    index_operator: Callable[..., dict[str, Any]]
+_OWN: dict[str, Callable[..., dict[str, Any]]] = {}
+"""Pointcept's own functions, behind those that take their places."""
 
 
 def index_operator(data_dict: dict[str, Any], index: Any, duplicate: bool = False) -> Any:  # noqa: ANN401
     """Take points out as Pointcept does, and out of our entries too."""
     data_dict.update(with_listed(data_dict, [*OUR_KEYS, *_LABELS]))
-    return _Pointcept.index_operator(data_dict, index, duplicate)
+    return _OWN["index_operator"](data_dict, index, duplicate)
 
 
 def _make_known() -> None:
@@ -102,23 +100,24 @@ def _make_known() -> None:
     from pointcept.datasets import transform, utils
     from pointcept.datasets.builder import DATASETS
 
-    for module in _TRANSFORMS:
-        transform.TRANSFORMS.register_module(module=module, force=True)
+    for known in _TRANSFORMS:
+        transform.TRANSFORMS.register_module(module=known, force=True)
     for data_set in DATASETS.module_dict.values():
         for assets in ("VALID_ASSETS", "PC_VALID_ASSETS"):
-            known = getattr(data_set, assets, None)
-            if known is not None:
-                setattr(data_set, assets, list(dict.fromkeys([*known, *_FILES])))
+            files = getattr(data_set, assets, None)
+            if files is not None:
+                setattr(data_set, assets, list(dict.fromkeys([*files, *_FILES])))
     if not hasattr(transform, "index_operator"):
         raise MissingDependencyError(
             "torchrg.transforms.pointcept: expected a Pointcept whose transforms take points out "
             "by index_operator, got an older one; update it."
         )
-    if transform.index_operator is not index_operator:
-        _Pointcept.index_operator = staticmethod(transform.index_operator)
-        _Pointcept.point_collate_fn = staticmethod(utils.point_collate_fn)
-    transform.index_operator = index_operator
-    utils.point_collate_fn = datasets.point_collate_fn = point_collate_fn
+    for module, ours in ((transform, index_operator), (utils, point_collate_fn)):
+        # Kept there, so that another import of this module finds them and not our own.
+        name = ours.__name__
+        _OWN[name] = vars(module).setdefault(f"_{name}_of_pointcept", getattr(module, name))
+        setattr(module, name, ours)
+    datasets.point_collate_fn = point_collate_fn
 
 
 if importlib.util.find_spec("pointcept") is not None:

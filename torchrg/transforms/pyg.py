@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_MADE_BY_BATCHING = ("batch", "ptr")
+_MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
 
 
 def is_separable(sample: Any) -> bool:  # noqa: ANN401
