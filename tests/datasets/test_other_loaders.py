@@ -1,4 +1,4 @@
-"""Areas read as one cloud become what the readers of KPConv and Superpoint Transformer ask for."""
+"""Areas read as one cloud become what the reader of KPConv asks for."""
 
 import numpy as np
 import pytest
@@ -75,19 +75,6 @@ def test_kpconv_reads_an_area(area, tmp_path):
     assert data["red"].dtype == np.uint8
     assert data["red"].tolist() == [10] * 1500 + [20] * 1200
     assert data["plane"].tolist() == joined["plane"].tolist()
-
-
-def test_superpoint_transformer_reads_an_area(area):
-    joined = read_pointcept_area(area)
-    sizes = joined["offset"].diff(prepend=joined["offset"].new_zeros(1))
-    is_val = torch.tensor([name in ("office_10",) for name in joined["name"]])
-    is_val = is_val.repeat_interleave(sizes)
-    assert is_val.tolist() == [False] * 1500 + [True] * 1200
-    rgb = joined["color"] / 255
-    assert (joined["coord"].dtype, rgb.dtype) == (torch.float32, torch.float32)
-    assert rgb.max() <= 1
-    assert joined["segment"].dtype == torch.int64
-    assert joined["normal"].shape == (2700, 3)
 
 
 def test_a_folder_without_scenes_is_named(tmp_path):

@@ -8,24 +8,25 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
 :func:`read_pointcept_scene` and :func:`write_pointcept_scene` one folder of Pointcept's layout.
 
 **Other people's loaders.** Pointcept loads what ``torchrg convert`` wrote once
-:mod:`torchrg.transforms.pointcept` is imported. Loaders that take whole areas of S3DIS get them
-from :func:`read_pointcept_area` after ``torchrg convert s3dis RAW OUT --class-order spt``, whose
-classes are in their order. KPConv reads ``original_ply/Area_1.ply`` (further fields stay unread
-until its ``load_subsampled_clouds`` is told of them)::
+:mod:`torchrg.transforms.pointcept` is imported.
+
+KPConv reads an area of S3DIS as ``original_ply/Area_1.ply``; after ``torchrg convert s3dis RAW OUT
+--class-order spt``, whose classes are in its order, these lines write it (the fields beyond
+``class`` stay unread until ``load_subsampled_clouds`` is told of them)::
 
     area = {key: np.asarray(value) for key, value in read_pointcept_area("OUT/Area_1").items()}
     fields = {"color": area["color"], "class": area["segment"].astype(np.int32)}
     fields |= {"normals": area["normal"], "plane": area["plane"]}
     torchrg.write_cloud("original_ply/Area_1.ply", torchrg.Cloud(area["coord"], fields))
 
-Superpoint Transformer reads what ``read_single_raw_cloud`` of its ``S3DIS`` returns; with ``OUT``
-as ``data/s3dis/raw``, a subclass returns (leave ``normal`` out of the keys of ``PointFeatures``)::
+Superpoint Transformer reads S3DIS as released and averages points over voxels, labels too: planes
+have to come after. With ``from torchrg.transforms import SegmentPlanes`` at the end of its
+``src/transforms/__init__.py``, its configs name our transforms; in ``pre_transform``, after
+``GridSampling3D`` (``plane`` also goes into ``point_save_keys``)::
 
-    area = read_pointcept_area(raw_cloud_path)
-    sizes = area["offset"].diff(prepend=area["offset"].new_zeros(1))
-    is_val = torch.tensor([name in VALIDATION_ROOMS for name in area["name"]])
-    return Data(pos=area["coord"], rgb=area["color"] / 255, y=area["segment"],
-                normal=area["normal"], plane=area["plane"], is_val=is_val.repeat_interleave(sizes))
+    - transform: SegmentPlanes
+      params:
+        config: s3dis
 
 OpenPCSeg reads scans of cars only (SemanticKITTI, Waymo), of which there is nothing to convert; in
 ``__getitem__`` of a subclass, columns of ours go beside those of ``xyzret``::

@@ -21,8 +21,11 @@ POINTCEPT_KEYS = ("coord", "color", "normal", "superpoint", "strength", "segment
 """What Pointcept puts into a sample's list when it first takes points out, if there is none."""
 OUR_KEYS = ("plane", "curvature", "residual")
 """Entries that torchrg adds."""
-_USUAL_KEYS = ("pos", "x", "batch", "grid_coord", "displacement", "index", "intensity", "labels")
-"""Other entries that have a row for each point where they are as long as the cloud."""
+_USUAL_KEYS = (
+    *("grid_coord", "displacement", "index", "intensity", "labels"),
+    *("pos", "x", "y", "rgb", "norm", "batch"),
+)
+"""Other entries that have a row for each point where they are as long as the cloud; then PyG's."""
 _WHOLE_KEYS = ("offset", "ptr", "origin", "pose", "inverse", "inverse_index", LISTED)
 """Entries that have none, however long they are."""
 _EARLIER = "origin_"
@@ -98,9 +101,8 @@ def with_listed(entries: Mapping[str, Any], keys: Iterable[str]) -> dict[str, li
     present = [key for key in keys if isinstance(entries.get(key), Tensor | np.ndarray)]
     if listed is None and not present:
         return {}
-    return {
-        LISTED: list(dict.fromkeys([*(POINTCEPT_KEYS if listed is None else listed), *present]))
-    }
+    begun = POINTCEPT_KEYS if listed is None else listed
+    return {LISTED: list(dict.fromkeys([*begun, *present]))}
 
 
 def is_whole(key: Any, whole: Collection[str] = ()) -> bool:  # noqa: ANN401
