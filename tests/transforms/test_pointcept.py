@@ -139,6 +139,17 @@ def test_a_list_in_the_config_is_used_and_not_changed(datasets, root, kind):
     assert names == kind(["coord", "segment"])
 
 
+def test_what_a_data_set_adds_stays_with_its_points_too(datasets, root):
+    transforms = sys.modules["pointcept.datasets.transform"].TRANSFORMS
+    sample = build(datasets, root, [])[0]
+    sample["row"] = np.stack([sample["segment"]] * 2, axis=1)
+    sample["origin_segment"] = whole = sample["segment"]
+    for step in (PLANES, GRID, CROP):
+        sample = transforms.build(step)(sample)
+    assert sample["row"][:, 1].tolist() == sample["segment"].tolist()
+    assert sample["origin_segment"] is whole
+
+
 class Halves:
     """A crop for the test path that gives several parts of a fragment, as Pointcept asks."""
 

@@ -59,6 +59,18 @@ def test_what_is_added_is_named_and_the_given_list_is_not_changed(names):
         assert set([kept] if isinstance(kept, str) else kept) == before
 
 
+@pytest.mark.parametrize("names", [None, ["coord", "segment"]], ids=["absent", "usual"])
+def test_what_is_recognized_is_named_too(names):
+    """So Pointcept takes points out of all of it; what it keeps of earlier points stays off."""
+    sample = sample_of(mine=np.zeros((NUM_POINTS, 2)), origin_coord=np.zeros((NUM_POINTS, 3)))
+    sample |= {} if names is None else {"index_valid_keys": names}
+    named = SegmentPlanes("classic")(sample)["index_valid_keys"]
+    assert "mine" in named
+    assert not {"origin_coord", "name", "index_valid_keys"} & set(named)
+    chosen = {**sample, "index_valid_keys": ["coord", "its_own"]}
+    assert "mine" not in SegmentPlanes("classic")(chosen)["index_valid_keys"]
+
+
 def test_one_list_of_two_samples_stays_as_it_is():
     shared = ["coord", "segment"]
     samples = [sample_of(index_valid_keys=shared) for _ in range(2)]

@@ -21,11 +21,13 @@ POINTCEPT_KEYS = ("coord", "color", "normal", "superpoint", "strength", "segment
 """What Pointcept puts into a sample's list when it first takes points out, if there is none."""
 OUR_KEYS = ("plane", "curvature", "residual")
 """Entries that torchrg adds."""
-_USUAL_KEYS = (
+_USUAL_KEYS = {
+    *POINTCEPT_KEYS,
+    *OUR_KEYS,
     *("grid_coord", "displacement", "index", "intensity", "labels"),
     *("pos", "x", "y", "rgb", "norm", "batch"),
-)
-"""Other entries that have a row for each point where they are as long as the cloud; then PyG's."""
+}
+"""Entries that have a row for each point where they are as long as the cloud; PyG's come last."""
 _WHOLE_KEYS = ("offset", "ptr", "origin", "pose", "inverse", "inverse_index", LISTED)
 """Entries that have none, however long they are."""
 _EARLIER = "origin_"
@@ -70,18 +72,7 @@ def point_keys(
     Raises:
         ConfigError: If it cannot be told of an entry.
     """
-    usual = {*POINTCEPT_KEYS, *OUR_KEYS, *_USUAL_KEYS}
-    by_name = usual.union(listed_keys(entries) or ())
-    found, doubtful = [], []
-    for key, value in entries.items():
-        if is_whole(key, whole) or num_points == 0 or not _is_as_long(value, num_points):
-            continue
-        is_array = isinstance(value, Tensor | np.ndarray)
-        # A list of usual names alone is nobody's choice: it says nothing of other entries.
-        if is_array and (key in by_name or (by_name == usual and num_points > _FEW)):
-            found.append(key)
-        else:
-            doubtful.append(key)
+    found, doubtful = _sort_keys(entries, num_points, whole)
     if doubtful:
         raise ConfigError(
             f"{caller}: cannot tell whether {', '.join(map(str, doubtful))} of the sample has a "
@@ -91,11 +82,17 @@ def point_keys(
     return found
 
 
+def recognized_keys(
+    entries: Mapping[str, Any], num_points: int, *, whole: Collection[str] = ()
+) -> list[str]:
+    """Return what belongs on a list besides ours: nothing where somebody made the list."""
+    return [] if _has_chosen_list(entries) else _sort_keys(entries, num_points, whole)[0]
+
+
 def with_listed(entries: Mapping[str, Any], keys: Iterable[str]) -> dict[str, list[str]]:
     """Return the list of a sample with some entries on it, those that are there; never the old one.
 
-    Where there is none, it is what Pointcept would begin, and they. Others are left as Pointcept
-    has them: what it does not list may be meant to stay, like labels for the evaluation.
+    Where there is none, it is what Pointcept would begin, and they.
     """
     listed = listed_keys(entries)
     present = [key for key in keys if isinstance(entries.get(key), Tensor | np.ndarray)]
@@ -103,6 +100,27 @@ def with_listed(entries: Mapping[str, Any], keys: Iterable[str]) -> dict[str, li
         return {}
     begun = POINTCEPT_KEYS if listed is None else listed
     return {LISTED: list(dict.fromkeys([*begun, *present]))}
+
+
+def _has_chosen_list(entries: Mapping[str, Any]) -> bool:
+    """Return whether somebody made the list; of usual names alone, nobody did."""
+    return not _USUAL_KEYS.issuperset(listed_keys(entries) or ())
+
+
+def _sort_keys(
+    entries: Mapping[str, Any], num_points: int, whole: Collection[str]
+) -> tuple[list[str], list[str]]:
+    """Return the entries with a row for each point, and those that may have one."""
+    by_name = _USUAL_KEYS.union(listed_keys(entries) or ())
+    by_length = num_points > _FEW and not _has_chosen_list(entries)
+    found: list[str] = []
+    doubtful: list[str] = []
+    for key, value in entries.items():
+        if is_whole(key, whole) or num_points == 0 or not _is_as_long(value, num_points):
+            continue
+        is_array = isinstance(value, Tensor | np.ndarray)
+        (found if is_array and (by_length or key in by_name) else doubtful).append(key)
+    return found, doubtful
 
 
 def is_whole(key: Any, whole: Collection[str] = ()) -> bool:  # noqa: ANN401
@@ -125,7 +143,8 @@ def check_in_step(caller: str, entries: Mapping[str, Any], num_points: int) -> N
         if len(value) != num_points and (key in listed or is_table):
             raise ConfigError(
                 f"{caller}: expected {key} with a row for each of {num_points} points, got "
-                f"{len(value)} rows; name it in {LISTED!r} before points are taken out."
+                f"{len(value)} rows; name it in {LISTED!r} before points are taken out, or leave "
+                "it out."
             )
 
 

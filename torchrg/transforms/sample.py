@@ -23,6 +23,7 @@ from torchrg.transforms.rows import (
     check_in_step,
     entries_of,
     follow_points,
+    recognized_keys,
     rows_of_clouds,
     select_points,
     with_listed,
@@ -120,14 +121,17 @@ class SampleTransform(nn.Module):
             for key, value in values.items()
         }
         changed = {**sample, **new}
+        coord = self.key(sample, "coord")
         # Pointcept's transforms would else begin a list in which ours are not.
-        if LISTED in sample or (is_numpy and self.key(sample, "coord") == "coord"):
-            changed |= with_listed(changed, [*OUR_KEYS, *per_point])
+        if LISTED in sample or (is_numpy and coord == "coord"):
+            num_points, whole = len(changed[coord]), self._whole_keys(sample)
+            others = recognized_keys(changed, num_points, whole=whole)
+            changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
         return changed
 
     def selected(self, sample: Any, rows: Tensor, num_points: int) -> dict[str, Any]:  # noqa: ANN401
         """Return the entries that change when only some rows are kept, given ascending."""
-        whole = [self.key(sample, name) for name in ("inverse", "origin")]
+        whole = self._whole_keys(sample)
         return select_points(type(self).__name__, sample, rows, num_points, whole=whole)
 
     def moved_inverse(self, sample: Any, place: Tensor) -> dict[str, Tensor]:  # noqa: ANN401
@@ -137,6 +141,10 @@ class SampleTransform(nn.Module):
             return {}
         inverse = self.read(sample, "inverse")
         return {key: follow_points(type(self).__name__, inverse, place)}
+
+    def _whole_keys(self, sample: Any) -> list[str]:  # noqa: ANN401
+        """Return what the entries are called that have no row for each point."""
+        return [self.key(sample, name) for name in ("inverse", "origin")]
 
 
 class CloudTransform(SampleTransform):
