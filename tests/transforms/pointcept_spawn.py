@@ -3,13 +3,13 @@
 import sys
 from functools import partial
 
-sys.path.insert(0, sys.argv[1])
-
-import real  # noqa: F401
-from pointcept import datasets
 from torch.utils.data import DataLoader
 
-import torchrg.transforms.pointcept
+if __name__ in ("__main__", "__mp_main__"):  # a worker imports this file under the second name
+    sys.path.insert(0, sys.argv[1])
+    import real  # noqa: F401
+
+    import torchrg.transforms.pointcept  # noqa: F401
 
 STEPS = {
     "made": [{"type": "SegmentPlanes", "config": "classic"}],
@@ -19,6 +19,8 @@ STEPS = {
 
 def main():
     """Write which samples are in step."""
+    from pointcept import datasets
+
     crop = {"type": "SphereCrop", "sample_rate": 0.5, "mode": "random"}
     collect = {"type": "Collect", "keys": ("coord", "plane"), "feat_keys": ("curvature",)}
     for name, steps in STEPS.items():
@@ -30,7 +32,7 @@ def main():
                 "transform": [*steps, crop, {"type": "ToTensor"}, collect],
             }
         )
-        collate = partial(torchrg.transforms.pointcept.point_collate_fn, mix_prob=0)
+        collate = partial(datasets.point_collate_fn, mix_prob=0)
         loader = DataLoader(
             data, batch_size=3, num_workers=1, multiprocessing_context="spawn", collate_fn=collate
         )
