@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader
 from tests.datasets.s3dis_tree import text_of, write_objects
 from torchrg.config import load_config
 from torchrg.datasets import write_pointcept_scene
+from torchrg.errors import MissingDependencyError
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 
@@ -267,6 +268,14 @@ def test_every_data_set_loads_our_files_and_importing_again_changes_nothing(data
     sample = {"coord": np.zeros((30, 3)), "plane": np.arange(30)}
     operator = sys.modules["pointcept.datasets.transform"].index_operator
     assert operator(sample, np.arange(5))["plane"].tolist() == list(range(5))
+
+
+def test_a_pointcept_without_the_function_is_named(datasets, monkeypatch):
+    monkeypatch.delattr(sys.modules["pointcept.datasets.transform"], "index_operator")
+    with pytest.raises(MissingDependencyError, match="expected a Pointcept whose transforms take"):
+        importlib.reload(sys.modules[OURS])
+    monkeypatch.undo()
+    importlib.reload(sys.modules[OURS])
 
 
 @pytest.mark.slow

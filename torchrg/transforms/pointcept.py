@@ -84,6 +84,7 @@ def point_collate_fn(batch: Sequence[Mapping[str, Any]], mix_prob: float = 0) ->
 
 
 _TRANSFORMS = (CenterCloud, EstimateNormals, GrowRegions, KeepFinite, SampleVoxels, SegmentPlanes)
+"""What configs can name."""
 _OWN: dict[str, Callable[..., dict[str, Any]]] = {}
 """Pointcept's own functions, behind those that take their places."""
 
