@@ -7,6 +7,7 @@ import torch
 
 SCANS = Path(__file__).parents[2] / "shared" / "data"
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
+POINTCEPT = Path(__file__).parents[2] / "shared" / "pointcept"
 
 
 def pytest_addoption(parser):
@@ -58,3 +59,11 @@ def oracles_folder():
     if not ORACLES.exists():
         pytest.skip("needs the reference values of other implementations")
     return ORACLES
+
+
+@pytest.fixture(scope="session")
+def pointcept_folder():
+    """Folder of Pointcept's own data pipeline; the test is skipped where it is absent."""
+    if not POINTCEPT.exists():
+        pytest.skip("needs the data pipeline of Pointcept")
+    return POINTCEPT

@@ -7,6 +7,7 @@ from torch.utils.data import DataLoader
 
 from torchrg.datasets import collate_offset
 from torchrg.errors import ShapeError
+from torchrg.transforms import SampleVoxels, restore_points
 
 
 def sample_of(count, name):
@@ -59,3 +60,21 @@ def test_samples_that_differ_are_refused():
         collate_offset([{"pos": torch.zeros(1, 3)}])
     with pytest.raises(ShapeError, match="got none"):
         collate_offset([])
+
+
+def test_what_names_points_names_rows_of_the_batch():
+    """Labels of a batch go back to the points of all clouds, and to no point without a voxel."""
+    clouds = [torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 0, 0]]), torch.eye(3)]
+    samples = [SampleVoxels(0.5)({"coord": cloud}) for cloud in clouds]
+    for batch in (collate_offset(samples), collate_offset([collate_offset(samples)])):
+        back = restore_points(batch["coord"], batch["inverse"], fill=-1)
+        assert batch["inverse"].lt(0).tolist() == [False, True, False, False, False, False]
+        assert torch.equal(back[[0, 2, 3, 4, 5]], torch.cat(clouds)[[0, 2, 3, 4, 5]])
+    twice = collate_offset([collate_offset(samples)] * 2)
+    assert twice["inverse"].tolist() == [0, -1, 1, 2, 3, 4, 5, -1, 6, 7, 8, 9]
+
+
+def test_names_of_entries_stay_one_list():
+    samples = [{**sample_of(2, "a"), "index_valid_keys": ("coord", "segment")} for _ in range(2)]
+    batch = collate_offset(samples)
+    assert batch["index_valid_keys"] == ["coord", "segment"]

@@ -5,9 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
-from tests.datasets.pointcept_rules import Collect, GridSample, Scenes, collate
 from tests.datasets.s3dis_tree import digest
 from torchrg.config import load_config
 from torchrg.datasets import describe_planes, read_pointcept_scene, write_pointcept_scene
@@ -59,7 +57,7 @@ def test_types_and_shapes_are_pointcepts(sample, seg, tmp_path):
         "instance": ("<i2", (3000, 1)),
         "superpoint": ("<i4", (3000,)),
         "plane": ("<i4", (3000,)),
-        "curvature": ("<f4", (3000,)),
+        "curvature": ("<f4", (3000, 1)),
     }
     found = {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in expected}
     assert {name: (a.dtype.str, a.shape) for name, a in found.items()} == expected
@@ -79,6 +77,7 @@ def test_a_scene_reads_as_it_was_written(sample, seg, tmp_path):
         assert found[name].dtype == sample[name].dtype
         assert torch.equal(found[name], sample[name])
     assert torch.equal(found["plane"], seg.labels)
+    assert torch.equal(found["curvature"], seg.curvature)
 
 
 def test_the_table_describes_the_labels(sample, seg, tmp_path):
@@ -242,25 +241,3 @@ def test_a_folder_that_cannot_be_made_is_named(sample, seg, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FormatError, match="cannot be made"):
         write_pointcept_scene(tmp_path / "file" / "room", sample, seg)
-
-
-def test_a_data_set_after_pointcepts_rules_reads_the_folder(sample, seg, tmp_path):
-    class WithPlanes(Scenes):
-        assets = (*Scenes.assets, "superpoint", "plane")
-
-    for i in range(3):
-        part = {key: value[: 2000 + 500 * i] for key, value in sample.items() if key != "name"}
-        labels = segment_planes(part["coord"], CLASSIC)
-        write_pointcept_scene(tmp_path / "Area_1" / f"office_{i}", part, labels, superpoint=True)
-
-    plain = Scenes(tmp_path, "Area_1")[0]
-    assert sorted(plain) == ["color", "coord", "instance", "name", "normal", "segment"]
-
-    keys = ("coord", "segment", "instance", "superpoint")
-    steps = [GridSample(0.2), Collect(keys, feat_keys=("color", "normal"))]
-    data = WithPlanes(tmp_path, "Area_1", steps)
-    batch = next(iter(DataLoader(data, batch_size=3, collate_fn=collate)))
-    num_points = int(batch["offset"][-1])
-    assert batch["feat"].shape == (num_points, 6)
-    assert 100 < num_points < 7500
-    assert all(len(batch[key]) == num_points for key in keys)

@@ -118,19 +118,21 @@ def test_transforms_compose_and_keep_numpy_samples_numpy():
     assert {"plane", "normal", "curvature"} <= set(sample["index_valid_keys"])
 
 
-def test_pyg_data_go_through_and_batch():
-    geometric = pytest.importorskip("torch_geometric")
-    rooms = [make_room(3000, 0.003, seed).points for seed in (3, 4)]
-    samples = [
-        SegmentPlanes("classic")(geometric.data.Data(pos=points, name="a")) for points in rooms
-    ]
-    for data, points in zip(samples, rooms, strict=True):
-        expected = segment_planes(points, load_config("classic"))
-        assert torch.equal(data.plane, expected.labels)
-        assert torch.equal(data.normal, expected.normals)
-    batch = geometric.data.Batch.from_data_list(
-        [geometric.data.Data(pos=points) for points in rooms]
-    )
-    together = SegmentPlanes("classic")(batch)
-    assert torch.equal(together.plane, torch.cat([data.plane for data in samples]))
-    assert "plane" not in batch
+def test_a_second_sampling_goes_on_from_the_first(rng):
+    coord = torch.rand(300, 3, generator=rng)
+    coord[4] = torch.nan
+    sample = SampleVoxels(0.4)(KeepFinite()(SampleVoxels(0.1)({"coord": coord})))
+    once = sample_voxels(coord, 0.1)
+    twice = sample_voxels(coord[once.rows], 0.4)
+    assert len(sample["inverse"]) == 300
+    for point, voxel in enumerate(sample["inverse"].tolist()):
+        first = int(once.inverse[point])
+        assert voxel == (-1 if first < 0 else int(twice.inverse[first]))
+
+
+def test_points_that_leave_are_named_by_no_row():
+    coord = torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 0, 0]])
+    sample = KeepFinite()({"coord": coord, "inverse": torch.tensor([2, 1, 0, 2, -1])})
+    assert sample["inverse"].tolist() == [1, -1, 0, 1, -1]
+    with pytest.raises(ConfigError, match="expected inverse to name rows of 3 points, got row 3"):
+        KeepFinite()({"coord": coord, "inverse": torch.tensor([3])})

@@ -1,5 +1,6 @@
 """Ragged batches: clouds one after the other, and where each ends."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,9 +11,12 @@ from torch.utils.data import default_collate
 
 from torchrg._checks import as_tensor
 from torchrg.errors import ShapeError
+from torchrg.transforms.rows import LISTED, listed_keys
 
 
-def collate_offset(samples: Sequence[Mapping[str, Any]], *, coord: str = "coord") -> dict[str, Any]:
+def collate_offset(
+    samples: Sequence[Mapping[str, Any]], *, coord: str = "coord", inverse: str = "inverse"
+) -> dict[str, Any]:
     """Join samples as Pointcept does: arrays end to end, ``offset`` the row each cloud ends before.
 
     Convention:
@@ -23,10 +27,12 @@ def collate_offset(samples: Sequence[Mapping[str, Any]], *, coord: str = "coord"
         samples: Samples with the same keys. Tensors and arrays are joined along their first axis,
             scalars stacked, everything else becomes a list.
         coord: Key that says how many points a sample has.
+        inverse: Key of the numbers of points, as of :class:`torchrg.transforms.SampleVoxels`, that
+            shall name rows of the batch.
 
     Returns:
         The batch, with ``offset`` ``(B,)`` int64. Samples that are batches themselves, with an
-        ``offset`` of their own, are joined into one.
+        ``offset`` of their own, are joined into one. ``index_valid_keys`` is one list.
 
     Raises:
         ShapeError: If there are no samples, or their keys differ.
@@ -56,7 +62,21 @@ def collate_offset(samples: Sequence[Mapping[str, Any]], *, coord: str = "coord"
         for s in samples
     ]
     batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}
+    if inverse in batch:
+        starts = itertools.accumulate((len(s[coord]) for s in samples), initial=0)
+        batch[inverse] = torch.cat(
+            [_shifted(s[inverse], start) for s, start in zip(samples, starts, strict=False)]
+        )
+    if LISTED in batch:
+        names = itertools.chain.from_iterable(listed_keys(s) or () for s in samples)
+        batch[LISTED] = list(dict.fromkeys(names))
     return {**batch, "offset": torch.cat(counts).cumsum(0)}
+
+
+def _shifted(rows: Any, start: int) -> Tensor:  # noqa: ANN401
+    """Return numbers of points in a sample as those in a batch, where it begins at ``start``."""
+    tensor = as_tensor("collate_offset", "inverse", rows)
+    return torch.where(tensor >= 0, tensor + start, tensor)
 
 
 def _join(key: str, values: list[Any]) -> Any:  # noqa: ANN401

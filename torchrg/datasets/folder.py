@@ -11,10 +11,13 @@ import torch
 from torch.utils.data import Dataset
 
 from torchrg._checks import as_tensor
+from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud
 
+_NUMBERED = {"instance", "plane", "superpoint"}
+"""Arrays whose numbers begin again in each scene."""
 _FIELD_KEYS = {"normals": "normal"}
 """Fields of a cloud that have another name in a sample."""
 
@@ -120,6 +123,36 @@ class FolderOfClouds(SceneDataset):
         }
         origin = torch.from_numpy(cloud.origin).reshape(1, 3)
         return {**fields, "coord": cloud.points, "origin": origin, "name": name}
+
+
+def read_pointcept_area(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read all scenes of a folder in Pointcept's layout as one cloud: an area of S3DIS, a split.
+
+    Loaders that take whole areas read this; see :mod:`torchrg.datasets`.
+
+    Args:
+        folder: A folder of scenes, as ``OUT/Area_5`` of ``torchrg convert s3dis``.
+
+    Returns:
+        What :func:`torchrg.datasets.read_pointcept_scene` returns of each scene, end to end in
+        natural order: ``(N, ...)``, with ``offset`` ``(B,)``, the row each scene ends before, and
+        ``name``, a list. Numbers of ``instance``, ``plane`` and ``superpoint`` go on from scene to
+        scene, so that each is in one scene only; -1 stays.
+
+    Raises:
+        FormatError: If there is no such folder or no scene in it, or a file is damaged.
+        ShapeError: If some scenes have an array that others have not.
+    """
+    paths = [path for path in files_below(Path(folder), is_item=_is_scene) if path.is_dir()]
+    if not paths:
+        raise FormatError(f"{folder}: expected folders with coord.npy, got none.")
+    scenes: list[dict[str, Any]] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
+    for key in _NUMBERED & set(scenes[0]):
+        first = 0
+        for labels in (scene[key] for scene in scenes if key in scene):
+            labels[labels >= 0] += first
+            first = int(labels.max()) + 1 if (labels >= 0).any() else first
+    return collate_offset(scenes)
 
 
 def _is_scene(folder: Path) -> bool:

@@ -1,9 +1,10 @@
 """Scenes in Pointcept's processed layout: a folder of ``.npy`` files for each scene.
 
 ``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
-``instance`` int16 of shape ``(N, 1)``. Beside them torchrg puts ``plane`` int32 and ``curvature``
-float32 of shape ``(N,)``, ``planes.json``, and ``superpoint`` where it is asked for. Pointcept
-reads the files it knows and passes over the others.
+``instance`` int16 of shape ``(N, 1)``. Beside them torchrg puts ``plane`` int32 of shape ``(N,)``,
+``curvature`` float32 of shape ``(N, 1)`` as Pointcept has features, ``planes.json``, and
+``superpoint`` where it is asked for. Pointcept reads the files it knows and passes over the others;
+``import torchrg.transforms.pointcept`` makes it know these.
 """
 
 import json
@@ -31,6 +32,8 @@ POINT_ARRAYS = (
 )  # fmt: skip
 """Arrays of a scene folder that have a row for each point."""
 _LABELS = ("segment", "instance", "superpoint", "plane")
+_FEATURES = ("strength", "curvature")
+"""Arrays of numbers that have two axes in files, whatever they have elsewhere."""
 _TABLE = "planes.json"
 
 
@@ -42,7 +45,7 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
 
     Returns:
         Those of :data:`POINT_ARRAYS` that are there; labels as int64 of shape ``(N,)``. The others
-        are mapped from the files copy-on-write.
+        are mapped from the files copy-on-write; ``curvature`` has shape ``(N,)``.
 
     Raises:
         FormatError: If there are no coordinates, a file is damaged, or lengths differ.
@@ -56,6 +59,8 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
     for name, values in arrays.items():
         _check_rows(paths[name], values, len(arrays["coord"]))
     sample = {name: as_tensor("scene", name, values) for name, values in arrays.items()}
+    if "curvature" in sample:
+        sample["curvature"] = sample["curvature"].reshape(-1)
     return {
         name: values.reshape(-1).long() if name in _LABELS else values
         for name, values in sample.items()
@@ -187,6 +192,8 @@ def _arrays_of(
         _check_rows(place / f"{name}.npy", values, len(segmentation.labels))
         if name in ("segment", "instance"):
             arrays[name] = _short(values).reshape(-1, 1)
+        elif name in _FEATURES:
+            arrays[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), -1)
         else:
             arrays[name] = np.ascontiguousarray(values, dtypes.get(name, np.float32))
     return arrays

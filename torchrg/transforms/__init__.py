@@ -1,4 +1,8 @@
-"""Modules for data pipelines: a dict of tensors (or a PyG ``Data``) in, a new one out."""
+"""Modules for data pipelines: a dict of tensors (or a PyG ``Data``, ``Batch``) in, a new one out.
+
+:mod:`torchrg.transforms.pointcept` makes them known to Pointcept; for other loaders see
+:mod:`torchrg.datasets`.
+"""
 
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth

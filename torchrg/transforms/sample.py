@@ -1,4 +1,4 @@
-"""Samples: a dict of tensors or NumPy arrays, or a PyG ``Data``, which is never imported.
+"""Samples: a dict of tensors or NumPy arrays, or a PyG ``Data`` or ``Batch``, never imported here.
 
 A sample holds one cloud, or a ragged batch: ``offset`` ``(B,)``, the row each cloud ends before
 (Pointcept), or ``batch`` ``(N,)``, the cloud of each point in ascending order (PyG). Transforms
@@ -6,7 +6,6 @@ treat each cloud by itself.
 """
 
 import copy
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,24 +15,39 @@ from torch import Tensor, nn
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
+from torchrg.structures import UNLABELED
+from torchrg.transforms.pyg import is_separable, with_each
+from torchrg.transforms.rows import (
+    LISTED,
+    OUR_KEYS,
+    check_in_step,
+    entries_of,
+    follow_points,
+    recognized_keys,
+    rows_of_clouds,
+    select_points,
+    with_listed,
+)
 
 KEYS = ("coord", "normal", "curvature", "residual", "plane", "inverse", "origin")
 """Names of the entries of a sample (Pointcept's, and ours)."""
-PYG_KEYS = {"coord": "pos"}
-"""Names that a PyG ``Data`` has instead of ours, unless others are given."""
-NOT_PER_POINT = ("offset", "origin", "pose", "inverse")
-"""Entries that have no row for each point that is there, however long they are."""
+PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
+"""Names that a PyG ``Data`` has instead of ours, unless others are given. PyG makes entries with
+``index`` in their name refer to the rows of the batch."""
 
 
 class SampleTransform(nn.Module):
     """Base of the transforms: reads and writes samples of every kind, never changes one.
 
-    Results are NumPy arrays where the coordinates are. Names of new keys with a row for each point
-    are added to ``index_valid_keys`` where a sample has it, so that Pointcept's transforms take
-    points out of them too.
+    Results are NumPy arrays where the coordinates are. Such samples leave with a list of the
+    entries that have a row for each point, ``index_valid_keys``, so that Pointcept's transforms
+    take points out of ours too. A PyG ``Batch`` leaves as one that can be taken apart again.
 
     Args:
         keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
+
+    Raises:
+        ConfigError: On a call, if an entry that must have a row for each point has not.
     """
 
     names: Sequence[str] = KEYS
@@ -53,6 +67,18 @@ class SampleTransform(nn.Module):
         """Return the settings."""
         return "" if self.config is None else repr(self.config)
 
+    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample; the given one is not changed."""
+        if is_separable(sample):
+            return with_each(sample, self.forward)
+        num_points = len(self.read(sample, "coord"))
+        check_in_step(type(self).__name__, entries_of(sample), num_points)
+        return self.transform(sample)
+
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample, of one whose entries are in step."""
+        raise NotImplementedError
+
     def key(self, sample: Any, name: str) -> str:  # noqa: ANN401
         """Return what an entry is called in a sample."""
         usual = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
@@ -61,7 +87,7 @@ class SampleTransform(nn.Module):
     def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
         """Return an entry of a sample as a tensor, or say what is wrong with it."""
         key, caller = self.key(sample, name), type(self).__name__
-        entries = _entries_of(sample)
+        entries = entries_of(sample)
         if key not in entries:
             raise ConfigError(
                 f"{caller}: expected a sample with {key!r}, got {', '.join(map(str, entries))}; "
@@ -70,12 +96,13 @@ class SampleTransform(nn.Module):
         tensor = as_tensor(caller, key, entries[key])
         if name == "coord":
             check_shapes(caller, **{key: (tensor, "N 3")})
-        return tensor
+        # Pointcept keeps one number a point with two axes.
+        return tensor.squeeze(-1) if name in OUR_KEYS and tensor.ndim == 2 else tensor
 
     def changed(
         self,
         sample: Any,  # noqa: ANN401
-        values: Mapping[str, Tensor],
+        values: Mapping[str, Any],
         *,
         per_point: Sequence[str] = (),
     ) -> Any:  # noqa: ANN401
@@ -83,20 +110,41 @@ class SampleTransform(nn.Module):
 
         Those in ``per_point`` have a row for each point.
         """
-        entries = _entries_of(sample)
-        is_numpy = isinstance(entries.get(self.key(sample, "coord")), np.ndarray)
-        new: dict[str, Any] = {
-            key: value.numpy() if is_numpy else value for key, value in values.items()
+        if not isinstance(sample, Mapping):
+            other = copy.copy(sample)
+            for key, value in values.items():
+                other[key] = value
+            return other
+        is_numpy = isinstance(sample.get(self.key(sample, "coord")), np.ndarray)
+        new = {
+            key: value.numpy(force=True) if is_numpy and isinstance(value, Tensor) else value
+            for key, value in values.items()
         }
-        if "index_valid_keys" in entries:
-            known = list(entries["index_valid_keys"])
-            new["index_valid_keys"] = known + [key for key in per_point if key not in known]
-        if isinstance(sample, Mapping):
-            return {**sample, **new}
-        other = copy.copy(sample)
-        for key, value in new.items():
-            other[key] = value
-        return other
+        changed = {**sample, **new}
+        coord = self.key(sample, "coord")
+        # Pointcept's transforms would else begin a list in which ours are not.
+        if LISTED in sample or (is_numpy and coord == "coord"):
+            num_points, whole = len(changed[coord]), self._whole_keys(sample)
+            others = recognized_keys(changed, num_points, whole=whole)
+            changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
+        return changed
+
+    def selected(self, sample: Any, rows: Tensor, num_points: int) -> dict[str, Any]:  # noqa: ANN401
+        """Return the entries that change when only some rows are kept, given ascending."""
+        whole = self._whole_keys(sample)
+        return select_points(type(self).__name__, sample, rows, num_points, whole=whole)
+
+    def moved_inverse(self, sample: Any, place: Tensor) -> dict[str, Tensor]:  # noqa: ANN401
+        """Return the ``inverse`` of a sample after rows moved to ``place``, if it has one."""
+        key = self.key(sample, "inverse")
+        if entries_of(sample).get(key) is None:
+            return {}
+        inverse = self.read(sample, "inverse")
+        return {key: follow_points(type(self).__name__, inverse, place)}
+
+    def _whole_keys(self, sample: Any) -> list[str]:  # noqa: ANN401
+        """Return what the entries are called that have no row for each point."""
+        return [self.key(sample, name) for name in ("inverse", "origin")]
 
 
 class CloudTransform(SampleTransform):
@@ -108,8 +156,8 @@ class CloudTransform(SampleTransform):
         """Return new entries of one cloud, from those that are read."""
         raise NotImplementedError
 
-    def forward(self, sample: Any) -> Any:  # noqa: ANN401
-        """Return a new sample with the new entries; the given one is not changed."""
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample with the new entries."""
         values = {name: self.read(sample, name) for name in self.reads}
         parts = [
             self.add({name: value[rows] for name, value in values.items()})
@@ -135,7 +183,7 @@ class CenterCloud(SampleTransform):
         ([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[6.0, 5.0, 5.0]])
     """
 
-    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample with moved coordinates."""
         coord = self.read(sample, "coord")
         clouds = [coord[rows] for rows in rows_of_clouds(sample, len(coord))]
@@ -153,85 +201,23 @@ class CenterCloud(SampleTransform):
 class KeepFinite(SampleTransform):
     """Leave out points whose coordinates are not finite, from every entry with a row a point.
 
+    Changes ``inverse``, if it is there, so that it still names the same points, -1 for those left
+    out.
+
     Example:
         >>> sample = {"coord": torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0]]), "name": "a"}
         >>> KeepFinite()(sample)
         {'coord': tensor([[0., 0., 0.]]), 'name': 'a'}
     """
 
-    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample with the finite points."""
         coord = self.read(sample, "coord")
-        rows = coord.isfinite().all(dim=-1).nonzero().squeeze(-1)
-        return self.changed(sample, select_points(sample, rows, num_points=len(coord)))
-
-
-def rows_of_clouds(sample: Any, num_points: int) -> list[slice]:  # noqa: ANN401
-    """Return the rows of each cloud of a sample, by its ``offset`` or ``batch`` if it has one."""
-    return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
-
-
-def select_points(sample: Any, rows: Tensor, *, num_points: int) -> dict[str, Tensor]:  # noqa: ANN401
-    """Return the entries of a sample that change when only some rows are kept, given ascending.
-
-    Which entries have a row for each point, ``index_valid_keys`` says as Pointcept does, or else
-    their length. ``offset`` is among them where the sample has it. A sample that has edges, or is a
-    batch that can be taken apart again, is refused.
-    """
-    entries = _entries_of(sample)
-    for key, repair in (("edge_index", "before edges are made"), ("ptr", "before batching")):
-        if key in entries:
-            raise ConfigError(
-                f"expected a sample without {key} to take points out of, got one; apply the "
-                f"transform {repair}."
-            )
-    named = entries.get("index_valid_keys")
-    chosen = {}
-    for key, value in entries.items():
-        if not isinstance(value, Tensor | np.ndarray) or key in NOT_PER_POINT:
-            continue
-        if value.ndim and len(value) == num_points and (named is None or key in named):
-            tensor = as_tensor("select_points", key, value)
-            chosen[key] = tensor[rows.to(tensor.device)]
-    if "offset" in entries:
-        offset = torch.as_tensor(entries["offset"])
-        ends = torch.tensor(_cloud_ends(sample, num_points), device=rows.device)
-        chosen["offset"] = torch.searchsorted(rows, ends).to(offset)
-    return chosen
-
-
-def _entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
-    """Return what a sample holds by key, or say that it is none."""
-    if isinstance(sample, Mapping):
-        return sample
-    if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
-        entries: dict[str, Any] = sample.to_dict()
-        return entries
-    raise ConfigError(
-        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
-    )
-
-
-def _cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
-    """Return the row that each cloud of a sample ends before; one cloud ends at the last."""
-    entries = _entries_of(sample)
-    if entries.get("offset") is not None:
-        ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
-        if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
-            raise ConfigError(
-                f"expected offset to ascend to the number of points ({num_points}), got {ends}."
-            )
-        return ends
-    if entries.get("batch") is not None:
-        batch = torch.as_tensor(entries["batch"])
-        if len(batch) != num_points or bool((batch.diff() < 0).any()):
-            raise ConfigError(
-                f"expected batch to ascend over {num_points} points, got {len(batch)} numbers; "
-                "sort the points by cloud."
-            )
-        counts: list[int] = torch.bincount(batch).cumsum(0).tolist()
-        return counts or [0]
-    return [num_points]
+        is_finite = coord.isfinite().all(dim=-1)
+        rows = is_finite.nonzero().squeeze(-1)
+        place = torch.where(is_finite, is_finite.cumsum(dim=0) - 1, UNLABELED)
+        selected = self.selected(sample, rows, len(coord))
+        return self.changed(sample, selected | self.moved_inverse(sample, place))
 
 
 def _middle(cloud: Tensor) -> Tensor:

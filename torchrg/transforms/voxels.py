@@ -15,15 +15,21 @@ from torchrg.neighbors import finite_rows, restore_points, sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
 from torchrg.structures import UNLABELED, PlaneAdjacency, Segmentation
-from torchrg.transforms.sample import SampleTransform, rows_of_clouds, select_points
+from torchrg.transforms.rows import rows_of_clouds
+from torchrg.transforms.sample import SampleTransform
+
+_NEVER_A_ROW = torch.iinfo(torch.int64).min
+"""Instead of -1 in a PyG ``Data``: negative still when PyG adds the rows of the clouds before."""
 
 
 class SampleVoxels(SampleTransform):
     """Keep one point of each voxel, and remember the voxel of every point.
 
     Reads ``coord`` ``(N, 3)``; reduces every entry with a row for each point to ``(V, ...)``, and
-    adds ``inverse`` ``(N,)``, int64: :func:`restore_points` takes labels of the voxels back to all
-    points. No voxel crosses the clouds of a batch. See :func:`sample_voxels`.
+    adds ``inverse`` ``(N,)``, int64, negative for none: :func:`restore_points` takes labels of the
+    voxels back to all points. It names rows of the whole sample, in a batch too; in a PyG ``Data``
+    it is ``inverse_index``, which PyG keeps so when it batches. Where ``inverse`` is there already,
+    it goes on from its points. No voxel crosses the clouds of a batch. See :func:`sample_voxels`.
 
     Args:
         size: Side of a voxel, in the unit of the cloud.
@@ -42,7 +48,7 @@ class SampleVoxels(SampleTransform):
             raise ConfigError(f"SampleVoxels: expected size > 0, got {size!r}.")
         self.size = size
 
-    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample of voxels."""
         coord = self.read(sample, "coord")
         rows, inverse, num_voxels = [], [], 0
@@ -51,9 +57,12 @@ class SampleVoxels(SampleTransform):
             rows.append(voxels.rows + cloud.start)
             inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
             num_voxels += len(voxels.rows)
-        selected = select_points(sample, torch.cat(rows), num_points=len(coord))
-        selected[self.key(sample, "inverse")] = torch.cat(inverse)
-        return self.changed(sample, selected)
+        voxel_of = torch.cat(inverse)
+        if not isinstance(sample, Mapping):
+            voxel_of = voxel_of.where(voxel_of >= 0, _NEVER_A_ROW)
+        selected = self.selected(sample, torch.cat(rows), len(coord))
+        found = {self.key(sample, "inverse"): voxel_of} | self.moved_inverse(sample, voxel_of)
+        return self.changed(sample, selected | found)
 
     def extra_repr(self) -> str:
         """Return the settings."""
