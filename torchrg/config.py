@@ -33,9 +33,19 @@ class NormalsConfig:
     sharp_angle_deg: float = 5.0
     """A point is sharp when its rule gives more than this angle."""
     support_fraction: float = 0.5
-    """Share of the neighbours that the MCD fits, in [0.5, 1]; 0.5 resists most outliers."""
+    """Share of the neighbours that the MCD fits, in [0.5, 1]: 0.5 resists most outliers, 0.75 is
+    the default of LIBRA, MATLAB's DetMCD."""
+    mcd_scaling: Literal["consistency", "quantile"] = "consistency"
+    """What DetMCD multiplies its raw scatter by: the factor for normal points, or one by which its
+    h-th smallest squared distance is the chi-square quantile of h of k (LIBRA)."""
+    mcd_inliers: Literal["raw", "reweighted"] = "raw"
+    """Distances of DetMCD that are cut: those to the raw fit, or those to the reweighted one
+    (LIBRA)."""
     inlier_quantile: float = 0.975
     """Neighbours within this chi-square quantile of the robust fit are inliers."""
+    irls_decay: float = 1.05
+    """Factor, above 1, by which the scale of irls shrinks in a step: its authors' is 1.01, which
+    takes five times as long."""
     adaptive_k: int | None = None
     """Largest number of neighbours that consensus may use in noisy clouds, where k are too few to
     tell faces apart. None: always k."""
@@ -47,11 +57,12 @@ class NormalsConfig:
         _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
         _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
+        _require(self, "irls_decay", "> 1", self.irls_decay > 1)
 
 
 @dataclass(frozen=True)
 class GrowingConfig:
-    """How regions grow; the defaults are the paper's Algorithm 2."""
+    """How regions grow; the defaults are the paper's."""
 
     max_angle_deg: float = 5.0
     """A neighbour joins when the angle between the normals is at most this."""
@@ -63,9 +74,10 @@ class GrowingConfig:
     connectivity: float | None = 0.75
     """Two points are connected when they share at least this fraction of their k neighbours.
     None: not tested."""
-    connectivity_scope: Literal["region", "seed"] = "region"
-    """What an unconnected neighbour may not do: join the region (Algorithm 2), or only become a
-    seed (the paper's text)."""
+    connectivity_scope: Literal["region", "seed"] = "seed"
+    """What an unconnected neighbour may not do: join the region (Algorithm 2 as printed), or only
+    become a seed (the paper's text), which it is once a seed of its region that is connected to it
+    reaches it, at the claim or later."""
     coplanarity: bool = True
     """Whether a neighbour joins only if its distance to the seed's plane is at most
     median + 2 Qn of those of the neighbourhood (eq. 11)."""
@@ -124,9 +136,13 @@ class GrowingConfig:
 
     @property
     def is_order_free(self) -> bool:
-        """Whether a claimed point spreads by what it is, not by which edge claimed it."""
-        by_edge = self.connectivity is not None and self.connectivity_scope == "seed"
-        return self.seed_rule == "curvature" and not by_edge
+        """Whether a claimed point spreads by what it is, not by which edges lead to it."""
+        return self.seed_rule == "curvature" and not self.promotes_late
+
+    @property
+    def promotes_late(self) -> bool:
+        """Whether any edge of its region makes a point a seed, not only the one that claimed it."""
+        return self.connectivity is not None and self.connectivity_scope == "seed"
 
     @property
     def is_refined(self) -> bool:

@@ -60,7 +60,7 @@ VARIANTS = {
     "consensus": NormalsConfig(method="consensus", k=K),
     "adaptive": NormalsConfig(method="consensus", k=K, adaptive_k=300),
     "detmm": NormalsConfig(method="detmm", k=K),
-    "irls": NormalsConfig(method="irls", k=K),
+    "irls": NormalsConfig(method="irls", k=K, irls_decay=1.01),  # The authors'.
     "mve": NormalsConfig(method="mve", k=K),
     "fastmcd": NormalsConfig(method="fastmcd", k=K),
 }
