@@ -1,23 +1,35 @@
-# Sourced by demo.sh and test.sh: makes .venv once, with the extras named in $1, and activates it.
+# Sourced by the other scripts: makes an environment once, with the extras named in $1, and activates
+# it. It is .venv, or with $2 = lowest .venv-lowest, which has the oldest versions of everything that
+# pyproject.toml allows.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-extras=${1:-}
+extras=${1:-} kind=${2:-}
+venv=.venv${kind:+-$kind}
 python=${PYTHON:-python3}
 if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
   echo "torchrg needs Python 3.11 or newer; set PYTHON to one, as in PYTHON=python3.12 bash $0" >&2
   exit 2
 fi
 
-stamp=.venv/.torchrg-$(cat pyproject.toml scripts/constraints.txt | cksum | tr ' ' '-')${extras:+-$extras}
+stamp=$venv/.torchrg-$(cat pyproject.toml scripts/constraints.txt | cksum | tr ' ' '-')${extras:+-$extras}
 if [ ! -e "$stamp" ]; then
   site=$("$python" -c 'import importlib.util as u; print("--system-site-packages" if u.find_spec("torch") else "")')
-  [ -x .venv/bin/python ] || "$python" -m venv $site .venv
-  echo "Installing torchrg into .venv (once; some minutes if PyTorch has to be downloaded) ..."
-  .venv/bin/python -c 'import torch' 2>/dev/null ||
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt torch
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".${extras:+[$extras]}"
-  rm -f .venv/.torchrg-*"${extras:+-$extras}"
+  [ -z "$kind" ] || site=
+  [ -x "$venv/bin/python" ] || "$python" -m venv $site "$venv"
+  install=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check)
+  echo "Installing torchrg into $venv (once; some minutes if PyTorch has to be downloaded) ..."
+  if [ -n "$kind" ]; then
+    # "laspy[lazrs]>=2.5" becomes laspy==2.5
+    grep -oE '"[A-Za-z0-9_-]+(\[[a-z,]+\])?>=[0-9.]+"' pyproject.toml | tr -d '"' |
+      sed -E 's/(\[.*\])?>=/==/' | sort -u > "$venv/constraints.txt"
+    "${install[@]}" -c "$venv/constraints.txt" -e ".${extras:+[$extras]}"
+  else
+    "$venv/bin/python" -c 'import torch' 2>/dev/null ||
+      "${install[@]}" -c scripts/constraints.txt torch
+    "${install[@]}" -e ".${extras:+[$extras]}"
+  fi
+  rm -f "$venv"/.torchrg-*"${extras:+-$extras}"
   touch "$stamp"
 fi
-export PATH="$PWD/.venv/bin:$PATH"
+export PATH="$PWD/$venv/bin:$PATH"

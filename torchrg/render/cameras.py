@@ -31,7 +31,7 @@ def make_camera(
 
     Example:
         >>> camera = make_camera(torch.eye(4), 500.0, (319.5, 239.5), 640, 480)
-        >>> camera.project(torch.tensor([[[0.5, 0.0, 1.0]]]).double()).tolist()
+        >>> camera.project(torch.tensor([[[0.5, 0.0, 1.0]]]).double()).round(decimals=3).tolist()
         [[[569.5, 239.5]]]
     """
     from kornia.geometry.camera import PinholeCamera
