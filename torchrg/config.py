@@ -51,7 +51,7 @@ class NormalsConfig:
 
 @dataclass(frozen=True)
 class GrowingConfig:
-    """How regions grow; the defaults are the paper's Algorithm 2."""
+    """How regions grow; the defaults are the paper's."""
 
     max_angle_deg: float = 5.0
     """A neighbour joins when the angle between the normals is at most this."""
@@ -63,9 +63,10 @@ class GrowingConfig:
     connectivity: float | None = 0.75
     """Two points are connected when they share at least this fraction of their k neighbours.
     None: not tested."""
-    connectivity_scope: Literal["region", "seed"] = "region"
-    """What an unconnected neighbour may not do: join the region (Algorithm 2), or only become a
-    seed (the paper's text)."""
+    connectivity_scope: Literal["region", "seed"] = "seed"
+    """What an unconnected neighbour may not do: join the region (Algorithm 2 as printed), or only
+    become a seed (the paper's text), which it is once a seed of its region that is connected to it
+    reaches it, at the claim or later."""
     coplanarity: bool = True
     """Whether a neighbour joins only if its distance to the seed's plane is at most
     median + 2 Qn of those of the neighbourhood (eq. 11)."""
@@ -124,9 +125,13 @@ class GrowingConfig:
 
     @property
     def is_order_free(self) -> bool:
-        """Whether a claimed point spreads by what it is, not by which edge claimed it."""
-        by_edge = self.connectivity is not None and self.connectivity_scope == "seed"
-        return self.seed_rule == "curvature" and not by_edge
+        """Whether a claimed point spreads by what it is, not by which edges lead to it."""
+        return self.seed_rule == "curvature" and not self.promotes_late
+
+    @property
+    def promotes_late(self) -> bool:
+        """Whether any edge of its region makes a point a seed, not only the one that claimed it."""
+        return self.connectivity is not None and self.connectivity_scope == "seed"
 
     @property
     def is_refined(self) -> bool:

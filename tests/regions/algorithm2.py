@@ -1,5 +1,8 @@
 """Algorithm 2 of the paper, line by line, for small clouds: the oracle of region growing.
 
+With ``connectivity_scope="seed"`` it is the paper's text instead: connectivity decides about seeds
+alone, and a point that joined without becoming one is looked at again by every later seed.
+
 Written from the paper and independent of the library: plain Python numbers, lists and loops. Where
 the paper leaves a choice, the argument has the name and the meaning of the library's setting.
 """
@@ -33,6 +36,7 @@ def segment(
     """
     num_points, k = len(points), k or len(knn[0])
     valid = [True] * num_points if valid is None else valid
+    promotes_late = connectivity is not None and connectivity_scope == "seed"
     ascending = sorted(c for c, v in zip(curvature, valid, strict=True) if v)
     sigma_th = ascending[int(curvature_quantile * (len(ascending) - 1))] if ascending else 0.0
     available = {i for i in range(num_points) if valid[i]}
@@ -63,7 +67,8 @@ def segment(
                 radius = max(math.dist(points[seed], points[j]) for j in neighbors)
                 gamma_th = median(used) + 2 * max(qn(used), coplanarity_floor * radius)
             for j, is_connected, gamma_j in zip(neighbors, connected, gamma, strict=True):
-                if j not in available:
+                may_be_promoted = promotes_late and j in region and j not in seeds
+                if j not in available and not may_be_promoted:
                     continue
                 if connectivity_scope == "region" and not is_connected:
                     continue
@@ -72,8 +77,9 @@ def segment(
                 ):
                     continue
                 if gamma_j <= gamma_th and angle_deg(normals[seed], normals[j]) <= max_angle_deg:
-                    region.append(j)
-                    available.remove(j)
+                    if j in available:
+                        region.append(j)
+                        available.remove(j)
                     if connectivity_scope == "seed" and not is_connected:
                         continue
                     if seed_rule == "curvature" and curvature[j] <= sigma_th:

@@ -145,11 +145,12 @@ def test_planes_that_each_point_must_be_on(kind, coplanarity):
     # Exact fits, for which eq. 11 decides, and others.
     rms = torch.from_numpy(0.03 * rng.random(len(coordinates)))
     rms[::3] = 0
-    for connectivity in (None, 0.5):
+    for connectivity, scope in ((None, "seed"), (0.5, "region"), (0.5, "seed")):
         config = GrowingConfig(
             max_angle_deg=25.0,
             seed_rule="curvature",
             connectivity=connectivity,
+            connectivity_scope=scope,
             coplanarity=coplanarity,
             plane_reach=1.5,
             min_size=3,

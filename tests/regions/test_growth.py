@@ -59,6 +59,17 @@ def test_the_increment_rule_compares_with_the_point_that_was_joined():
     assert grow_regions(points, normals, curvature, neighbors, config).max() == 0
 
 
+def test_a_point_that_joined_unconnected_is_a_seed_once_a_connected_seed_reaches_it():
+    # 0 claims 2, but only 1 shares three neighbours with it; 3 hangs on 2 alone.
+    rows = [[0, 2, 1, 5], [1, 0, 2, 4], [2, 1, 4, 3], [3, 5, 4, 0], [4, 5, 3, 0], [5, 0, 3, 4]]
+    points, normals, _, _ = strip(6, 0.0)
+    cloud = (points, normals, torch.arange(6).double(), Neighbors(torch.tensor(rows)))
+    settings = {"coplanarity": False, "curvature_quantile": 1.0, "min_size": 1}
+    assert grow_regions(*cloud, GrowingConfig(**settings)).tolist() == [0] * 6
+    printed = GrowingConfig(**settings, connectivity_scope="region")
+    assert grow_regions(*cloud, printed).tolist() == [0, 0, 0, 1, 1, 1]
+
+
 def test_curvature_limit_is_the_lower_quantile():
     for num_values in (12, 237):
         values = torch.rand(num_values, generator=torch.Generator().manual_seed(0))

@@ -17,7 +17,8 @@ PRESETS = {name: load_config(name).growing for name in ("classic", "paper", "con
 PRESETS["consensus"] = dataclasses.replace(PRESETS["consensus"], plane_reach=None)
 SMALL = {"min_size": 3, "max_angle_deg": 12.0}
 CONFIGS = {name: GrowingConfig(**{**vars(config), **SMALL}) for name, config in PRESETS.items()} | {
-    "seed scope": GrowingConfig(seed_rule="curvature", connectivity_scope="seed", **SMALL)
+    "seeds by value": GrowingConfig(seed_rule="curvature", **SMALL),
+    "as printed": GrowingConfig(connectivity_scope="region", **SMALL),
 }
 
 

@@ -42,7 +42,9 @@ def grow_regions(
 
     A region starts at the free point of least curvature. Each of its seeds claims those of its free
     neighbours that pass the criteria of the settings; a claimed point becomes a seed if the seed
-    rule holds.
+    rule holds. With ``connectivity_scope="seed"`` the two must also be connected, and where that
+    fails for the seed that claimed the point, any later seed of its region may still make it one:
+    without such late promotion regions shatter.
 
     Convention:
         All limits are inclusive. The curvature limit is the value at place
@@ -128,7 +130,8 @@ def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArra
     limit = _curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
     if not config.is_order_free:
         edges = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        return _grow_first_in_first_out(edges, order, valid)
+        late = config.promotes_late
+        return _grow_first_in_first_out(edges, order, valid, promotes_late=late)
     seeds = order[curvature[order] <= limit.cpu().numpy()]
     edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
     heads = _first_to_reach(edges, seeds, len(valid))
@@ -184,29 +187,38 @@ def _first_to_reach(
 
 
 def _grow_first_in_first_out(
-    edges: EdgeLists, order: NDArray[np.int32], valid: NDArray[np.bool_]
+    edges: EdgeLists,
+    order: NDArray[np.int32],
+    valid: NDArray[np.bool_],
+    *,
+    promotes_late: bool = False,
 ) -> NDArray[np.int32]:
     """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
 
-    A point belongs to the first seed in the queue that has an edge to it, and whether it becomes a
-    seed itself is a property of that edge: targets are ``2 * row + (whether it does)``. Long queues
-    are taken a level at a time: all edges of the waiting seeds in their order, of which the first
-    to a point claims it. This is the order of the queue, exactly.
+    A point belongs to the first seed in the queue that has an edge to it. Whether it becomes a seed
+    itself is a property of that edge: targets are ``2 * row + (whether it does)``. With late
+    promotion it becomes one by the first edge of its region that says so; the region is then the
+    same in whatever order its seeds are taken.
+
+    Long queues are taken a level at a time: all edges of the waiting seeds in their order. This is
+    the order of the queue, exactly.
 
     Returns the head of each point's region, -1 where not valid.
     """
     codes = edges.targets
     starts = memoryview(edges.starts.data)
-    free = bytearray(valid.tobytes())
+    # Points that an edge may still claim or, once they are claimed, make a seed of their region.
+    pending = bytearray(valid.tobytes())
     heads = array("i", bytes(4 * len(valid)))
-    open_points = np.frombuffer(free, dtype=np.bool_)
+    pending_view = np.frombuffer(pending, dtype=np.bool_)
     heads_view = np.frombuffer(heads, dtype=np.int32)
     heads_view[:] = -1
     slots = np.empty(len(valid), dtype=np.int32)
+    shared = (pending_view, heads_view, slots, promotes_late)
     for head in order.tolist():
-        if not free[head]:
+        if heads[head] >= 0:
             continue
-        free[head] = 0
+        pending[head] = False
         heads[head] = head
         queue = [head]
         done = 0
@@ -214,18 +226,18 @@ def _grow_first_in_first_out(
             if len(queue) - done >= _LONG_QUEUE:
                 level = np.array(queue[done:], dtype=np.int32)
                 while len(level) >= _LONG_QUEUE:
-                    level = _claim_level(edges, level, head, open_points, heads_view, slots)
+                    level = _claim_level(edges, level, head, *shared)
                 queue, done = level.tolist(), 0
                 continue
             seed = queue[done]
             done += 1
             for code in codes[starts[seed] : starts[seed + 1]].tolist():
                 target = code >> 1
-                if free[target]:
-                    free[target] = 0
+                if pending[target] and heads[target] in (-1, head):
                     heads[target] = head
                     if code & 1:
                         queue.append(target)
+                    pending[target] = promotes_late and not code & 1
     return heads_view
 
 
@@ -233,9 +245,10 @@ def _claim_level(
     edges: EdgeLists,
     level: NDArray[np.int32],
     head: int,
-    open_points: NDArray[np.bool_],
+    pending: NDArray[np.bool_],
     heads: NDArray[np.int32],
     slots: NDArray[np.int32],
+    promotes_late: bool,
 ) -> NDArray[np.int32]:
     """Let a level of seeds claim points, and return the seeds among them in queue order."""
     starts = edges.starts[level]
@@ -244,14 +257,20 @@ def _claim_level(
     places = np.repeat(starts - ends + counts, counts)
     places += np.arange(len(places), dtype=places.dtype)
     codes = edges.targets[places]
-    codes = codes[open_points[codes >> 1]]
+    codes = codes[pending[codes >> 1]]
+    if promotes_late:
+        owners = heads[codes >> 1]
+        codes = codes[(owners < 0) | (owners == head)]
+        # An edge that makes a seed comes before all that do not.
+        makes_seed = (codes & 1).astype(bool)
+        codes = np.concatenate([codes[makes_seed], codes[~makes_seed]])
     targets = codes >> 1
     numbers = np.arange(len(targets), dtype=np.int32)
     # Of several writes to one place the last one stays: in reverse, the first edge to a point.
     slots[targets[::-1]] = numbers[::-1]
     first = slots[targets] == numbers
     codes, targets = codes[first], targets[first]
-    open_points[targets] = False
-    heads[targets] = head
     seeds: NDArray[np.int32] = targets[(codes & 1).astype(bool)]
+    pending[seeds if promotes_late else targets] = False
+    heads[targets] = head
     return seeds
