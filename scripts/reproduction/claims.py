@@ -50,8 +50,8 @@ def segmentation_claims(
         _sphere_order(sphere, dvi_remark),
         *_edge_claims(usual),
         _smoother_tutorial(scores),
-        *([_five_degrees(angles)] if "ari" in angles["cory"]["5"] else []),
-        _curved(scores),
+        _five_degrees(angles),
+        *([_curved(scores["curved"])] if "curved" in scores else []),
         _small(usual),
         *(_rise("beyond", name, form, take, hard) for name, form, take in _RISING[:2]),
         *(_consensus_ahead(name, form, take, scores) for name, form, take in _AHEAD),
@@ -183,11 +183,11 @@ def _five_degrees(angles: Mapping[str, Record]) -> Block:
     return claim("IV, Figure 9", "The desired segmentation comes at 5 degrees.", found)
 
 
-def _curved(scores: Scores) -> Block:
+def _curved(scores: Mapping[str, Record]) -> Block:
     """Return whether curved surfaces are found as well as planes."""
     found = {}
     for method in ("paper", "consensus"):
-        faces = scores["curved"][method]["faces"]
+        faces = scores[method]["faces"]
         curved, flat = faces["found_curved"], faces["found_flat"]
         holds = curved is not None and curved >= flat
         numbers = f"{curved or 0:.2f} of curved and {flat:.2f} of plane faces found"
@@ -224,7 +224,5 @@ def _consensus_ahead(
     return claim(
         "beyond",
         f"The paper's method < consensus by {name}.",
-        _each(
-            scores, lambda found: rising([take(found[m]) for m in ("paper", "consensus")], form)
-        ),
+        _each(scores, lambda found: rising([take(found[m]) for m in ("paper", "consensus")], form)),
     )

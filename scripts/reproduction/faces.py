@@ -104,9 +104,7 @@ def find_edges(truth: Tensor, neighbors: Neighbors) -> Tensor:
     """Return the points of a face that have one of another among their neighbours, ``(N,)``."""
     crossed = [
         ((truth[some.long()] != own[:, None]) & (truth[some.long()] != UNLABELED)).any(dim=1)
-        for some, own in zip(
-            neighbors.indices.split(_CHUNK), truth.split(_CHUNK), strict=True
-        )
+        for some, own in zip(neighbors.indices.split(_CHUNK), truth.split(_CHUNK), strict=True)
     ]
     return torch.cat(crossed) & (truth != UNLABELED)
 

@@ -1,6 +1,7 @@
 """What a part of the report consists of: texts, tables, figures and claims; ready for JSON."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 Block = dict[str, Any]
@@ -60,7 +61,10 @@ def verdict(block: Block) -> str:
 
 
 def section(
-    title: str, blocks: Sequence[Block], records: Any, claims: Sequence[Block] = ()  # noqa: ANN401
+    title: str,
+    blocks: Sequence[Block],
+    records: Any,  # noqa: ANN401
+    claims: Sequence[Block] = (),
 ) -> dict[str, Any]:
     """Return a part of the report, with the records that it was made from."""
     return {"title": title, "blocks": list(blocks), "claims": list(claims), "records": records}
@@ -76,7 +80,7 @@ def rising(values: Iterable[float | None], form: str) -> tuple[bool, str]:
     values = list(values)
     if None in values:
         return False, ", ".join("-" if value is None else format(value, form) for value in values)
-    ordered = all(low < high for low, high in zip(values, values[1:], strict=False))
+    ordered = all(low < high for low, high in pairwise(values))
     return ordered, (" < " if ordered else ", ").join(format(value, form) for value in values)
 
 

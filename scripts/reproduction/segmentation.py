@@ -118,9 +118,7 @@ def index_table(run: Run, key: str, found: dict[str, Record]) -> Block:
     return table(title, ["method", *COLUMNS], zip(titles(found), *columns, strict=True))
 
 
-def sphere_table(
-    run: Run, key: str, sphere: dict[str, Record], scores: dict[str, Record]
-) -> Block:
+def sphere_table(run: Run, key: str, sphere: dict[str, Record], scores: dict[str, Record]) -> Block:
     """Return Table 2 for one cloud: the paper's numbers, then ours."""
     rows = []
     for place, name in enumerate(INDEX_NAMES):
@@ -158,9 +156,7 @@ def _external(record: Record, name: str) -> float | None:
 def draw_figures(run: Run, key: str, number: str) -> list[Block]:
     """Return the figures of a cloud: methods side by side, and with truth what is wrong."""
     cloud = run.cloud(key).cloud
-    labelings = {
-        METHODS[method].title: read_segmented(run, key, method).labels for method in DRAWN
-    }
+    labelings = {METHODS[method].title: read_segmented(run, key, method).labels for method in DRAWN}
     name = f"{number.lower().replace(' ', '')}_{key}"
     file = draw_side_by_side(run.folder, name, cloud, labelings)
     blocks = [figure(file, f"**{number}**, {cloud.origin}. Points of no region are gray.")]
@@ -191,17 +187,17 @@ def _angles(run: Run, key: str) -> Record:
             if cloud.labels is not None:
                 ari = adjusted_rand_index(contingency_table(labels, cloud.labels))
                 found[f"{angle:g}"]["ari"] = ari
-        return found
+        return {"angles": found}
 
-    return run.folder.cell(f"angles-{cloud.name}", work)
+    record: Record = run.folder.cell(f"angles-{cloud.name}", work)["angles"]
+    return record
 
 
 def angle_blocks(run: Run, key: str, found: Record) -> list[Block]:
     """Return picture and table of the paper's method at several angles."""
     cloud = run.cloud(key).cloud
     labelings = {
-        f"paper, {angle:g} degrees": regrow(run, key, "paper", angle, 0.95)
-        for angle in ANGLES_DEG
+        f"paper, {angle:g} degrees": regrow(run, key, "paper", angle, 0.95) for angle in ANGLES_DEG
     }
     file = draw_side_by_side(
         run.folder, f"figure9_{key}_angles", cloud, labelings, with_input=False

@@ -98,8 +98,8 @@ def _claims(records: list[Record]) -> list[Block]:
         largest[title] = (high["largest"] > middle["largest"], " < ".join(shares))
     return [
         claim("II.B", "The 95th and 98th percentiles give nearly identical segments.", alike),
-        claim("II.B", "At 2 degrees too little is joined: fewer points labelled than at 5.", joined),
-        claim("II.B", "At 8 degrees too much is joined: a larger largest region than at 5.", largest),
+        claim("II.B", "At 2 degrees fewer points are labelled than at 5.", joined),
+        claim("II.B", "At 8 degrees the largest region is larger than at 5.", largest),
     ]
 
 
