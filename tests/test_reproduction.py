@@ -29,7 +29,7 @@ def normals(monkeypatch):
     from reproduction import normal_figures, normals
 
     small = (
-        normals.Grid(60, ("cuboid", "dodecahedron"), (0.25,), (0, 1), VARIANTS),
+        normals.Grid(60, ("cuboid", "dodecahedron"), (0.25,), (0,), VARIANTS),
         normals.Grid(60, ("octahedron",), (0.25,), (0,), VARIANTS),
     )
     monkeypatch.setattr(normals, "QUICK", small)
@@ -42,14 +42,18 @@ def normals(monkeypatch):
 @pytest.fixture
 def small(monkeypatch, normals):
     """Everything small: clouds of a thousand points, pictures of some pixels."""
-    from reproduction import clouds, pictures, runs, study
+    from reproduction import clouds, faces, pictures, runs, study
 
     room = make_room(600)
     made = {key: (lambda quick: room, "a small room") for key in clouds.MADE}
     monkeypatch.setattr(clouds, "MADE", made)
-    for table, keys in ((clouds.OTHERS, clouds.OTHERS), (clouds.HARD, {"exact", "quantised"})):
+    for table, keys in (
+        (clouds.OTHERS, clouds.OTHERS),
+        (clouds.HARD, {"exact", "quantised", "thinned"}),
+    ):
         for key in tuple(keys):
             monkeypatch.delitem(table, key)
+    monkeypatch.setattr(faces, "LARGE", 30)
     monkeypatch.setattr(pictures, "_WIDTH", 60)
     monkeypatch.setattr(runs, "_WARM_UP", 50)
     monkeypatch.setattr(study, "ANGLES_DEG", (2.0, 5.0, 8.0))

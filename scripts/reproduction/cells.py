@@ -1,5 +1,6 @@
 """A folder of results, each computed once."""
 
+import functools
 import json
 import os
 import platform
@@ -65,6 +66,7 @@ class Folder:
         return target
 
 
+@functools.cache
 def surroundings() -> Record:
     """Return versions, commit, processor and threads: what a time depends on."""
     here = Path(__file__).parent

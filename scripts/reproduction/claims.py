@@ -188,15 +188,14 @@ def _curved(scores: Mapping[str, Record]) -> Block:
     found = {}
     for method in ("paper", "consensus"):
         faces = scores[method]["faces"]
-        curved, flat = faces["found_curved"], faces["found_flat"]
-        holds = curved is not None and curved >= flat
-        numbers = f"{curved or 0:.2f} of curved and {flat:.2f} of plane faces found"
-        found[METHODS[method].title] = (holds, numbers)
+        order, numbers = rising([faces["found_flat"], faces["found_curved"]], ".2f")
+        found[METHODS[method].title] = (order, numbers)
     return claim(
         "IV, V",
         "Regular curved surfaces are segmented as properly as planes.",
         found,
-        f"Faces of {LARGE:,} points and more of {title_of('curved')}, at IoU 0.5.",
+        f"Shares of the plane and of the curved faces of {LARGE:,} points and more of "
+        f"{title_of('curved')} that are found at IoU 0.5.",
     )
 
 
@@ -205,15 +204,14 @@ def _small(scores: Scores) -> Block:
 
     def lost(found: Mapping[str, Record]) -> tuple[bool, str]:
         faces = found["paper"]["faces"]
-        small, large = faces["found_small"], faces["found_large"]
-        holds = small is not None and small < large
-        return holds, f"{small or 0:.2f} of small and {large:.2f} of large faces found"
+        return rising([faces["found_small"], faces["found_large"]], ".2f")
 
     return claim(
         "V",
         "The paper's method cannot segment small objects.",
         _each(scores, lost),
-        f"Small: fewer than {LARGE:,} points; found: at IoU 0.5.",
+        f"Shares of the faces of fewer than {LARGE:,} points, and of the others, that are found at "
+        "IoU 0.5.",
     )
 
 

@@ -43,14 +43,13 @@ def reproduce(run: Run) -> Record:
             "percentiles nearly identical, too little joined at 2 degrees and too much at 8, and "
             f"gives no numbers. Here: {cloud.origin}; normals stay, growth changes."
         ),
-        *_claims(records),
         figure(
             "figures/study.png", "Section II.B: lines at the 95th, dots at the 98th percentile."
         ),
         figure(picture, "The paper's method at several angles, 95th percentile."),
         _table(records),
     ]
-    return section("Section II.B: the limits of growth", blocks, records)
+    return section("Section II.B: the limits of growth", blocks, records, _claims(records))
 
 
 def _labels(run: Run, method: str, angle: float, quantile: float = QUANTILES[0]) -> Tensor:
