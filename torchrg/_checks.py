@@ -1,12 +1,12 @@
 """Argument checks that never read tensor values, so they cost no device synchronisation."""
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 
 
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
@@ -29,6 +29,27 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
         return torch.from_numpy(np.require(native, requirements=["C", "W"]))
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
     raise ShapeError(f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}.")
+
+
+def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
+    """Check that settings are among the choices of their ``Literal`` types.
+
+    Arguments are a value and its type by name, as in ``x=(x, Literal["a", "b"])``.
+
+    Raises:
+        ConfigError: If one is not.
+
+    Example:
+        >>> from typing import Literal
+        >>> check_choices("f", rule=("half", Literal["all", "none"]))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ConfigError: f: expected rule to be one of all, none, got 'half'.
+    """
+    for name, (value, kind) in arguments.items():
+        if value not in get_args(kind):
+            known = ", ".join(get_args(kind))
+            raise ConfigError(f"{caller}: expected {name} to be one of {known}, got {value!r}.")
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:

@@ -33,7 +33,14 @@ class NormalsConfig:
     sharp_angle_deg: float = 5.0
     """A point is sharp when its rule gives more than this angle."""
     support_fraction: float = 0.5
-    """Share of the neighbours that the MCD fits, in [0.5, 1]; 0.5 resists most outliers."""
+    """Share of the neighbours that the MCD fits, in [0.5, 1]: 0.5 resists most outliers, 0.75 is
+    the default of LIBRA, MATLAB's DetMCD."""
+    mcd_scaling: Literal["consistency", "quantile"] = "consistency"
+    """What DetMCD multiplies its raw scatter by: the factor for normal points, or one by which its
+    h-th smallest squared distance is the chi-square quantile of h of k (LIBRA)."""
+    mcd_inliers: Literal["raw", "reweighted"] = "raw"
+    """Distances of DetMCD that are cut: those to the raw fit, or those to the reweighted one
+    (LIBRA)."""
     inlier_quantile: float = 0.975
     """Neighbours within this chi-square quantile of the robust fit are inliers."""
     adaptive_k: int | None = None

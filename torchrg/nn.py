@@ -11,6 +11,7 @@ from torchrg.linalg import covariance, eigh3
 from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, qn
 from torchrg.robust.mm import Target
 from torchrg.robust.starts import Starts
+from torchrg.robust.weights import Inliers, Scaling
 
 
 @dataclass(eq=False, repr=False)
@@ -95,6 +96,8 @@ class DetMCD(_Function):
     quantile: float = 0.975
     starts: Starts = "paper"
     small_sample: bool = False
+    scaling: Scaling = "consistency"
+    inliers: Inliers = "raw"
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""

@@ -7,6 +7,9 @@ import torch
 
 FRACTIONS = {"50": 0.5, "75": 0.75}
 
+# What MATLAB's LIBRA calls DetMCD, but for what it trusts by default (0.75).
+LIBRA = {"scaling": "quantile", "inliers": "reweighted"}
+
 # Listed in the notes beside the reference values: QR tolerance, false exact fits, cut iterations.
 WRONG_RRCOV = {"planar_very_fine", "planar_tilt__aniso_units"}
 

@@ -5,11 +5,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchrg
-from tests.robust.oracle_cases import angle_deg, fit_all, load_oracles, local_float32, normal_of
+from tests.robust.oracle_cases import (
+    LIBRA,
+    angle_deg,
+    fit_all,
+    load_oracles,
+    local_float32,
+    normal_of,
+)
 from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
 
 ESTIMATORS = {
     "paper": fit_detmcd,
+    "libra": lambda patches, **k: fit_detmcd(patches, **LIBRA, **k),
     "planes": lambda patches, **k: fit_detmcd(patches, starts="planes", **k),
     "more": lambda patches, **k: fit_detmcd(patches, starts="more", **k),
     "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=20, **k),

@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 
 from tests.robust.oracle_cases import (
     FLAT_IN_FLOAT32,
     FRACTIONS,
+    LIBRA,
     angle_deg,
     fit_all,
     load_oracles,
@@ -16,6 +18,9 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.robust import fit_detmcd
 from torchrg.robust.starts import _score_table
 from torchrg.robust.weights import consistency_factor, small_sample_factor, subset_size
+
+CUTOFF = 9.348403604496148
+"""Quantile 0.975 of the chi-square distribution of 3 degrees."""
 
 
 def regular_fits(patches, cases, answers, key, **settings):
@@ -83,6 +88,70 @@ def test_robustbase_variant_agrees_with_robustbase(oracles_folder):
         assert_close(fit.covariance.numpy() / factor, expected, 1e-8, name)
         seen += 1
     assert seen > 110
+
+
+def test_final_flags_and_distances_are_those_of_robustbase(oracles_folder):
+    patches, cases, robustbase = load_oracles(oracles_folder, "r_robustbase")
+    seen = 0
+    settings = {"starts": "robustbase", "small_sample": True, "inliers": "reweighted"}
+    for name, fraction, fit, answer in regular_fits(
+        patches, cases, robustbase, "detmcd_{}", **settings
+    ):
+        if len(fit.support) <= 6:
+            continue  # its factor for few points is negative or above a hundred
+        factor = 1
+        if not all(answer["raw_weights"]):
+            factor = consistency_factor(0.975, 3)
+            factor *= small_sample_factor(len(fit.support), 3, fraction, reweighted=True)
+        # Its covariance has another factor since that version; without factors they agree.
+        expected = np.asarray(answer["mah"]) * np.prod(answer["cnp2"]) / factor
+        # They invert matrices: those of thin patches and far origins lose digits.
+        tolerance = 1e-4 if name.endswith("utm") else 1e-6
+        np.testing.assert_allclose(fit.sq_distances, expected, rtol=tolerance, err_msg=name)
+        assert points_of(fit.support) == set(np.flatnonzero(expected < CUTOFF)), name
+        seen += 1
+    assert seen > 110
+
+
+def libra(points, best):
+    """DetMCD.m of LIBRA from its best set on: raw scatter, and location, scatter, flags, rd^2."""
+    n, h = len(points), len(best)
+
+    def squared(center, scatter):
+        offset = points - center
+        return np.einsum("ij,jk,ik->i", offset, np.linalg.inv(scatter), offset)
+
+    center, scatter = points[best].mean(axis=0), np.cov(points[best].T)
+    raw = scatter * np.sort(squared(center, scatter))[h - 1] / chi2.ppf(h / n, 3)
+    weights = squared(center, raw) <= chi2.ppf(0.975, 3)
+    center, scatter = points[weights].mean(axis=0), np.cov(points[weights].T)
+    distances = squared(center, scatter)
+    return raw, center, scatter, distances <= chi2.ppf(0.975, 3), distances
+
+
+def test_libra_variant_is_what_its_formulas_give(oracles_folder):
+    patches, cases, ours = load_oracles(oracles_folder, "ref_numpy")
+    seen = 0
+    for name, _, fit, answer in regular_fits(patches, cases, ours, "detmcd_paper_{}", **LIBRA):
+        if name.endswith("aniso_units") or cases[name]["n"] < 10:
+            continue
+        points = patches[name] - patches[name][0]
+        raw, center, scatter, flags, distances = libra(points, answer["best"])
+        assert_close(fit.raw_covariance.numpy(), raw, 1e-6, name)
+        assert_close(fit.covariance.numpy(), scatter, 1e-8, name)
+        np.testing.assert_allclose(
+            fit.location.numpy() - patches[name][0], center, atol=1e-8, err_msg=name
+        )
+        np.testing.assert_allclose(fit.sq_distances, distances, rtol=1e-4, err_msg=name)
+        assert points_of(fit.support) == set(np.flatnonzero(flags)), name
+        seen += 1
+    assert seen > 100
+
+
+def test_scatter_of_all_points_is_not_scaled(rng):
+    patch = torch.randn(50, 3, generator=rng, dtype=torch.float64)
+    fit = fit_detmcd(patch, support_fraction=1.0, **LIBRA)
+    torch.testing.assert_close(fit.raw_covariance, patch.T.cov())
 
 
 @pytest.mark.parametrize("starts", ["robustbase", "paper"])
@@ -168,7 +237,7 @@ def test_long_patches_use_tau(rng):
 def test_distances_decide_the_support(rng):
     patches = torch.randn(30, 50, 3, generator=rng, dtype=torch.float64)
     fit = fit_detmcd(patches)
-    assert torch.equal(fit.support, fit.sq_distances <= 9.348403604496148)
+    assert torch.equal(fit.support, fit.sq_distances <= CUTOFF)
     offset = patches - fit.raw_location[:, None]
     expected = (offset @ torch.linalg.inv(fit.raw_covariance) * offset).sum(-1)
     torch.testing.assert_close(fit.sq_distances, expected)
@@ -203,5 +272,11 @@ def test_refusals():
         fit_detmcd(patch, starts="six")
     with pytest.raises(ConfigError, match=r"expected quantile above 0 and below 1, got 1"):
         fit_detmcd(patch, quantile=1)
+    with pytest.raises(ConfigError, match="expected scaling to be one of consistency, quantile"):
+        fit_detmcd(patch, scaling="median")
+    with pytest.raises(ConfigError, match="expected inliers to be one of raw, reweighted"):
+        fit_detmcd(patch, inliers="final")
+    with pytest.raises(ConfigError, match="expected small_sample off with scaling='quantile'"):
+        fit_detmcd(patch, small_sample=True, scaling="quantile")
     with pytest.raises(ConfigError, match="expected points of 3 coordinates"):
         fit_detmcd(torch.randn(50, 2), small_sample=True)

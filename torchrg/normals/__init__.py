@@ -38,6 +38,7 @@ __all__ = [
 ]
 
 _MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
+_DETMCD = _MCD | {"scaling": "mcd_scaling", "inliers": "mcd_inliers"}
 
 ESTIMATORS: dict[str, Estimator] = {
     "pca": at_all_points(fit_normals_pca),
@@ -45,7 +46,7 @@ ESTIMATORS: dict[str, Estimator] = {
     "irls": estimate_irls,
     "fastmcd": at_all_points(partial(fit_normals_robust, estimator=fit_fastmcd), **_MCD),
     "mve": at_all_points(partial(fit_normals_robust, estimator=fit_mve), **_MCD),
-    "detmcd": at_all_points(partial(fit_normals_robust, estimator=fit_detmcd), **_MCD),
+    "detmcd": at_all_points(partial(fit_normals_robust, estimator=fit_detmcd), **_DETMCD),
     "detmm": at_all_points(
         partial(fit_normals_robust, estimator=fit_detmm), quantile="inlier_quantile"
     ),

@@ -121,6 +121,8 @@ def estimate_paper(
         fit_normals_robust,
         support_fraction=config.support_fraction,
         quantile=config.inlier_quantile,
+        scaling=config.mcd_scaling,
+        inliers=config.mcd_inliers,
     )
     refined = fit_points(points, neighbors, robust, rows=rows, chunk_size=chunk_size)
     return replace_rows(fit, rows, refined)._replace(sharp=sharp)

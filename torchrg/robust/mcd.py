@@ -6,9 +6,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._checks import check_choices
 from torchrg._parallel import chunks_of
 from torchrg.errors import ConfigError
 from torchrg.robust.lanes import (
+    Ellipsoid,
     covariance_entries,
     determinant,
     fit_ellipsoid,
@@ -20,12 +22,21 @@ from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise
 from torchrg.robust.scale import sum_points
 from torchrg.robust.starts import (
     Starts,
-    check_starts,
     draw_seed,
     elemental_sets,
     initial_sets,
 )
-from torchrg.robust.weights import Estimate, consistency_factor, reweight, small_sample_factor
+from torchrg.robust.weights import (
+    Estimate,
+    Inliers,
+    Scaling,
+    consistency_factor,
+    distances_to_support,
+    quantile_factor,
+    reweight,
+    small_sample_factor,
+    within_quantile,
+)
 
 _MAX_STEPS = 100
 """Concentration steps after which tied points that follow each other are left as they are."""
@@ -39,6 +50,16 @@ where they are many."""
 
 _DIGITS = 24
 """Points whose membership one number holds exactly, as a binary digit each."""
+
+
+class _Settings(NamedTuple):
+    """How much is trusted, and how the raw fit becomes the final one: see :func:`fit_detmcd`."""
+
+    support_fraction: float
+    quantile: float
+    small_sample: bool
+    scaling: Scaling = "consistency"
+    inliers: Inliers = "raw"
 
 
 class _Concentrated(NamedTuple):
@@ -60,6 +81,8 @@ def fit_detmcd(
     quantile: float = 0.975,
     starts: Starts = "paper",
     small_sample: bool = False,
+    scaling: Scaling = "consistency",
+    inliers: Inliers = "raw",
     chunk_size: int = PATCHES_IN_CACHE,
 ) -> RobustFit:
     r"""Fit location and scatter to the majority of each patch by the deterministic MCD.
@@ -74,6 +97,12 @@ def fit_detmcd(
         initial sets is a choice of its own, because it alone changes the final set of every third
         small patch. The factors for small samples are off, because a normal does not depend on
         them: they only widen the cut-off (by 19 % at K = 50).
+
+        What else is called DetMCD differs in four settings. R's robustbase [2]:
+        ``starts="robustbase"``, ``small_sample=True``, and ``inliers="reweighted"`` for its
+        ``mcd.wt`` after reweighting (robustbase since 0.99-0). MATLAB's LIBRA [3]:
+        ``support_fraction=0.75``, ``scaling="quantile"``, ``inliers="reweighted"``; it stops at
+        exact fits.
 
         The published starts use the coordinate axes: turning a patch changes the final set of
         every second one, and a compact minority can draw all six. On made patches near edges of 90
@@ -92,6 +121,14 @@ def fit_detmcd(
             through P points; a third of the cost, no rotation changes it, and it withstands
             clusters. ``"more"``: these, and the published six in the patch's own axes.
         small_sample: Apply the factors for small samples (P = 3 only). They widen the cut-off.
+        scaling: What the scatters are multiplied by. ``"consistency"``: the factors that make them
+            consistent for normal points. ``"quantile"``: the raw one by ``d2_(h) / chi2inv(h/n)``,
+            the h-th smallest squared distance to it over the quantile that it should be, the final
+            one by nothing. This follows the patch: the cut-off is wider the less the h points
+            look like the inner part of normal ones. Nothing where h is all points.
+        inliers: Which distances are cut. ``"raw"``: those to the raw fit. ``"reweighted"``: these
+            first, then those to location and covariance of what is left, which become
+            ``sq_distances``; location and covariance stay.
         chunk_size: Patches worked on together.
 
     Returns:
@@ -100,6 +137,9 @@ def fit_detmcd(
     References:
         [1] M. Hubert, P. J. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location
         and scatter. Journal of Computational and Graphical Statistics 21, 2012.
+        [2] M. Maechler et al. robustbase: Basic Robust Statistics. R package, ``covMcd``.
+        [3] S. Verboven, M. Hubert. LIBRA: a MATLAB library for robust analysis. Chemometrics and
+        Intelligent Laboratory Systems 75, 2005; ``DetMCD.m`` of 2011.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(5.0), torch.arange(5.0))
@@ -108,7 +148,17 @@ def fit_detmcd(
         >>> fit.exact_fit.item(), fit.support.sum().item()
         (True, 25)
     """
-    check_starts("fit_detmcd", starts)
+    check_choices(
+        "fit_detmcd",
+        starts=(starts, Starts),
+        scaling=(scaling, Scaling),
+        inliers=(inliers, Inliers),
+    )
+    if small_sample and scaling == "quantile":
+        raise ConfigError(
+            "fit_detmcd: expected small_sample off with scaling='quantile', which has no such "
+            "factors, got True."
+        )
 
     def search(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
         parts = [
@@ -118,9 +168,8 @@ def fit_detmcd(
         members, determinants = zip(*parts, strict=True)
         return _Concentrated(torch.cat(members, dim=1), torch.cat(determinants))
 
-    return _fit_mcd(
-        "fit_detmcd", patches, mask, support_fraction, quantile, chunk_size, search, small_sample
-    )
+    settings = _Settings(support_fraction, quantile, small_sample, scaling, inliers)
+    return _fit_mcd("fit_detmcd", patches, mask, settings, chunk_size, search)
 
 
 def fit_fastmcd(
@@ -178,20 +227,17 @@ def fit_fastmcd(
         quick = _concentrate(columns, initial, num_coordinates + 1, size, floor, max_steps=1)
         return _concentrate(columns, _distinct_best(quick, _NUM_KEPT), size, size, floor)
 
-    return _fit_mcd(
-        "fit_fastmcd", patches, mask, support_fraction, quantile, chunk_size, search, small_sample
-    )
+    settings = _Settings(support_fraction, quantile, small_sample)
+    return _fit_mcd("fit_fastmcd", patches, mask, settings, chunk_size, search)
 
 
 def _fit_mcd(
     caller: str,
     patches: Tensor,
     mask: Tensor | None,
-    support_fraction: float,
-    quantile: float,
+    settings: _Settings,
     chunk_size: int,
     search: Callable[[list[Tensor], Tensor, int], _Concentrated],
-    small_sample: bool,
 ) -> RobustFit:
     """Take the best set that a search finds as raw fit, and reweight by the distances to it."""
 
@@ -199,27 +245,52 @@ def _fit_mcd(
         sets = search(columns, floor, size)
         best = sets.determinants.argmin(dim=0)
         members = sets.members.gather(1, best.expand(len(sets.members), 1, -1)).squeeze(1)
-        num_points, num_coordinates = len(members), len(columns)
-        raw_factor = consistency_factor(size / num_points, num_coordinates)
-        final_factor = 1.0
-        if small_sample:
-            known = (num_points, num_coordinates, support_fraction)
-            raw_factor *= small_sample_factor(*known, reweighted=False)
-            final_factor = small_sample_factor(*known, reweighted=True)
         ellipsoid = fit_ellipsoid(columns, members, size, floor)
+        raw_factor, factor = _factors(ellipsoid, size, settings)
         distances = sq_distances(ellipsoid, (size - 1) / raw_factor)
         covariance = covariance_entries(columns, ellipsoid.means, members, size - 1)
+        location, final, support = reweight(columns, distances, settings.quantile, factor)
+        if settings.inliers == "reweighted":
+            distances = distances_to_support(columns, support, factor, floor)
+            support = within_quantile(distances, settings.quantile, len(columns)) > 0
         return Estimate(
-            *reweight(columns, distances, quantile, final_factor),
+            location,
+            final,
+            support,
             sq_distances=distances,
             raw_location=torch.stack(ellipsoid.means, dim=-1),
-            raw_covariance=covariance * raw_factor,
+            raw_covariance=covariance * raw_factor[:, None, None],
             raw_support=members > 0,
             objective=sets.determinants.gather(0, best[None]).squeeze(0),
             singular=ellipsoid.singular,
         )
 
-    return fit_patchwise(caller, patches, mask, support_fraction, quantile, chunk_size, estimator)
+    return fit_patchwise(
+        caller,
+        patches,
+        mask,
+        settings.support_fraction,
+        settings.quantile,
+        chunk_size,
+        estimator,
+    )
+
+
+def _factors(ellipsoid: Ellipsoid, size: int, settings: _Settings) -> tuple[Tensor, float]:
+    """Return what the raw scatter ``(M,)`` and the final one are multiplied by."""
+    num_points, num_coordinates = len(ellipsoid.residuals[0]), len(ellipsoid.residuals)
+    if settings.scaling == "quantile":
+        if size == num_points:
+            return torch.ones_like(ellipsoid.squares[0]), 1.0
+        distances = sq_distances(ellipsoid, size - 1)
+        return quantile_factor(distances, size, num_coordinates), 1.0
+    raw = consistency_factor(size / num_points, num_coordinates)
+    final = consistency_factor(settings.quantile, num_coordinates)
+    if settings.small_sample:
+        known = (num_points, num_coordinates, settings.support_fraction)
+        raw *= small_sample_factor(*known, reweighted=False)
+        final *= small_sample_factor(*known, reweighted=True)
+    return torch.full_like(ellipsoid.squares[0], raw), final
 
 
 def _distinct_best(sets: _Concentrated, number: int) -> Tensor:

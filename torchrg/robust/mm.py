@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg._checks import check_choices
 from torchrg.errors import ConfigError
 from torchrg.linalg import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
@@ -24,7 +25,7 @@ from torchrg.robust.lanes import (
 )
 from torchrg.robust.patches import RobustFit, fit_patchwise
 from torchrg.robust.scale import half_size, sum_points
-from torchrg.robust.starts import Starts, check_starts, initial_sets
+from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
@@ -94,7 +95,7 @@ def fit_dets(
         >>> fit_dets(points).support[:20].any().item()
         False
     """
-    check_starts("fit_dets", starts)
+    check_choices("fit_dets", starts=(starts, Starts))
 
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         shape, scale = _best_s_estimate(columns, floor, size, starts)
@@ -144,7 +145,7 @@ def fit_detmm(
         >>> fit_detmm(points).support[:20].any().item()
         False
     """
-    check_starts("fit_detmm", starts)
+    check_choices("fit_detmm", starts=(starts, Starts))
     if tuned_for not in ("shape", "location"):
         raise ConfigError(
             f"fit_detmm: expected tuned_for to be shape or location, got {tuned_for!r}."

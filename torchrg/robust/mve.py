@@ -16,7 +16,13 @@ from torchrg.robust.lanes import (
 )
 from torchrg.robust.patches import RobustFit, fit_patchwise
 from torchrg.robust.starts import draw_seed, elemental_sets
-from torchrg.robust.weights import Estimate, chi2_quantile, reweight
+from torchrg.robust.weights import (
+    Estimate,
+    chi2_quantile,
+    consistency_factor,
+    quantile_factor,
+    reweight,
+)
 
 _LANES_AT_ONCE = 1024
 """Sets times patches worked on together: what they need fits the cache."""
@@ -79,13 +85,13 @@ def fit_mve(
         ellipsoid = fit_ellipsoid(columns, weights, corners, floor)
         distances = sq_distances(ellipsoid, num_coordinates)
         covered = smallest_points(distances, size)
-        reach = sorted_points(distances)[:, size - 1]
         if size < num_points:
-            factor = reach / chi2_quantile(size / num_points, num_coordinates)
+            factor = quantile_factor(distances, size, num_coordinates)
         else:
-            factor = reach / chi2_quantile(quantile, num_coordinates)
+            factor = distances.amax(dim=0) / chi2_quantile(quantile, num_coordinates)
         distances = distances / factor
-        final = reweight(columns, distances, quantile)
+        final_factor = consistency_factor(quantile, num_coordinates)
+        final = reweight(columns, distances, quantile, final_factor)
         covariance = covariance_entries(columns, ellipsoid.means, weights, num_coordinates)
         return Estimate(
             *final,

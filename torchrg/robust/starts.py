@@ -4,13 +4,12 @@ from functools import lru_cache
 from itertools import combinations
 from math import comb
 from statistics import NormalDist
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.errors import ConfigError
 from torchrg.linalg import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
@@ -46,13 +45,6 @@ _NUM_PLANE_STARTS = 4
 
 _PLANES_AT_ONCE = 8
 """Planes worked on together: what they need fits the cache."""
-
-
-def check_starts(caller: str, starts: str) -> None:
-    """Raise if there are no such starts."""
-    if starts not in get_args(Starts):
-        known = ", ".join(get_args(Starts))
-        raise ConfigError(f"{caller}: expected starts to be one of {known}, got {starts!r}.")
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:

@@ -1,15 +1,23 @@
 """From a raw fit to the final one: h, cut-offs, correction factors, and the reweighted scatter."""
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most
-from torchrg.robust.lanes import covariance_entries
+from torchrg.robust.lanes import (
+    covariance_entries,
+    fit_ellipsoid,
+    sorted_points,
+    sq_distances,
+)
 from torchrg.robust.scale import sum_points
+
+Scaling = Literal["consistency", "quantile"]
+Inliers = Literal["raw", "reweighted"]
 
 
 def subset_size(num_points: int, num_coordinates: int, support_fraction: float) -> int:
@@ -96,21 +104,44 @@ class Estimate(NamedTuple):
     singular: Tensor
 
 
+def quantile_factor(distances: Tensor, size: int, num_coordinates: int) -> Tensor:
+    """Factor ``(M,)`` of a scatter that brings the h-th smallest distance to its quantile.
+
+    ``d2_(h) / chi2inv(h / n)`` of squared distances ``(K, M)``, h below n: of n normal points the
+    h-th smallest is about the quantile of level h / n.
+    """
+    reach = sorted_points(distances)[:, size - 1]
+    return reach / chi2_quantile(size / len(distances), num_coordinates)
+
+
+def within_quantile(distances: Tensor, quantile: float, num_coordinates: int) -> Tensor:
+    """Return 1 where squared distances ``(K, M)`` are within a chi-square quantile, 0 elsewhere."""
+    return at_most(distances, distances.new_tensor([chi2_quantile(quantile, num_coordinates)]))
+
+
 def reweight(
-    columns: list[Tensor], distances: Tensor, quantile: float, small_sample: float = 1.0
+    columns: list[Tensor], distances: Tensor, quantile: float, factor: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Take mean and covariance of the points within a chi-square quantile of a raw fit.
 
-    The covariance has its consistency factor, and neither that nor the small-sample factor where
-    no point is left out. Returns location, covariance and support, as in :class:`Estimate`.
+    The covariance is multiplied by the factor except where no point is left out. Returns location,
+    covariance and support, as in :class:`Estimate`.
     """
-    size = len(columns)
-    bound = distances.new_tensor([chi2_quantile(quantile, size)])
-    weights = at_most(distances, bound)
+    weights = within_quantile(distances, quantile, len(columns))
     count = sum_points(weights)
     means = [sum_points(weights * column) / count.clamp(min=1) for column in columns]
     covariance = covariance_entries(columns, means, weights, (count - 1).clamp(min=1))
-    factor = consistency_factor(quantile, size) * small_sample
     whole = count == len(distances)
     covariance = torch.where(whole[:, None, None], covariance, covariance * factor)
     return torch.stack(means, dim=-1), covariance, weights > 0
+
+
+def distances_to_support(
+    columns: list[Tensor], support: Tensor, factor: float, floor: Tensor
+) -> Tensor:
+    """Squared distances ``(K, M)`` to the mean and covariance that :func:`reweight` returned."""
+    weights = support.to(floor.dtype)
+    count = sum_points(weights)
+    ellipsoid = fit_ellipsoid(columns, weights, count.clamp(min=1), floor)
+    scale = torch.where(count == len(support), torch.ones_like(floor), factor)
+    return sq_distances(ellipsoid, (count - 1).clamp(min=1) / scale)
