@@ -28,7 +28,7 @@ from torchrg.neighbors.voxels import sample_voxels
 from torchrg.scenes import RoomLayout, Scene, build_room, make_room
 from torchrg.structures import UNLABELED
 
-QUICK_POINTS = 40_000
+QUICK_POINTS = 30_000
 """Most points of a file in a quick run."""
 
 SMALLEST = 50
@@ -177,7 +177,7 @@ _DISPARITY_SCALE = 525 * 0.075 * 8
 
 def _laser_hall(quick: bool) -> Scene:
     """Return a hallway as a laser scanner sees it, in the place of the tutorial's."""
-    layout, size = (_PIECE, 40_000) if quick else (_SHORT_HALL, POINTS["tutorial"])
+    layout, size = (_PIECE, 30_000) if quick else (_SHORT_HALL, POINTS["tutorial"])
     return scan_scene(build_room(2, layout=layout), size, noise=_NOISE)
 
 
@@ -187,7 +187,7 @@ def _quantised_room(quick: bool) -> Scene:
     frame = render_depth(model, cameras_around(model, 1)[0])
     steps = (_DISPARITY_SCALE / frame.depth).round()
     frame = frame._replace(depth=(_DISPARITY_SCALE / steps).where(frame.depth > 0, 0))
-    return fuse_frames(model, [frame], 40_000 if quick else 250_000)
+    return fuse_frames(model, [frame], 30_000 if quick else 250_000)
 
 
 def _thinned_room(quick: bool) -> Scene:
@@ -202,7 +202,7 @@ def _thinned_room(quick: bool) -> Scene:
 def _room(quick: bool, num_points: int = 1, noise: float = _NOISE) -> Scene:
     """Return a furnished room, with so many times the usual number of points."""
     if quick:
-        return make_room(60_000 * num_points, noise, layout=_OFFICE)
+        return make_room(30_000 * num_points, noise, layout=_OFFICE)
     return make_room(200_000 * num_points, noise)
 
 
@@ -210,7 +210,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     "tutorial": (_laser_hall, "a laser scan of a hallway with doors, noise 3 mm"),
     "hallway": (
         lambda quick: (
-            make_room(100_000, layout=_PIECE)
+            make_room(60_000, layout=_PIECE)
             if quick
             else make_room(POINTS["hallway"], layout=HALL_LAYOUT)
         ),
@@ -218,7 +218,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "cory": (
         lambda quick: (
-            make_storey(150_000, layout=StoreyLayout(rooms_per_side=2))
+            make_storey(80_000, layout=StoreyLayout(rooms_per_side=1))
             if quick
             else make_storey(POINTS["cory"])
         ),
@@ -226,14 +226,14 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "kinect": (
         lambda quick: (
-            make_kinect_room(80_000, num_frames=8) if quick else make_kinect_room(POINTS["kinect"])
+            make_kinect_room(40_000, num_frames=4) if quick else make_kinect_room(POINTS["kinect"])
         ),
         "an office from simulated depth frames with the noise of a Kinect",
     ),
     "room": (_room, "a furnished room, noise 3 mm"),
     "hall": (
         lambda quick: (
-            make_room(60_000, layout=_PIECE, seed=1)
+            make_room(30_000, layout=_PIECE, seed=1)
             if quick
             else make_room(300_000, layout=HALL_LAYOUT, seed=1)
         ),
@@ -246,7 +246,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "thinned": (_thinned_room, "a furnished room, noise 3 mm, one point of each voxel of 3 cm"),
     "curved": (
-        lambda quick: make_room(60_000 if quick else 250_000, layout=_CURVED),
+        lambda quick: make_room(40_000 if quick else 250_000, layout=_CURVED),
         "a small room with columns, balls, a lamp, a round table, a bent wall, noise 3 mm",
     ),
 }

@@ -176,43 +176,46 @@ def draw_figures(run: Run, key: str, number: str) -> list[Block]:
 
 
 def _angles(run: Run, key: str) -> Record:
-    """Return what the paper's method makes of a cloud at several angles of growth."""
+    """Draw what the paper's method makes of a cloud at several angles of growth, and score it."""
     cloud = run.cloud(key).cloud
 
     def work() -> Record:
-        found = {}
-        for angle in ANGLES_DEG:
-            labels = regrow(run, key, "paper", angle, 0.95)
-            found[f"{angle:g}"] = count_regions(labels)
-            if cloud.labels is not None:
-                ari = adjusted_rand_index(contingency_table(labels, cloud.labels))
-                found[f"{angle:g}"]["ari"] = ari
+        labelings = {f"{angle:g}": regrow(run, key, "paper", angle, 0.95) for angle in ANGLES_DEG}
+        titled = {f"paper, {angle} degrees": labels for angle, labels in labelings.items()}
+        draw_side_by_side(run.folder, _angles_name(key), cloud, titled, with_input=False)
+        found = {angle: count_regions(labels) for angle, labels in labelings.items()}
+        if cloud.labels is not None:
+            for angle, labels in labelings.items():
+                overlaps = contingency_table(labels, cloud.labels)
+                found[angle]["ari"] = adjusted_rand_index(overlaps)
         return {"angles": found}
 
-    record: Record = run.folder.cell(f"angles-{cloud.name}", work)["angles"]
+    picture = run.folder.path / f"figures/{_angles_name(key)}.png"
+    record: Record = run.folder.cell(f"angles-{cloud.name}", work, needs=picture)["angles"]
     return record
+
+
+def _angles_name(key: str) -> str:
+    """Return the name of a picture."""
+    return f"figure9_{key}_angles"
 
 
 def angle_blocks(run: Run, key: str, found: Record) -> list[Block]:
     """Return picture and table of the paper's method at several angles."""
-    cloud = run.cloud(key).cloud
-    labelings = {
-        f"paper, {angle:g} degrees": regrow(run, key, "paper", angle, 0.95) for angle in ANGLES_DEG
-    }
-    file = draw_side_by_side(
-        run.folder, f"figure9_{key}_angles", cloud, labelings, with_input=False
-    )
     rows = [
         [
-            f"{angle:g}",
-            f"{found[f'{angle:g}']['regions']:,}",
-            f"{100 * found[f'{angle:g}']['share_labeled']:.1f} %",
-            format(found[f"{angle:g}"].get("ari", float("nan")), ".3f"),
+            angle,
+            f"{one['regions']:,}",
+            f"{100 * one['share_labeled']:.1f} %",
+            f"{one['ari']:.3f}" if "ari" in one else "-",
         ]
-        for angle in ANGLES_DEG
+        for angle, one in found.items()
     ]
     caption = (
-        f"**Figure 9**, {cloud.origin}: the paper's method at several angles of growth. Normals "
-        "and sharp points are those of the preset, at 5 degrees."
+        f"**Figure 9**, {run.cloud(key).cloud.origin}: the paper's method at several angles of "
+        "growth. Normals and sharp points are those of the preset, at 5 degrees."
     )
-    return [figure(file, caption), table("", ["degrees", "regions", "labelled", "ARI"], rows)]
+    return [
+        figure(f"figures/{_angles_name(key)}.png", caption),
+        table("", ["degrees", "regions", "labelled", "ARI"], rows),
+    ]
