@@ -54,7 +54,8 @@ def segmentation_claims(
         *([_curved(scores["curved"])] if "curved" in scores else []),
         _small(usual),
         *(_rise("beyond", name, form, take, hard) for name, form, take in _RISING[:2]),
-        *(_consensus_ahead(name, form, take, scores) for name, form, take in _AHEAD),
+        *(_ahead("printed", "paper", *index, scores) for index in _RISING[:2]),
+        *(_ahead("paper", "consensus", *index, scores) for index in _AHEAD),
     ]
 
 
@@ -215,12 +216,17 @@ def _small(scores: Scores) -> Block:
     )
 
 
-def _consensus_ahead(
-    name: str, form: str, take: Callable[[Record], float | None], scores: Scores
+def _ahead(
+    low: str,
+    high: str,
+    name: str,
+    form: str,
+    take: Callable[[Record], float | None],
+    scores: Scores,
 ) -> Block:
-    """Return where consensus is ahead of the paper's method."""
+    """Return where a method is ahead of another one by an index."""
     return claim(
         "beyond",
-        f"The paper's method < consensus by {name}.",
-        _each(scores, lambda found: rising([take(found[m]) for m in ("paper", "consensus")], form)),
+        f"{METHODS[low].title} < {METHODS[high].title} by {name}.",
+        _each(scores, lambda found: rising([take(found[low]), take(found[high])], form)),
     )
