@@ -250,6 +250,7 @@ def test_colors_of_many_points_are_faces():
     colors = np.repeat(np.eye(3, dtype=np.uint8), (50, 49, 60), axis=0)
     faces = faces_of_colors(colors)
     assert len(faces[:50].unique()) == len(faces[99:].unique()) == 1
+    assert -1 not in (faces[0], faces[-1])
     assert faces[0] != faces[-1]
     assert faces[50:99].unique().tolist() == [-1]
 

@@ -163,9 +163,21 @@ def faces_of_colors(colors: NDArray[np.uint8]) -> Tensor:
 
 _SHORT_HALL = replace(HALL_LAYOUT, size=(10.0, 2.4, 2.7), num_doors=5, num_cabinets=1, num_panels=2)
 _PIECE = replace(HALL_LAYOUT, size=(6.0, 2.4, 2.7), num_doors=2, num_cabinets=0, num_panels=1)
-_OFFICE = RoomLayout(size=(4.0, 3.5, 2.5), num_tables=2, num_cabinets=1, num_windows=1, num_doors=1)
-_CURVED = replace(
-    _OFFICE, num_columns=2, num_round_tables=1, num_balls=2, num_lamps=1, num_bent_walls=1
+_CURVED = RoomLayout(
+    size=(8.0, 6.0, 2.6),
+    num_doors=1,
+    num_windows=0,
+    num_cabinets=0,
+    num_shelves=0,
+    num_tables=0,
+    num_boxes=0,
+    num_small_boxes=0,
+    num_pillars=0,
+    num_columns=3,
+    num_round_tables=1,
+    num_balls=3,
+    num_lamps=1,
+    num_bent_walls=2,
 )
 _NOISE = 0.003
 """Metres."""
@@ -202,7 +214,7 @@ def _thinned_room(quick: bool) -> Scene:
 def _room(quick: bool, num_points: int = 1, noise: float = _NOISE) -> Scene:
     """Return a furnished room, with so many times the usual number of points."""
     if quick:
-        return make_room(30_000 * num_points, noise, layout=_OFFICE)
+        return make_room(30_000 * num_points, noise, layout=KINECT_LAYOUT)
     return make_room(200_000 * num_points, noise)
 
 
@@ -218,7 +230,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "cory": (
         lambda quick: (
-            make_storey(80_000, layout=StoreyLayout(rooms_per_side=1))
+            make_storey(80_000, layout=StoreyLayout(rooms_per_side=2))
             if quick
             else make_storey(POINTS["cory"])
         ),
@@ -247,7 +259,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     "thinned": (_thinned_room, "a furnished room, noise 3 mm, one point of each voxel of 3 cm"),
     "curved": (
         lambda quick: make_room(40_000 if quick else 250_000, layout=_CURVED),
-        "a small room with columns, balls, a lamp, a round table, a bent wall, noise 3 mm",
+        "a small room with columns, balls, a lamp, a round table, two bent walls, noise 3 mm",
     ),
 }
 """What makes each cloud, given whether it may be small, and what it is."""
