@@ -82,6 +82,12 @@ class EvalCloud(NamedTuple):
     objects: Tensor | None = None
     curved: Tensor | None = None
 
+    @property
+    def title(self) -> str:
+        """Its name in tables, with * where it stands in for the paper's."""
+        stands_in = self.key in TITLES and not self.is_papers
+        return f"{title_of(self.key)}*" if stands_in else title_of(self.key)
+
 
 def title_of(key: str) -> str:
     """Return the name of a cloud in tables."""

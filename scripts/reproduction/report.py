@@ -12,8 +12,9 @@ INTRO = (
     "Every number here was made by scripts/reproduce_paper.py of torchrg. The paper is: Indoor "
     "Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate Normal "
     "Estimation. First each of its claims, where it holds and the numbers behind that; then the "
-    'tables and figures. "Beyond" marks what the paper does not say. The default of torchrg, '
-    "consensus, is not in the paper."
+    'tables and figures. "Beyond" marks what the paper does not say; * marks a made cloud in the '
+    "place of the paper's, or a piece of it. The default of torchrg, consensus, is not in the "
+    "paper."
 )
 
 

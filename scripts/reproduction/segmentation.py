@@ -5,7 +5,7 @@ from itertools import chain
 
 from reproduction.cells import Record
 from reproduction.claims import segmentation_claims
-from reproduction.clouds import HARD, OTHERS, TITLES, title_of
+from reproduction.clouds import HARD, OTHERS, TITLES
 from reproduction.faces import LARGE, outcomes_of
 from reproduction.methods import DRAWN, METHODS, PAPERS, titles
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
@@ -101,7 +101,7 @@ def cloud_table(run: Run) -> Block:
         cloud = run.cloud(key).cloud
         paper = f"{POINTS[key]:,}" if key in POINTS else ""
         here = "the paper's own" if cloud.is_papers else "**another**" if paper else ""
-        rows.append([title_of(key), paper, here, cloud.origin])
+        rows.append([cloud.title, paper, here, cloud.origin])
     head = ["cloud", "points in the paper", "here", "what it is"]
     note = "The paper's figures and ours are of different clouds where its own are not given."
     return table("Clouds", head, rows, note)
@@ -114,7 +114,7 @@ def index_table(run: Run, key: str, found: dict[str, Record]) -> Block:
         for form, take in COLUMNS.values()
     ]
     faces = next(iter(found.values()))["labels"]["faces"]
-    title = f"**{title_of(key)}** ({faces} faces; {run.cloud(key).cloud.origin})"
+    title = f"**{run.cloud(key).cloud.title}** ({faces} faces; {run.cloud(key).cloud.origin})"
     return table(title, ["method", *COLUMNS], zip(titles(found), *columns, strict=True))
 
 
@@ -144,7 +144,9 @@ def sphere_table(run: Run, key: str, sphere: dict[str, Record], scores: dict[str
         f"Clusters of more than {SAMPLE_SIZE:,} points enter DBI by a subsample of that size. "
         f"{DVI_REMARK}"
     )
-    return table(f"**Table 2**, {title_of(key)}", [*head, *titles(METHODS)], rows, note)
+    return table(
+        f"**Table 2**, {run.cloud(key).cloud.title}", [*head, *titles(METHODS)], rows, note
+    )
 
 
 def _external(record: Record, name: str) -> float | None:
@@ -188,11 +190,10 @@ def _angles(run: Run, key: str) -> Record:
             for angle, labels in labelings.items():
                 overlaps = contingency_table(labels, cloud.labels)
                 found[angle]["ari"] = adjusted_rand_index(overlaps)
-        return {"angles": found}
+        return {"title": cloud.title, "angles": found}
 
     picture = run.folder.path / f"figures/{_angles_name(key)}.png"
-    record: Record = run.folder.cell(f"angles-{cloud.name}", work, needs=picture)["angles"]
-    return record
+    return run.folder.cell(f"angles-{cloud.name}", work, needs=picture)
 
 
 def _angles_name(key: str) -> str:
@@ -200,7 +201,7 @@ def _angles_name(key: str) -> str:
     return f"figure9_{key}_angles"
 
 
-def angle_blocks(run: Run, key: str, found: Record) -> list[Block]:
+def angle_blocks(run: Run, key: str, record: Record) -> list[Block]:
     """Return picture and table of the paper's method at several angles."""
     rows = [
         [
@@ -209,7 +210,7 @@ def angle_blocks(run: Run, key: str, found: Record) -> list[Block]:
             f"{100 * one['share_labeled']:.1f} %",
             f"{one['ari']:.3f}" if "ari" in one else "-",
         ]
-        for angle, one in found.items()
+        for angle, one in record["angles"].items()
     ]
     caption = (
         f"**Figure 9**, {run.cloud(key).cloud.origin}: the paper's method at several angles of "

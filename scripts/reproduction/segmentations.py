@@ -49,6 +49,7 @@ def segment(run: Run, key: str, method: str) -> Record:
         write_cloud(target, Cloud(cloud.points.numpy()), seg)
         return {
             "cloud": key,
+            "title": cloud.title,
             "method": method,
             "points": len(cloud.points),
             "seconds": {stage: end - begin for (stage, begin), (_, end) in pairwise(begins)},
@@ -78,7 +79,7 @@ def score(run: Run, key: str, method: str) -> Record:
 
     def work() -> Record:
         labels = read_segmented(run, key, method).labels
-        record = {"cloud": key, "method": method, **count_regions(labels)}
+        record = {"cloud": key, "title": cloud.title, "method": method, **count_regions(labels)}
         if cloud.labels is not None:
             record["labels"] = score_labels(labels, cloud.labels)._asdict()
             record["faces"] = score_faces(labels, cloud, loaded.at_edges)
@@ -93,7 +94,8 @@ def score_sphere(run: Run, key: str, method: str) -> Record:
 
     def work() -> Record:
         found = read_segmented(run, key, method)
-        return score_clusters(found.normals, found.labels, sample_size=SAMPLE_SIZE)._asdict()
+        indices = score_clusters(found.normals, found.labels, sample_size=SAMPLE_SIZE)
+        return {"title": cloud.title, **indices._asdict()}
 
     return run.folder.cell(f"sphere-{cloud.name}-{method}", work)
 

@@ -1,7 +1,7 @@
 """Table 3: how long the methods take."""
 
 from reproduction.cells import Record, describe_surroundings
-from reproduction.clouds import TITLES, title_of
+from reproduction.clouds import TITLES
 from reproduction.methods import METHODS, PAPERS, titles
 from reproduction.paper_numbers import MINUTES, POINTS
 from reproduction.runs import Run
@@ -43,14 +43,14 @@ def ratio(record: Record) -> float | None:
 def ratio_table(run: Run, records: list[Record]) -> Block:
     """Return seconds of each cloud and method, with the paper's minutes and the ratio."""
     rows = []
-    for key, title in TITLES.items():
+    for key in TITLES:
         cloud = run.cloud(key).cloud
         cells = []
         for record in (record for record in records if record["cloud"] == key):
             times = ratio(record)
             theirs = f" ({MINUTES[key][record['method']]:g} min, {times:,.0f} x)" if times else ""
             cells.append(f"{record['total']:.1f} s{theirs}")
-        rows.append([title if cloud.is_papers else f"{title}*", f"{len(cloud.points):,}", *cells])
+        rows.append([cloud.title, f"{len(cloud.points):,}", *cells])
     note = "Seconds, then the paper's minutes and how many times faster. * made cloud, or a piece."
     return table("**Table 3**", ["cloud", "points", *titles(METHODS)], rows, note)
 
@@ -59,7 +59,7 @@ def stage_table(records: list[Record]) -> Block:
     """Return the seconds of each stage."""
     rows = [
         [
-            TITLES[record["cloud"]],
+            record["title"],
             METHODS[record["method"]].title,
             *(f"{record['seconds'][stage]:.1f}" for stage in STAGES),
             f"{100 * record['sharp_fraction']:.1f} %",
@@ -75,9 +75,9 @@ def time_claims(records: list[Record]) -> list[Block]:
     """Return the paper's claims on times, and how many times faster its method is here."""
     between = {}
     for key in TITLES:
-        seconds = {r["method"]: r["total"] for r in records if r["cloud"] == key}
-        classic, detmm, paper = (seconds[method] for method in PAPERS)
-        between[title_of(key)] = (
+        found = {record["method"]: record for record in records if record["cloud"] == key}
+        classic, detmm, paper = (found[method]["total"] for method in PAPERS)
+        between[found["paper"]["title"]] = (
             classic < paper < detmm,
             f"{classic:.1f}, {paper:.1f} and {detmm:.1f} s",
         )
@@ -94,13 +94,13 @@ def time_claims(records: list[Record]) -> list[Block]:
         claim(
             "II.A",
             "Normals of a cloud take less than a minute.",
-            {title_of("cory"): (normals < 60, f"{normals:.1f} s")},
+            {record["title"]: (normals < 60, f"{normals:.1f} s")},
         ),
         claim(
             "beyond",
             f"The paper's method takes its own 9.84 minutes over {GOAL}, or less.",
             {
-                title_of("cory"): (
+                record["title"]: (
                     times >= GOAL,
                     f"{record['total']:.1f} s for {record['points']:,} points: {times:.0f} times",
                 )
