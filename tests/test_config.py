@@ -82,6 +82,7 @@ def test_missing_file_is_named(tmp_path):
     [
         (NormalsConfig, {"support_fraction": 0.4}, r"support_fraction in \[0.5, 1\], got 0.4"),
         (NormalsConfig, {"sharp_angle_deg": -1.0}, r"sharp_angle_deg in \[0, 90\]"),
+        (NormalsConfig, {"irls_decay": 1.0}, "irls_decay > 1"),
         (NormalsConfig, {"inlier_quantile": 1.0}, r"inlier_quantile in \(0, 1\)"),
         (GrowingConfig, {"max_angle_deg": 91.0}, r"max_angle_deg in \[0, 90\]"),
         (GrowingConfig, {"curvature_quantile": 1.1}, "curvature_quantile in"),

@@ -43,6 +43,9 @@ class NormalsConfig:
     (LIBRA)."""
     inlier_quantile: float = 0.975
     """Neighbours within this chi-square quantile of the robust fit are inliers."""
+    irls_decay: float = 1.05
+    """Factor, above 1, by which the scale of irls shrinks in a step: its authors' is 1.01, which
+    takes five times as long."""
     adaptive_k: int | None = None
     """Largest number of neighbours that consensus may use in noisy clouds, where k are too few to
     tell faces apart. None: always k."""
@@ -54,6 +57,7 @@ class NormalsConfig:
         _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
         _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
+        _require(self, "irls_decay", "> 1", self.irls_decay > 1)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,8 @@ OTHERS = {"room": "a room", "hall": "a second hall"}
 
 HARD = {
     "exact": "exact planes",
-    "quantised": "quantised depth",
+    "quantised": "depth in centimetres",
+    "stepped": "depth in steps of a Kinect",
     "thinned": "thinned to voxels",
     "curved": "curved surfaces",
 }
@@ -199,13 +200,12 @@ def _laser_hall(quick: bool) -> Scene:
     return scan_scene(build_room(2, layout=layout), size, noise=_NOISE)
 
 
-def _quantised_room(quick: bool) -> Scene:
-    """Return a noise-free depth frame in which disparity comes in eighths of a pixel."""
+def _depth_room(quick: bool, quantise: Callable[[Tensor], Tensor]) -> Scene:
+    """Return a depth frame without noise, its depth (0: none) replaced."""
     model = build_room(layout=KINECT_LAYOUT)
     frame = render_depth(model, cameras_around(model, 1)[0])
-    steps = (_DISPARITY_SCALE / frame.depth).round()
-    frame = frame._replace(depth=(_DISPARITY_SCALE / steps).where(frame.depth > 0, 0))
-    return fuse_frames(model, [frame], 30_000 if quick else 250_000)
+    depth = quantise(frame.depth).where(frame.depth > 0, 0)
+    return fuse_frames(model, [frame._replace(depth=depth)], 30_000 if quick else 250_000)
 
 
 def _thinned_room(quick: bool) -> Scene:
@@ -259,7 +259,13 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "exact": (lambda quick: _room(quick, noise=0.0), "a furnished room without noise"),
     "quantised": (
-        _quantised_room,
+        lambda quick: _depth_room(quick, lambda depth: (100 * depth).round() / 100),
+        "one depth frame without noise, in whole centimetres",
+    ),
+    "stepped": (
+        lambda quick: _depth_room(
+            quick, lambda depth: _DISPARITY_SCALE / (_DISPARITY_SCALE / depth).round()
+        ),
         "one depth frame without noise, its disparity in eighths of a pixel",
     ),
     "thinned": (_thinned_room, "a furnished room, noise 3 mm, one point of each voxel of 3 cm"),

@@ -57,7 +57,7 @@ class Grid(NamedTuple):
 VARIANTS = {
     "pca": NormalsConfig(method="pca", k=K),
     "jet": NormalsConfig(method="jet", k=K),
-    "irls": NormalsConfig(method="irls", k=K),
+    "irls": NormalsConfig(method="irls", k=K, irls_decay=1.01),  # The authors'.
     "detmm": NormalsConfig(method="detmm", k=K),
     "paper": load_config("paper").normals,
     "paper, h 0.5": NormalsConfig(method="paper", k=K),

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.normals import fit_normals_irls, fit_normals_pca
+from torchrg.normals import estimate_normals, fit_normals_irls, fit_normals_pca
 
 
 def edges(rng, count, on_own=12, on_other=6, noise=0.01):
@@ -188,3 +189,15 @@ def test_wrong_settings_are_refused(rng):
         fit_normals_irls(patches, noise=torch.ones(2), mu_decay=1.0)
     with pytest.raises(ShapeError, match="expected noise of shape"):
         fit_normals_irls(patches, noise=torch.ones(3))
+
+
+def test_decay_is_a_setting_of_clouds(rng):
+    points = torch.rand(300, 3, generator=rng)
+    points[:, 2] *= 0.01
+    points[150:, [0, 2]] = points[150:, [2, 0]]
+    fits = [
+        estimate_normals(points, config=NormalsConfig(method="irls", k=30, irls_decay=decay))
+        for decay in (1.2, 4.0, 4.0)
+    ]
+    assert torch.equal(fits[1].normals, fits[2].normals)
+    assert not torch.equal(fits[0].normals, fits[1].normals)

@@ -120,8 +120,10 @@ def fit_normals_irls(
 
     Convention:
         The point itself is the first of the patch that counts; it takes no part in the fit.
-        The authors' ``mu_decay`` is 1.01. (The paper prints eq. (5) without the square of ``r``;
-        the authors square it.) Their surface may be curved by a known radius; here it is flat.
+        The authors' ``mu_decay`` is 1.01; 1.05 takes a fifth of the time, and its mean squared
+        errors on solids with edges are 4 to 11 % larger. (The paper prints eq. (5) without the
+        square of ``r``; the authors square it.) Their surface may be curved by a known radius;
+        here it is flat.
         Gradients are those of the steps as taken, and are recomputed step by step to save memory.
 
     Args:
@@ -176,12 +178,13 @@ def estimate_irls(
     """Estimate normals by iteratively weighted PCA, with the noise found about each point.
 
     The authors ask the user for the noise; here it is estimated from the planes of PCA about each
-    point. No setting matters.
+    point.
     """
     known = points.detach()
     planes = fit_points(known, neighbors, fit_normals_pca, chunk_size=chunk_size)
     noise = survey_noise(known, neighbors, planes, chunk_size=chunk_size).noise
-    return fit_points(points, neighbors, fit_normals_irls, chunk_size=chunk_size, noise=noise)
+    fit = partial(fit_normals_irls, mu_decay=config.irls_decay)
+    return fit_points(points, neighbors, fit, chunk_size=chunk_size, noise=noise)
 
 
 def _fit_rows(
