@@ -417,6 +417,33 @@ def test_ratio_is_the_papers_time_over_ours_per_point():
     assert ratio({**record, "method": "consensus"}) is None
 
 
+def test_times_hold_only_where_the_numbers_say_so():
+    from reproduction.times import time_claims
+
+    def timed(key, **seconds):
+        return [
+            {
+                "cloud": key,
+                "title": key,
+                "method": method,
+                "points": 1_097_901,
+                "total": total,
+                "seconds": {"normals": total / 2},
+            }
+            for method, total in seconds.items()
+        ]
+
+    records = []
+    for key in ("tutorial", "hallway", "kinect"):
+        records += timed(key, classic=2, detmm=4, paper=3)
+    records += timed("cory", classic=2, detmm=14, paper=14.8)
+    order, minute, goal = time_claims(records)
+    assert (order["holds"], order["fails"]) == (["tutorial", "hallway", "kinect"], ["cory"])
+    assert minute["numbers"] == {"cory": "7.4 s"}
+    assert goal["fails"] == ["cory"]
+    assert "39.9 times" in goal["numbers"]["cory"]
+
+
 def test_best_numbers_are_bold():
     from reproduction.sections import mark_best
 

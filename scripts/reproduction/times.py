@@ -102,7 +102,7 @@ def time_claims(records: list[Record]) -> list[Block]:
             {
                 record["title"]: (
                     times >= GOAL,
-                    f"{record['total']:.1f} s for {record['points']:,} points: {times:.0f} times",
+                    f"{record['total']:.1f} s for {record['points']:,} points: {times:.1f} times",
                 )
             },
         ),
