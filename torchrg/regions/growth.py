@@ -258,19 +258,19 @@ def _claim_level(
     places += np.arange(len(places), dtype=places.dtype)
     codes = edges.targets[places]
     codes = codes[pending[codes >> 1]]
-    if promotes_late:
-        owners = heads[codes >> 1]
-        codes = codes[(owners < 0) | (owners == head)]
-        # An edge that makes a seed comes before all that do not.
-        makes_seed = (codes & 1).astype(bool)
-        codes = np.concatenate([codes[makes_seed], codes[~makes_seed]])
     targets = codes >> 1
+    if promotes_late:
+        owners = heads[targets]
+        mine = (owners < 0) | (owners == head)
+        heads[targets[mine]] = head
+        makes_seed = mine & (codes & 1).astype(bool)
+        codes, targets = codes[makes_seed], targets[makes_seed]
     numbers = np.arange(len(targets), dtype=np.int32)
     # Of several writes to one place the last one stays: in reverse, the first edge to a point.
     slots[targets[::-1]] = numbers[::-1]
     first = slots[targets] == numbers
     codes, targets = codes[first], targets[first]
-    seeds: NDArray[np.int32] = targets[(codes & 1).astype(bool)]
-    pending[seeds if promotes_late else targets] = False
+    pending[targets] = False
     heads[targets] = head
+    seeds: NDArray[np.int32] = targets[(codes & 1).astype(bool)]
     return seeds
