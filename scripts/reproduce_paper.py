@@ -3,6 +3,7 @@
     python scripts/reproduce_paper.py --out DIR                 # everything
     python scripts/reproduce_paper.py --out DIR --quick         # the same, small, in minutes
     python scripts/reproduce_paper.py --out DIR normals times   # some parts
+    python scripts/reproduce_paper.py --out DIR --again times   # Table 3 measured once more
 
 Open DIR/report.html. Each result is kept in a file of its own under DIR; what is there is not
 computed again, so a run that was interrupted goes on where it stopped. Quick results are apart, in
@@ -18,18 +19,17 @@ from pathlib import Path
 
 import matplotlib as mpl
 import torch
-from reproduction import criteria, large, normals, readme, segmentation_tables, study, times
+from reproduction import method, normals, readme, segmentation, study, times
 from reproduction.cells import Folder, Record
 from reproduction.clouds import TITLES
 from reproduction.report import write_report
 from reproduction.runs import Run
 
 PARTS: dict[str, tuple[Callable[[Run], Record], str]] = {
+    "method": (method.reproduce, "Figures 1, 2, 5 and 6: the method and its indices"),
     "normals": (normals.reproduce, "Table 1, Figures 3 and 4: errors and times of normals"),
-    "criteria": (criteria.reproduce, "Figure 5: coplanar and connective points"),
     "study": (study.reproduce, "section II.B: limits of angle and curvature"),
-    "segmentation": (segmentation_tables.reproduce, "Table 2, Figures 7 and 8"),
-    "large": (large.reproduce, "Figure 9: the two large clouds"),
+    "segmentation": (segmentation.reproduce, "Table 2, Figures 7 to 9"),
     "times": (times.reproduce, "Table 3: times"),
 }
 """Parts by name: what makes them, and what they are."""
@@ -41,7 +41,8 @@ def main() -> None:
     mpl.use("agg")
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
-    folder = Folder(arguments.out / "quick" if arguments.quick else arguments.out)
+    path = arguments.out / "quick" if arguments.quick else arguments.out
+    folder = Folder(path, arguments.again)
     run = Run(folder, arguments.quick, {key: getattr(arguments, key) for key in TITLES})
     for name in arguments.parts or PARTS:
         begin = time.perf_counter()
@@ -66,6 +67,9 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the report")
     parser.add_argument("--quick", action="store_true", help="small clouds, a few minutes")
+    parser.add_argument(
+        "--again", action="store_true", help="compute results that are there once more"
+    )
     parser.add_argument("--threads", type=int, help="threads of torch; default: as torch decides")
     parser.add_argument(
         "--readme", action="store_true", help="put the main numbers into the README"

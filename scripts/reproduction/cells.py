@@ -1,11 +1,12 @@
 """A folder of results, each computed once."""
 
+import functools
 import json
 import os
 import platform
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,12 @@ class Folder:
 
     Args:
         path: The folder; it is made when the first result comes.
+        again: Whether results that are there are computed once more, each once a call.
     """
 
     path: Path
+    again: bool = False
+    _renewed: set[str] = field(default_factory=set)
 
     def cell(self, name: str, work: Callable[[], Record], *, needs: Path | None = None) -> Record:
         """Return the record of that name, computed now if it is not there yet.
@@ -40,10 +44,12 @@ class Folder:
             needs: A file that ``work`` writes beside it, without which the record is of no use.
         """
         path = self.path / "cells" / f"{name}.json"
-        if path.exists() and (needs is None or needs.exists()):
+        is_due = self.again and name not in self._renewed
+        if path.exists() and (needs is None or needs.exists()) and not is_due:
             record: Record = json.loads(path.read_text())
             return record
         record = {**work(), "made_with": surroundings()}
+        self._renewed.add(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         self.write(Path("cells") / path.name, json.dumps(record, indent=1))
         return record
@@ -60,6 +66,7 @@ class Folder:
         return target
 
 
+@functools.cache
 def surroundings() -> Record:
     """Return versions, commit, processor and threads: what a time depends on."""
     here = Path(__file__).parent

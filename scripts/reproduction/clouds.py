@@ -1,4 +1,4 @@
-"""The four clouds of the paper, or made ones with known truth in their place."""
+"""The clouds: the paper's four, or made ones in their place, and others with known truth."""
 
 import hashlib
 from collections.abc import Callable
@@ -6,16 +6,36 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from reproduction.paper_numbers import POINTS
-from reproduction.scenes import HALL_LAYOUT, StoreyLayout, make_kinect_room, make_storey
+from reproduction.scenes import (
+    HALL_LAYOUT,
+    KINECT_LAYOUT,
+    StoreyLayout,
+    cameras_around,
+    fuse_frames,
+    make_kinect_room,
+    make_storey,
+    render_depth,
+    scan_scene,
+)
 from torchrg.io import read_cloud
-from torchrg.scenes import Scene, make_room
+from torchrg.neighbors.voxels import sample_voxels
+from torchrg.scenes import RoomLayout, Scene, build_room, make_room
+from torchrg.structures import UNLABELED
 
-QUICK_POINTS = 100_000
+QUICK_POINTS = 30_000
 """Most points of a file in a quick run."""
+
+SMALLEST = 50
+"""Points of the smallest region that the paper draws, and of the smallest colour that is a face."""
+
+SHELL = ("floor", "ceiling", "wall")
+"""Faces that are objects of their own where objects are annotated, as in S3DIS."""
 
 TITLES = {
     "tutorial": "region_growing_tutorial",
@@ -25,19 +45,32 @@ TITLES = {
 }
 """The paper's names of its clouds."""
 
+OTHERS = {"room": "a room", "hall": "a second hall"}
+"""Clouds on which its claims are tried as well."""
+
+HARD = {
+    "exact": "exact planes",
+    "quantised": "depth in centimetres",
+    "stepped": "depth in steps of a Kinect",
+    "thinned": "thinned to voxels",
+    "curved": "curved surfaces",
+}
+"""Clouds unlike the paper's."""
+
 
 class EvalCloud(NamedTuple):
     """A cloud to segment.
 
     Attributes:
-        key: A key of :data:`TITLES`.
+        key: A key of :data:`TITLES`, :data:`OTHERS` or :data:`HARD`.
         name: Of its cells: another name for other points.
         points: Finite points, shape ``(N, 3)``.
         labels: True faces, shape ``(N,)``, or None.
         normals: True normals, shape ``(N, 3)``, or None.
-        colors: Shape ``(N, 3)``, uint8, or None.
         origin: What the cloud is, and how it differs from the paper's.
         is_papers: Whether it is the paper's own.
+        objects: True objects, shape ``(N,)``, or None.
+        curved: Labels of the faces that are not planes, or None.
     """
 
     key: str
@@ -45,28 +78,63 @@ class EvalCloud(NamedTuple):
     points: Tensor
     labels: Tensor | None
     normals: Tensor | None
-    colors: Tensor | None
     origin: str
-    is_papers: bool
+    is_papers: bool = False
+    objects: Tensor | None = None
+    curved: Tensor | None = None
+
+    @property
+    def title(self) -> str:
+        """Its name in tables, with * where it stands in for the paper's."""
+        stands_in = self.key in TITLES and not self.is_papers
+        return f"{title_of(self.key)}*" if stands_in else title_of(self.key)
+
+
+def title_of(key: str) -> str:
+    """Return the name of a cloud in tables."""
+    return {**TITLES, **OTHERS, **HARD}[key]
 
 
 def load_cloud(key: str, path: Path | None, *, quick: bool) -> EvalCloud:
-    """Read a cloud of the paper, or make one in its place.
+    """Read a cloud of the paper, or make one.
 
     Args:
-        key: A key of :data:`TITLES`.
+        key: A key of :data:`TITLES`, :data:`OTHERS` or :data:`HARD`.
         path: The paper's cloud, if it is there.
         quick: Whether a small piece will do.
 
     Returns:
         The cloud. Of a file the finite points, in quick runs those nearest to its middle.
     """
-    if path is None:
-        scene, what = _made_scene(key, quick)
-        origin = f"{len(scene.points):,} points, made with exact truth: {what}"
-        return EvalCloud(
-            key, f"{key}-made", scene.points, scene.labels, scene.normals, None, origin, False
-        )
+    return _made_cloud(key, quick) if path is None else _read_cloud(key, path, quick)
+
+
+def _made_cloud(key: str, quick: bool) -> EvalCloud:
+    """Return a made cloud with exact truth."""
+    make, what = MADE[key]
+    scene = make(quick)
+    return EvalCloud(
+        key,
+        f"{key}-made",
+        scene.points,
+        scene.labels,
+        scene.normals,
+        f"{len(scene.points):,} points, made with exact truth: {what}",
+        objects=_objects(scene),
+        curved=(~scene.planar).nonzero().squeeze(1),
+    )
+
+
+def _objects(scene: Scene) -> Tensor:
+    """Return the object of each point, as people annotate them: a table is one, a wall is one."""
+    is_shell = torch.tensor([kind in SHELL for kind in scene.kinds])
+    num_objects = int(scene.objects.max()) + 1
+    faces = torch.arange(len(is_shell)) + num_objects
+    return torch.where(is_shell, faces, scene.objects)[scene.labels]
+
+
+def _read_cloud(key: str, path: Path, quick: bool) -> EvalCloud:
+    """Return a cloud of the paper."""
     cloud = read_cloud(path)
     kept = torch.from_numpy(cloud.finite).nonzero().squeeze(1)
     origin = f"{len(kept):,} points of {path.name}"
@@ -75,61 +143,135 @@ def load_cloud(key: str, path: Path | None, *, quick: bool) -> EvalCloud:
         distances = (points - points.median(dim=0).values).square().sum(dim=1)
         kept = kept[distances.topk(QUICK_POINTS, largest=False).indices.sort().values]
         origin = f"{len(kept):,} points around the middle of {path.name}"
-    labels, normals, colors = (
-        torch.from_numpy(cloud.fields[field])[kept] if field in cloud.fields else None
-        for field in ("labels", "normals", "color")
+    fields = {name: values[kept.numpy()] for name, values in cloud.fields.items()}
+    labels, normals = (
+        torch.from_numpy(fields[field]) if field in fields else None
+        for field in ("labels", "normals")
     )
-    if key == "tutorial":
-        colors = None  # Those of the file show somebody's segmentation, not the scene.
+    if key == "tutorial" and labels is None and "color" in fields:
+        labels = faces_of_colors(fields["color"])
+        origin += ", its colours taken for faces (somebody's segmentation, not a measured truth)"
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()[:8]
     return EvalCloud(
-        key, f"{key}-{digest}", cloud.points[kept], labels, normals, colors, origin, not quick
+        key, f"{key}-{digest}", cloud.points[kept], labels, normals, origin, is_papers=not quick
     )
 
 
-def _made_scene(key: str, quick: bool) -> tuple[Scene, str]:
-    """Return a made cloud and a few words about it."""
-    make, what = (_QUICK if quick else _FULL)[key]
-    return make(), what
+def faces_of_colors(colors: NDArray[np.uint8]) -> Tensor:
+    """Return a label for each colour, ``(N,)``; none for those of fewer than 50 points.
+
+    The file of PCL's tutorial shows a segmentation: 124 colours of 50 points and more.
+    """
+    _, labels, counts = np.unique(colors, axis=0, return_inverse=True, return_counts=True)
+    labels = labels.ravel()
+    return torch.from_numpy(np.where(counts[labels] >= SMALLEST, labels, UNLABELED))
 
 
 _SHORT_HALL = replace(HALL_LAYOUT, size=(10.0, 2.4, 2.7), num_doors=5, num_cabinets=1, num_panels=2)
 _PIECE = replace(HALL_LAYOUT, size=(6.0, 2.4, 2.7), num_doors=2, num_cabinets=0, num_panels=1)
+_CURVED = RoomLayout(
+    size=(8.0, 6.0, 2.6),
+    num_doors=1,
+    num_windows=0,
+    num_cabinets=0,
+    num_shelves=0,
+    num_tables=0,
+    num_boxes=0,
+    num_small_boxes=0,
+    num_pillars=0,
+    num_columns=3,
+    num_round_tables=1,
+    num_balls=3,
+    num_lamps=1,
+    num_bent_walls=2,
+)
+_NOISE = 0.003
+"""Metres."""
+_VOXEL = 0.03
+"""Metres."""
+_DISPARITY_SCALE = 525 * 0.075 * 8
+"""Depth times this many eighths of a pixel, of a Kinect, in metres."""
 
-_FULL: dict[str, tuple[Callable[[], Scene], str]] = {
-    "tutorial": (
-        lambda: make_room(POINTS["tutorial"], layout=_SHORT_HALL, seed=1),
-        "a hallway of 10 m with five doors, noise 3 mm",
-    ),
+
+def _laser_hall(quick: bool) -> Scene:
+    """Return a hallway as a laser scanner sees it, in the place of the tutorial's."""
+    layout, size = (_PIECE, 30_000) if quick else (_SHORT_HALL, POINTS["tutorial"])
+    return scan_scene(build_room(2, layout=layout), size, noise=_NOISE)
+
+
+def _depth_room(quick: bool, quantise: Callable[[Tensor], Tensor]) -> Scene:
+    """Return a depth frame without noise, its depth (0: none) replaced."""
+    model = build_room(layout=KINECT_LAYOUT)
+    frame = render_depth(model, cameras_around(model, 1)[0])
+    depth = quantise(frame.depth).where(frame.depth > 0, 0)
+    return fuse_frames(model, [frame._replace(depth=depth)], 30_000 if quick else 250_000)
+
+
+def _thinned_room(quick: bool) -> Scene:
+    """Return one point of each voxel of a room."""
+    scene = _room(quick, num_points=5)
+    rows = sample_voxels(scene.points, _VOXEL).rows
+    return scene._replace(
+        points=scene.points[rows], labels=scene.labels[rows], normals=scene.normals[rows]
+    )
+
+
+def _room(quick: bool, num_points: int = 1, noise: float = _NOISE) -> Scene:
+    """Return a furnished room, with so many times the usual number of points."""
+    if quick:
+        return make_room(30_000 * num_points, noise, layout=KINECT_LAYOUT)
+    return make_room(200_000 * num_points, noise)
+
+
+MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
+    "tutorial": (_laser_hall, "a laser scan of a hallway with doors, noise 3 mm"),
     "hallway": (
-        lambda: make_room(POINTS["hallway"], layout=HALL_LAYOUT),
-        "a hallway of 24 m with 14 doors, noise 3 mm",
+        lambda quick: (
+            make_room(60_000, layout=_PIECE)
+            if quick
+            else make_room(POINTS["hallway"], layout=HALL_LAYOUT)
+        ),
+        "a hallway with doors, panels and cabinets, noise 3 mm",
     ),
     "cory": (
-        lambda: make_storey(POINTS["cory"]),
-        "a hallway and eight furnished rooms, noise 3 mm",
+        lambda quick: (
+            make_storey(80_000, layout=StoreyLayout(rooms_per_side=2))
+            if quick
+            else make_storey(POINTS["cory"])
+        ),
+        "a hallway and the furnished rooms on both sides of it, noise 3 mm",
     ),
     "kinect": (
-        lambda: make_kinect_room(POINTS["kinect"]),
-        "an office from 16 simulated depth frames with the noise of a Kinect",
+        lambda quick: (
+            make_kinect_room(40_000, num_frames=4) if quick else make_kinect_room(POINTS["kinect"])
+        ),
+        "an office from simulated depth frames with the noise of a Kinect",
+    ),
+    "room": (_room, "a furnished room, noise 3 mm"),
+    "hall": (
+        lambda quick: (
+            make_room(30_000, layout=_PIECE, seed=1)
+            if quick
+            else make_room(300_000, layout=HALL_LAYOUT, seed=1)
+        ),
+        "another hallway, half as dense, noise 3 mm",
+    ),
+    "exact": (lambda quick: _room(quick, noise=0.0), "a furnished room without noise"),
+    "quantised": (
+        lambda quick: _depth_room(quick, lambda depth: (100 * depth).round() / 100),
+        "one depth frame without noise, in whole centimetres",
+    ),
+    "stepped": (
+        lambda quick: _depth_room(
+            quick, lambda depth: _DISPARITY_SCALE / (_DISPARITY_SCALE / depth).round()
+        ),
+        "one depth frame without noise, its disparity in eighths of a pixel",
+    ),
+    "thinned": (_thinned_room, "a furnished room, noise 3 mm, one point of each voxel of 3 cm"),
+    "curved": (
+        lambda quick: make_room(40_000 if quick else 250_000, layout=_CURVED),
+        "a small room with columns, balls, a lamp, a round table, two bent walls, noise 3 mm",
     ),
 }
-_QUICK: dict[str, tuple[Callable[[], Scene], str]] = {
-    "tutorial": (
-        lambda: make_room(60_000, layout=_PIECE, seed=1),
-        "a hallway of 6 m, noise 3 mm",
-    ),
-    "hallway": (
-        lambda: make_room(150_000, layout=_PIECE),
-        "a hallway of 6 m with two doors, noise 3 mm",
-    ),
-    "cory": (
-        lambda: make_storey(150_000, layout=StoreyLayout(rooms_per_side=2)),
-        "a hallway and four furnished rooms, noise 3 mm",
-    ),
-    "kinect": (
-        lambda: make_kinect_room(100_000, num_frames=8),
-        "an office from eight simulated depth frames with the noise of a Kinect",
-    ),
-}
+"""What makes each cloud, given whether it may be small, and what it is."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from reproduction.cells import Record
 from reproduction.plotting import settings
 from reproduction.runs import Run
-from reproduction.sections import figure, section, text
+from reproduction.sections import Block, figure, text
 from torchrg import estimate_normals, load_config, search_knn
 from torchrg.neighbors import gather_patches
 from torchrg.regions.criteria import coplanarity_limits, patch_radii, plane_residuals
@@ -53,8 +53,8 @@ class Case(NamedTuple):
     limit: float
 
 
-def reproduce(run: Run) -> Record:
-    """Make Figure 5."""
+def make_figure5(run: Run) -> tuple[list[Block], Record]:
+    """Make Figure 5; return it, and how many neighbours are what."""
     floor = _square(-_SIDE, 0)
     wall = _square(0, _SIDE)[:, [2, 1, 0]]
     raised = _square(0, _SIDE) + torch.tensor([0.0, 0.0, 1.5])
@@ -82,16 +82,15 @@ def reproduce(run: Run) -> Record:
         "**Figure 5**: the neighbours of a point (black ring) near an edge, a step and a gap, on "
         "made surfaces; gray: other points. The band is the limit of eq. (11)."
     )
-    blocks = [
+    return [
+        figure("figures/figure5.png", caption),
         text(
             "A neighbour is connective if it shares 75 % of its neighbours with the point "
             "(eq. 10), and coplanar if its distance to the plane of the point is at most "
-            "median + 2 Qn of those of the neighbourhood (eq. 11). Normals are the paper's."
+            "median + 2 Qn of those of the neighbourhood (eq. 11). Normals are the paper's. Of "
+            f"{k} neighbours: {listed}."
         ),
-        figure("figures/figure5.png", caption),
-        text(f"Of {k} neighbours: {listed}."),
-    ]
-    return section("Figure 5: coplanar and connective points", blocks, counts)
+    ], counts
 
 
 def _square(start: int, stop: int) -> Tensor:

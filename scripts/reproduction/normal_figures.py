@@ -8,6 +8,7 @@ from matplotlib import ticker
 from torch import Tensor
 
 from reproduction.cells import Record
+from reproduction.normal_tables import mean_score, where
 from reproduction.plotting import settings
 from reproduction.tiles import tile_pictures
 from torchrg.render import color_normals, color_sharp, render_cloud, write_png
@@ -17,9 +18,6 @@ STYLES = {
     "pca": ("PCA", "#4878a8", "o", "-"),
     "jet": ("2-jet", "#7fb2d5", "s", "-"),
     "irls": ("weighted PCA", "#e39b3d", "^", "-"),
-    "fastmcd": ("FastMCD", "#bdbdbd", "v", ":"),
-    "mve": ("MVE", "#8c8c8c", "<", ":"),
-    "detmcd": ("DetMCD", "#b79ac8", "P", "--"),
     "detmm": ("DetMM", "#7a4f9a", "D", "-"),
     "paper": ("PCA + DetMCD (paper)", "#c44e52", "X", "-"),
     "consensus": ("consensus", "#2a7f3f", "*", "-"),
@@ -67,9 +65,9 @@ def _draw_panel(axis: plt.Axes, records: list[Record]) -> None:
     noises = sorted({record["noise_percent"] for record in records})
     for name, (label, color, marker, line) in STYLES.items():
         found = {
-            record["noise_percent"]: record["score"]["msae"]
-            for record in records
-            if record["variant"] == name
+            noise: mean_score(records, "msae", noise_percent=noise, variant=name)
+            for noise in noises
+            if where(records, noise_percent=noise, variant=name)
         }
         if found:
             heights = [max(found[noise], 0.1) for noise in noises]

@@ -5,8 +5,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from torch import Tensor
+
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud, load_cloud
+from reproduction.faces import find_edges
 from reproduction.methods import settings_of
 from torchrg import estimate_normals, load_config, search_knn, segment_planes
 from torchrg.scenes import make_room
@@ -41,11 +44,11 @@ class Run:
             self._clouds[key] = LoadedCloud(cloud)
         return self._clouds[key]
 
-    def warm_up(self, preset: str) -> None:
+    def warm_up(self, method: str) -> None:
         """Segment a small cloud first, so that no time includes the loading of code."""
-        if preset not in self._warm:
-            segment_planes(make_room(_WARM_UP).points, settings_of(preset))
-            self._warm.add(preset)
+        if method not in self._warm:
+            segment_planes(make_room(_WARM_UP).points, settings_of(method))
+            self._warm.add(method)
 
 
 @dataclass(frozen=True)
@@ -57,17 +60,22 @@ class LoadedCloud:
 
     @cached_property
     def neighbors(self) -> Neighbors:
-        """The neighbours that all presets use."""
+        """The neighbours that all methods use."""
         return search_knn(self.cloud.points, load_config().normals.k)
 
-    def fit(self, preset: str) -> NormalFit:
-        """Return the normals of a preset; those of the last one asked for are kept."""
-        if preset not in self._fits:
+    @cached_property
+    def at_edges(self) -> Tensor:
+        """The points with true faces of two kinds among their neighbours, shape ``(N,)``."""
+        return find_edges(self.cloud.labels, self.neighbors)
+
+    def fit(self, method: str) -> NormalFit:
+        """Return the normals of a method; those of the last one asked for are kept."""
+        if method not in self._fits:
             self._fits.clear()
-            self._fits[preset] = estimate_normals(
-                self.cloud.points, config=settings_of(preset).normals, neighbors=self.neighbors
+            self._fits[method] = estimate_normals(
+                self.cloud.points, config=settings_of(method).normals, neighbors=self.neighbors
             )
-        return self._fits[preset]
+        return self._fits[method]
 
     def forget(self) -> None:
         """Let go what is large and can be computed again."""

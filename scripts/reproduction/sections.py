@@ -1,6 +1,7 @@
-"""What a part of the report consists of: texts, claims, tables, figures; ready for JSON."""
+"""What a part of the report consists of: texts, tables, figures and claims; ready for JSON."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 Block = dict[str, Any]
@@ -11,7 +12,7 @@ def text(words: str) -> Block:
     return {"kind": "text", "text": words}
 
 
-def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], note: str = "") -> Block:
+def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> Block:
     """Return a table of printed values; ``**bold**`` is bold."""
     return {
         "kind": "table",
@@ -27,14 +28,60 @@ def figure(file: str, caption: str) -> Block:
     return {"kind": "figure", "file": file, "caption": caption}
 
 
-def claim(words: str, holds: bool, numbers: str, why: str = "") -> Block:
-    """Return a statement of the paper, whether it came out here, and the numbers behind that."""
-    return {"kind": "claim", "text": words, "holds": bool(holds), "numbers": numbers, "why": why}
+def claim(where: str, words: str, found: Mapping[str, tuple[bool, str]], why: str = "") -> Block:
+    """Return a statement, and where it comes out.
+
+    Args:
+        where: Its place in the paper.
+        words: What it says.
+        found: On what it was tried; whether it came out there, and the numbers behind that.
+        why: What else is to be known.
+    """
+    return {
+        "where": where,
+        "text": words,
+        "holds": [place for place, (holds, _) in found.items() if holds],
+        "fails": [place for place, (holds, _) in found.items() if not holds],
+        "numbers": {place: numbers for place, (_, numbers) in found.items()},
+        "why": why,
+    }
 
 
-def section(title: str, blocks: Sequence[Block], records: Any) -> dict[str, Any]:  # noqa: ANN401
+def verdict(block: Block) -> str:
+    """Return whether a claim holds, or where.
+
+    Example:
+        >>> verdict(claim("", "", {"a": (True, ""), "b": (False, ""), "c": (True, "")}))
+        'holds on 2 of 3: a, c'
+    """
+    holds, fails = block["holds"], block["fails"]
+    if not holds or not fails:
+        return "holds" if holds else "does not"
+    return f"holds on {len(holds)} of {len(holds) + len(fails)}: {', '.join(holds)}"
+
+
+def section(
+    title: str,
+    blocks: Sequence[Block],
+    records: Any,  # noqa: ANN401
+    claims: Sequence[Block] = (),
+) -> dict[str, Any]:
     """Return a part of the report, with the records that it was made from."""
-    return {"title": title, "blocks": list(blocks), "records": records}
+    return {"title": title, "blocks": list(blocks), "claims": list(claims), "records": records}
+
+
+def rising(values: Iterable[float | None], form: str) -> tuple[bool, str]:
+    """Return whether values rise, and how they are printed.
+
+    Example:
+        >>> rising([0.1, 0.3, 0.2], ".2f")
+        (False, '0.10, 0.30, 0.20')
+    """
+    values = list(values)
+    if None in values:
+        return False, ", ".join("-" if value is None else format(value, form) for value in values)
+    ordered = all(low < high for low, high in pairwise(values))
+    return ordered, (" < " if ordered else ", ").join(format(value, form) for value in values)
 
 
 def mark_best(values: Sequence[float | None], form: str, *, higher: bool | None) -> list[str]:
