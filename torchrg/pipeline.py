@@ -106,7 +106,7 @@ def make_superpoints(
     seg: Segmentation | None = None,
     config: SuperpointsConfig | None = None,
     *,
-    colors: Tensor | NDArray[np.integer | np.floating] | None = None,
+    colors: Tensor | NDArray[np.generic] | None = None,
 ) -> Superpoints:
     """Partition a cloud into superpoints: every finite point in exactly one, in nested levels.
 

@@ -210,3 +210,18 @@ class Superpoints(NamedTuple):
     labels: Tensor
     plane: Tensor
     levels: tuple[Tensor, ...]
+
+    def by_level(self) -> dict[str, NDArray[np.int32]]:
+        """Return all partitions by the names that they have in files.
+
+        Example:
+            >>> one = torch.tensor([0, 0, 1])
+            >>> list(Superpoints(one, torch.tensor([-1, -1]), (one // 2, one // 2)).by_level())
+            ['superpoints', 'superpoints_1', 'superpoints_2']
+        """
+        return {
+            "superpoints" if i == 0 else f"superpoints_{i}": level.numpy(force=True).astype(
+                np.int32
+            )
+            for i, level in enumerate((self.labels, *self.levels))
+        }

@@ -7,7 +7,7 @@ They read and return NumPy arrays there. Where Pointcept is not installed, nothi
 
 import importlib.util
 
-from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
+from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes, Superpoints
 from torchrg.transforms.sample import CenterCloud, KeepFinite
 from torchrg.transforms.voxels import SampleVoxels
 
@@ -21,5 +21,6 @@ if importlib.util.find_spec("pointcept") is not None:
         KeepFinite,
         SampleVoxels,
         SegmentPlanes,
+        Superpoints,
     ):
         TRANSFORMS.register_module(module=_transform)

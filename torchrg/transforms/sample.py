@@ -17,7 +17,9 @@ from torch import Tensor, nn
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
 
-KEYS = ("coord", "normal", "curvature", "residual", "plane", "inverse", "origin")
+KEYS = (
+    "coord", "normal", "curvature", "residual", "plane", "inverse", "origin", "color", "superpoint",
+)  # fmt: skip
 """Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos"}
 """Names that a PyG ``Data`` has instead of ours, unless others are given."""
