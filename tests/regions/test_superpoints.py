@@ -52,7 +52,7 @@ def crumpled(rng, count=120, num_planes=2):
 
 
 def literal_merging(points, normals, planes, config):
-    """Whole planes and points merge one pair of best partners after the other, all from points."""
+    """Whole planes and points merge, those first that are best partners, all from the points."""
     near = cKDTree(points).query(points, k=9)[1][:, 1:]
     contacts = [(i, int(j)) for i in range(len(points)) for j in near[i]]
     tensors = np.einsum("ni,nj->nij", normals, normals).reshape(len(points), 9)
@@ -93,11 +93,18 @@ def literal_merging(points, normals, planes, config):
                 for row in sorted(row for row in found if row[0] < np.inf):
                     for group in row[1:]:
                         best.setdefault(group, row)
-                mutual = [row for row in set(best.values()) if best[row[1]] == best[row[2]] == row]
-                if not mutual:
+                if not best:
                     break
-                for _, a, b in mutual:
-                    join(a, b)
+                wanted = {a: sum(row[1:]) - a for a, row in best.items()}
+                small = {a for a, b in wanted.items() if len(groups[b]) >= 16 * len(groups[a])}
+                joining = [(a, b) for a, b in wanted.items() if a in small and b not in small]
+                joining += [
+                    (a, b)
+                    for a, b in wanted.items()
+                    if a > b and best[a] == best[b] and not {a, b} & small
+                ]
+                for a, b in joining:
+                    join(of[a], of[b])
         levels.append(list(of))
     return levels
 
