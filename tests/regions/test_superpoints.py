@@ -1,7 +1,6 @@
 """Superpoints: a literal form of the merging, and what every partition promises."""
 
 import dataclasses
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -43,12 +42,13 @@ def parts(room):
     return partition_points(*room, CONFIG)
 
 
-def crumpled(rng, count=120, num_planes=2):
-    """Points at random in a flat box with random normals, and a few on two planes."""
+def crumpled(rng, count=120, *, crumple=1.0):
+    """Points at random in a flat box, their normals spread about z, and a part on two planes."""
     points = torch.rand(count, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.1])
-    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
-    planes = torch.where(points[:, 0] < 0.3, (points[:, 1] < 0.5).long(), -1)
-    return points, normals, planes.clamp(max=num_planes - 1)
+    spread = crumple * torch.randn(count, 3, generator=rng)
+    normals = torch.nn.functional.normalize(torch.tensor([0.0, 0, 1]) + spread, dim=1)
+    planes = torch.where(points[:, 0] < 0.4, (points[:, 1] < 0.5).long(), -1)
+    return points, normals, planes
 
 
 def literal_merging(points, normals, planes, config):
@@ -71,8 +71,6 @@ def literal_merging(points, normals, planes, config):
 
     def cost(a, b):
         links = [(i, j) for i, j in contacts if {of[i], of[j]} == {a, b}]
-        if not links:
-            return np.inf
         chord = np.mean([2 - 2 * abs(normals[i] @ normals[j]) for i, j in links])
         mean_a, mean_b = (tensors[list(groups[g])].mean(axis=0) for g in (a, b))
         n_a, n_b = len(groups[a]), len(groups[b])
@@ -83,14 +81,15 @@ def literal_merging(points, normals, planes, config):
     for strength in config.strengths:
         for least in (0, config.min_size):
             while True:
+                touching = {tuple(sorted((of[i], of[j]))) for i, j in contacts if of[i] != of[j]}
                 found = [
                     (cost(a, b), a, b)
-                    for a, b in combinations(sorted(groups), 2)
+                    for a, b in touching
                     if not least or min(len(groups[a]), len(groups[b])) < least
                 ]
                 found = [row for row in found if row[0] <= (np.inf if least else strength)]
                 best = {}
-                for row in sorted(row for row in found if row[0] < np.inf):
+                for row in sorted(found):
                     for group in row[1:]:
                         best.setdefault(group, row)
                 if not best:
@@ -116,8 +115,11 @@ def same_partition(a, b):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_merging_is_that_of_literal_loops(seed):
-    points, normals, planes = crumpled(torch.Generator().manual_seed(seed), 60)
-    config = SuperpointsConfig(strengths=(0.5, 1.5), min_size=4, planes="whole")
+    rng = torch.Generator().manual_seed(seed)
+    points, normals, planes = crumpled(rng, 100, crumple=0.1 + 0.3 * seed)
+    config = SuperpointsConfig(
+        strengths=(0.008 + 0.1 * seed, 0.05 + 0.4 * seed), min_size=3, planes="whole"
+    )
     order = superpoints.finite_rows(points)
     points, normals, planes = points[order], normals[order], planes[order]
     found = partition_points(points, normals, planes, config)
@@ -221,6 +223,17 @@ def test_an_island_without_neighbours_stays_small(rng):
     found = partition_points(points, normals, planes, config)
     assert len(found.labels[:9].unique()) == 1
     assert torch.bincount(found.labels).min() == 9
+
+
+def test_a_floor_takes_in_its_specks_together(rng, monkeypatch):
+    points = torch.rand(3000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
+    normals = torch.tensor([0.0, 0, 1]).expand(3000, 3)
+    planes = torch.where(torch.rand(3000, generator=rng) < 0.1, -1, 0)
+    merge, turns = superpoints._merge, []
+    monkeypatch.setattr(superpoints, "_merge", lambda *args: turns.append(1) or merge(*args))
+    config = dataclasses.replace(CONFIG, planes="whole")
+    assert len(partition_points(points, normals, planes, config).plane) == 1
+    assert len(turns) < 10
 
 
 def test_whole_planes_are_not_cut_and_extents_are_bounded(room):
