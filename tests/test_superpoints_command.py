@@ -74,3 +74,5 @@ def test_a_wrong_setting_is_told_in_one_line(folder, tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "strengths" in error
+    assert main([*command, "--partition.min-size", "3"]) == 2
+    assert "expected --superpoints" in capsys.readouterr().err

@@ -59,6 +59,10 @@ def run(argv: list[str]) -> int:
         inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
     )
     arguments = console.parse(Arguments, argv, prog="torchrg segment", default=start)
+    if not arguments.superpoints and arguments.partition != SuperpointsConfig():
+        raise ConfigError(
+            "segment: expected --superpoints with --partition flags, got none; add it."
+        )
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     pictures = console.picture_paths(outputs, arguments.picture)
