@@ -249,6 +249,17 @@ def test_whole_planes_are_not_cut_and_extents_are_bounded(room):
             assert np.ptp(points[level == number].numpy(), axis=0).max() <= 0.8
 
 
+def test_specks_on_both_sides_do_not_exceed_an_extent():
+    points = torch.cat([torch.linspace(0, 1, 101), torch.tensor([-0.02, 1.02])])[:, None]
+    points = torch.cat([points, torch.zeros(103, 2)], dim=1)
+    normals = torch.tensor([0.0, 0, 1]).expand(103, 3)
+    planes = torch.where((points[:, 0] < 0) | (points[:, 0] > 1), -1, 0)
+    config = SuperpointsConfig((50.0,), min_size=1, planes="whole", max_extent=1.03)
+    found = partition_points(points, normals, planes, config)
+    sizes = [np.ptp(points[found.labels == i, 0].numpy()) for i in found.labels.unique()]
+    assert max(sizes) == pytest.approx(1.02, abs=1e-6)
+
+
 def test_colours_tell_flat_things_apart():
     x, y = torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0)).unbind(1)
     floor = torch.stack([x, y, 0 * x], dim=1)

@@ -267,6 +267,8 @@ def _merge_regions(
     Returns the graph of what is left, and what each region has become, shape ``(R,)``.
     """
     regions, borders = graph
+    # Two that fit into the box of a third one by one may not fit together.
+    ratio = _MUCH_LARGER if bound == math.inf else math.inf
     become = torch.arange(len(regions.size))
     while True:
         cost = _costs(regions, borders, bound)
@@ -277,7 +279,8 @@ def _merge_regions(
             eligible = cost <= strength
         if not bool(eligible.any()):
             return _Graph(regions, borders), become
-        chosen = _choose_pairs(borders, torch.where(eligible, cost, math.inf), regions.size)
+        cost = torch.where(eligible, cost, math.inf)
+        chosen = _choose_pairs(borders, cost, regions.size, ratio)
         regions, borders, new = _merge(regions, borders, *chosen)
         become = new[become]
 
@@ -301,9 +304,12 @@ def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
     return cost
 
 
-def _choose_pairs(borders: _Borders, cost: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+def _choose_pairs(
+    borders: _Borders, cost: Tensor, size: Tensor, ratio: float
+) -> tuple[Tensor, Tensor]:
     """Return regions, and those that they are to become part of, each of which stays itself.
 
+    Those are each other's cheapest, or the cheapest of one that has ``ratio`` times fewer points.
     Of equal costs the first border's counts.
     """
     num_regions, num_borders = len(size), len(cost)
@@ -316,7 +322,7 @@ def _choose_pairs(borders: _Borders, cost: Tensor, size: Tensor) -> tuple[Tensor
     best = best.scatter_reduce(0, ends[is_least], rows[is_least], "amin")
     asking = (best < num_borders).nonzero().squeeze(1)
     wanted = borders.first[best[asking]] + borders.second[best[asking]] - asking
-    joins = size[wanted] >= _MUCH_LARGER * size[asking]
+    joins = size[wanted] >= ratio * size[asking]
     is_joining = torch.zeros(num_regions, dtype=torch.bool).index_copy(0, asking, joins)
     joins &= ~is_joining[wanted]
     mutual = (best[wanted] == best[asking]) & ~is_joining[asking] & ~is_joining[wanted]
