@@ -6,7 +6,7 @@ from torchrg.errors import TorchrgError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions import grow_regions
 from torchrg.structures import UNLABELED, Cloud
 
@@ -21,6 +21,7 @@ __all__ = [
     "estimate_normals",
     "grow_regions",
     "load_config",
+    "make_superpoints",
     "metrics",
     "nn",
     "normals",

@@ -1,6 +1,7 @@
 """All settings, their defaults and their meaning; files and flags hold only differences."""
 
 import dataclasses
+import itertools
 import math
 import types
 import typing
@@ -184,6 +185,36 @@ class PipelineConfig:
 
     def __post_init__(self) -> None:
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
+
+
+@dataclass(frozen=True)
+class SuperpointsConfig:
+    """How a cloud is partitioned; see :func:`torchrg.make_superpoints`."""
+
+    strengths: tuple[float, ...] = (0.5, 1.5, 4.0, 12.0)
+    """Strength of regularisation of each level, ascending: a region merges with one beside it when
+    that costs at most this, in points of opposite sides of a right angle. Twice the strength leaves
+    about 0.6 times the superpoints."""
+    min_size: int = 10
+    """Smaller superpoints join the neighbour that it costs least, in distinct points."""
+    planes: Literal["pieces", "whole"] = "pieces"
+    """Planes enter as compact pieces, which merge again unless objects meet in the plane, or whole,
+    and are never cut."""
+    max_extent: float | None = None
+    """Longest side of the box around a superpoint, in the unit of the cloud; whole planes may have
+    longer ones. None: no limit."""
+    color_weight: float = 1.0
+    """What a squared difference of colours in [0, 1] counts, against one of unit normals."""
+
+    def __post_init__(self) -> None:
+        steps = (0.0, *self.strengths, math.inf)
+        ascending = all(a < b for a, b in itertools.pairwise(steps))
+        is_list = len(self.strengths) > 0 and ascending
+        _require(self, "strengths", "one or more numbers > 0, ascending", is_list)
+        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        extent = self.max_extent
+        _require(self, "max_extent", "> 0 or none", extent is None or 0 < extent < math.inf)
+        _require(self, "color_weight", ">= 0", 0 <= self.color_weight < math.inf)
 
 
 @dataclass(frozen=True)

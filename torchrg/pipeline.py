@@ -1,4 +1,4 @@
-"""From points to planes: the method in one function."""
+"""From points to planes, and to superpoints: each in one function."""
 
 from collections.abc import Callable
 
@@ -9,11 +9,12 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import sequential_operations
-from torchrg.config import PipelineConfig, load_config
+from torchrg.config import PipelineConfig, SuperpointsConfig, load_config
+from torchrg.errors import ShapeError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals import ESTIMATORS
-from torchrg.regions import grow_regions, summarize_planes
-from torchrg.structures import UNLABELED, Neighbors, Segmentation
+from torchrg.regions import grow_regions, partition_points, summarize_planes
+from torchrg.structures import UNLABELED, Neighbors, Segmentation, Superpoints
 
 
 @sequential_operations()
@@ -100,3 +101,66 @@ def segment_planes(
         restore_rows(fit.valid, rows, num_points),
         planes,
     )
+
+
+@sequential_operations()
+def make_superpoints(
+    points: Tensor | NDArray[np.floating],
+    seg: Segmentation | None = None,
+    config: SuperpointsConfig | None = None,
+    *,
+    colors: Tensor | NDArray[np.generic] | None = None,
+) -> Superpoints:
+    """Partition a cloud into superpoints: every finite point in exactly one, in nested levels.
+
+    Superpoints are connected (of a chain of points between any two, each is one of the 8 nearest
+    neighbours of the one before or after it), of one orientation, and keep to the borders of
+    objects. Planes come first: their compact pieces, or whole planes, are regions from the start.
+    Regions merge while that costs an energy like that of cut pursuit [1] at most the strength of
+    the level; see :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
+
+    Convention:
+        The result does not depend on the order of the points or on the number of threads. Exact
+        duplicates are in one superpoint. Sizes are counted in distinct points. Neither a voxel grid
+        nor weights by local density made partitions of clouds of varying density better, so each
+        point counts once.
+
+    Args:
+        points: Points, shape ``(N, 3)``, float32 or float64.
+        seg: What :func:`segment_planes` said about them. Default: it is asked, with the preset
+            ``consensus``.
+        config: Settings.
+        colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
+            [0, 1]. Default: they play no part.
+
+    Returns:
+        The partition of the first strength, and those of the others. A superpoint smaller than
+        ``min_size`` has no neighbour to join, or only beyond ``max_extent``.
+
+    Raises:
+        ShapeError: If a shape or dtype is wrong, or ``seg`` is of another number of points.
+
+    References:
+        [1] L. Landrieu, G. Obozinski. Cut pursuit: fast algorithms to learn piecewise constant
+        functions on general weighted graphs. SIAM J. Imaging Sciences, 2017.
+
+    Example:
+        >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
+        >>> step = torch.stack([x, y, 10 * (x > 9)], dim=1)
+        >>> found = make_superpoints(step)
+        >>> found.labels.unique(return_counts=True)[1].tolist(), found.plane.tolist()
+        ([200, 200], [0, 1])
+    """
+    tensor = as_tensor("make_superpoints", "points", points)
+    check_shapes("make_superpoints", points=(tensor, "N 3"))
+    check_floating("make_superpoints", points=tensor)
+    shades = None if colors is None else as_tensor("make_superpoints", "colors", colors)
+    check_shapes("make_superpoints", points=(tensor, "N 3"), colors=(shades, "N 3"))
+    seg = segment_planes(tensor) if seg is None else seg
+    if len(seg.labels) != len(tensor):
+        raise ShapeError(
+            f"make_superpoints: expected seg of {len(tensor):,} points, got {len(seg.labels):,}; "
+            "pass the segmentation of these points."
+        )
+    config = SuperpointsConfig() if config is None else config
+    return partition_points(tensor, seg.normals, seg.labels, config, shades)

@@ -193,3 +193,35 @@ class Segmentation(NamedTuple):
     sharp: Tensor
     valid: Tensor
     planes: Planes
+
+
+class Superpoints(NamedTuple):
+    """What :func:`torchrg.make_superpoints` returns: a partition of all points, and coarser ones.
+
+    Attributes:
+        labels: Superpoint of each point, shape ``(N,)``, int64: 0 to M-1 by descending size; -1 for
+            points that are not finite, and for no others.
+        plane: Plane that more than half of the points of each superpoint are on, shape ``(M,)``,
+            int64, or -1.
+        levels: Coarser partitions, numbered likewise, each shape ``(N,)``: each of their parts is
+            made of whole parts of the one before.
+    """
+
+    labels: Tensor
+    plane: Tensor
+    levels: tuple[Tensor, ...]
+
+    def by_level(self) -> dict[str, NDArray[np.int32]]:
+        """Return all partitions by the names that they have in files.
+
+        Example:
+            >>> one = torch.tensor([0, 0, 1])
+            >>> list(Superpoints(one, torch.tensor([-1, -1]), (one // 2, one // 2)).by_level())
+            ['superpoints', 'superpoints_1', 'superpoints_2']
+        """
+        return {
+            "superpoints" if i == 0 else f"superpoints_{i}": level.numpy(force=True).astype(
+                np.int32
+            )
+            for i, level in enumerate((self.labels, *self.levels))
+        }

@@ -19,7 +19,7 @@ from torchrg.datasets.rgbd import LAYOUTS
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.errors import ConfigError
 from torchrg.io import Cloud, estimate_points, write_cloud
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 
 CLASSIC = load_config("classic")
 
@@ -95,7 +95,9 @@ def test_s3dis_becomes_pointcept_with_planes(tmp_path):
     assert segment.ravel().tolist() == [1] * 400 + [2] * 380
     expected = segment_planes(coord, CLASSIC)
     assert np.array_equal(plane, expected.labels)
-    assert np.array_equal(superpoint, plane)
+    parts = make_superpoints(coord, expected, colors=color)
+    assert np.array_equal(superpoint, parts.labels)
+    assert superpoint.dtype == np.int32
     assert len(json.loads((out / "planes.json").read_text())["planes"]) == report.num_regions
 
 

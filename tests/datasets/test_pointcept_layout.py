@@ -1,6 +1,9 @@
 """Scene folders have Pointcept's types, and those of others are completed, never changed."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from tests.datasets.s3dis_tree import digest
 from torchrg.config import load_config
 from torchrg.datasets import describe_planes, read_pointcept_scene, write_pointcept_scene
 from torchrg.errors import FormatError
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.scenes import make_room
 
 CLASSIC = load_config("classic")
@@ -48,7 +51,7 @@ def foreign(sample, tmp_path):
 
 def test_types_and_shapes_are_pointcepts(sample, seg, tmp_path):
     folder = tmp_path / "Area_1" / "office_1"
-    written = write_pointcept_scene(folder, sample, seg, superpoint=True)
+    written = write_pointcept_scene(folder, sample, seg, superpoint=seg.labels)
     expected = {
         "coord": ("<f4", (3000, 3)),
         "color": ("|u1", (3000, 3)),
@@ -123,15 +126,15 @@ def test_a_folder_of_pointcept_is_completed_and_not_changed(foreign):
     before = {path.name: path.read_bytes() for path in foreign.iterdir()}
     found = read_pointcept_scene(foreign)
     seg = segment_planes(found["coord"], CLASSIC)
-    for superpoint in (True, False, True):
+    for superpoint in (seg.labels, None, seg.labels):
         written = write_pointcept_scene(foreign, found, seg, superpoint=superpoint)
-        extra = ["superpoint.npy"] if superpoint else []
+        extra = ["superpoint.npy"] if superpoint is not None else []
         assert sorted(written) == sorted(["curvature.npy", "plane.npy", "planes.json", *extra])
         assert {name: (foreign / name).read_bytes() for name in before} == before
 
 
 def test_what_torchrg_wrote_is_replaced(sample, seg, tmp_path):
-    write_pointcept_scene(tmp_path, sample, seg, superpoint=True)
+    write_pointcept_scene(tmp_path, sample, seg, superpoint=seg.labels)
     flipped = seg._replace(normals=-seg.normals, labels=seg.labels.clone().fill_(-1))
     moved = {**sample, "coord": sample["coord"] + 1}
     write_pointcept_scene(tmp_path, moved, flipped)
@@ -141,7 +144,7 @@ def test_what_torchrg_wrote_is_replaced(sample, seg, tmp_path):
 
 
 def test_a_superpoint_of_an_older_run_does_not_stay(sample, seg, tmp_path):
-    write_pointcept_scene(tmp_path, sample, seg, superpoint=True)
+    write_pointcept_scene(tmp_path, sample, seg, superpoint=seg.labels)
     write_pointcept_scene(tmp_path, sample, seg)
     assert not (tmp_path / "superpoint.npy").exists()
 
@@ -202,7 +205,7 @@ def test_labels_from_elsewhere_are_not_touched(foreign, sample, seg, name):
     np.save(foreign / f"{name}.npy", np.zeros(3000, np.float32))
     before = digest(foreign)
     with pytest.raises(FormatError, match=rf"{name}\.npy: was not written by torchrg"):
-        write_pointcept_scene(foreign, sample, seg, superpoint=True)
+        write_pointcept_scene(foreign, sample, seg, superpoint=seg.labels)
     assert digest(foreign) == before
 
 
@@ -241,3 +244,31 @@ def test_a_folder_that_cannot_be_made_is_named(sample, seg, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FormatError, match="cannot be made"):
         write_pointcept_scene(tmp_path / "file" / "room", sample, seg)
+
+
+READ_BY_POINTCEPT = """
+import sys
+import real
+from pointcept.datasets.scannetpp import ScanNetPPDataset
+sample = ScanNetPPDataset(split="Area_1", data_root=sys.argv[1], transform=[])[0]
+print(sample["superpoint"].dtype, sample["superpoint"].shape, *sample["superpoint"].tolist())
+"""
+
+
+@pytest.mark.slow
+def test_the_real_loader_of_scannetpp_reads_superpoints(sample, seg, tmp_path):
+    pointcept = Path(__file__).parents[3] / "shared" / "pointcept"
+    if not pointcept.exists():
+        pytest.skip("needs the data pipeline of Pointcept")
+    parts = make_superpoints(sample["coord"], seg).labels
+    write_pointcept_scene(tmp_path / "Area_1" / "office_1", sample, seg, superpoint=parts)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", READ_BY_POINTCEPT, str(tmp_path)],
+        cwd=pointcept,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    dtype, shape, *labels = done.stdout.split()
+    assert (dtype, shape) == ("int32", "(3000,)")
+    assert [int(label) for label in labels] == parts.tolist()

@@ -17,7 +17,7 @@ from torchmetrics.clustering import (  # noqa: E402
 
 from tests.metrics.sphere_clusters import scattered  # noqa: E402
 from torchrg.errors import ConfigError  # noqa: E402
-from torchrg.metrics import METRICS, modules, score_clusters, score_labels  # noqa: E402
+from torchrg.metrics import METRICS, modules, score_clusters, score_labels, score_partition  # noqa: E402
 from torchrg.metrics import score_normals as score_errors  # noqa: E402
 from torchrg.metrics.modules import PlaneMetric  # noqa: E402
 
@@ -40,6 +40,7 @@ def scans(part):
         sharp = torch.rand(len(normals), generator=rng) < 0.3
         arguments, score = {
             "labels": ((labels, truth), score_labels),
+            "superpoints": ((labels, truth, torch.rand(count, 3, generator=rng)), score_partition),
             "clusters": ((normals, clusters), score_clusters),
             "normals": ((normals, other, sharp), score_errors),
         }[part]

@@ -10,7 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from torchrg._optional import require
 from torchrg.batch.scans import Converted, Scan, check_finite, write_results
@@ -28,8 +31,8 @@ from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import estimate_points, read_cloud
-from torchrg.pipeline import segment_planes
-from torchrg.structures import Cloud
+from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.structures import Cloud, Segmentation
 
 _COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
@@ -51,15 +54,14 @@ class FolderSource:
         settings: How to segment.
         out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
             no other folder below it can be.
-        superpoint: Whether the planes of folders in Pointcept's layout are written as
-            ``superpoint`` too.
+        superpoint: Whether superpoints are written as ``superpoint.npy`` too.
     """
 
     root: Path
     settings: PipelineConfig
     out: Path
     superpoint: bool = False
-    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4
+    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4 + 4
 
     @property
     def in_place(self) -> bool:
@@ -85,8 +87,9 @@ class FolderSource:
         """Return a cloud with its input files."""
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
-        # In place, nothing but the coordinates decides what is added.
-        used = _COPIED if not self.in_place else ("coord",)
+        # In place, nothing but the coordinates, for superpoints the colours, decides what is added.
+        decisive = ("coord", "color") if self.superpoint else ("coord",)
+        used = decisive if self.in_place else _COPIED
         files = tuple(file for file in scene.files if file.stem in used)
         return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
 
@@ -99,20 +102,34 @@ class FolderSource:
             cloud = read_cloud(first)
         else:
             sample = read_pointcept_scene(first.parent)
-            cloud = Cloud(sample["coord"].numpy(), source=str(first.parent))
+            # Pointcept's colours are 0 to 255 in any type.
+            colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
+            cloud = Cloud(sample["coord"].numpy(), colors, source=str(first.parent))
         warnings = check_finite(cloud)
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
+        color = cloud.fields.get("color")
+        parts = _superpoints(cloud, seg, color, begin) if self.superpoint else None
         begin("write")
         origin = cloud.origin.tolist()
         if is_file:
-            colors = {name: cloud.fields[name] for name in ("color",) if name in cloud.fields}
-            files = write_results(folder, cloud.coordinates, seg, fields=colors, origin=origin)
+            found = {"color": color, "superpoint": parts}
+            fields = {name: values for name, values in found.items() if values is not None}
+            files = write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
         else:
             kept = {name: sample[name] for name in _COPIED if name in sample}
-            files = write_pointcept_scene(
-                folder, kept, seg, superpoint=self.superpoint, origin=origin
-            )
+            files = write_pointcept_scene(folder, kept, seg, superpoint=parts, origin=origin)
         return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
+
+
+def _superpoints(
+    cloud: Cloud,
+    seg: Segmentation,
+    colors: Tensor | NDArray[np.generic] | None,
+    begin: Callable[[str], None],
+) -> NDArray[np.int32]:
+    """Return the superpoint of each point of a cloud, in the type of Pointcept's files."""
+    begin("superpoints")
+    return make_superpoints(cloud.points, seg, colors=colors).by_level()["superpoints"]
 
 
 @dataclass(frozen=True)
@@ -126,7 +143,7 @@ class S3DISSource:
         settings: How to segment.
         areas: Numbers of the areas.
         class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
-        superpoint: Whether planes are written as ``superpoint`` too.
+        superpoint: Whether superpoints are written as ``superpoint.npy`` too.
     """
 
     root: Path
@@ -158,11 +175,10 @@ class S3DISSource:
             *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
         ]
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
+        parts = _superpoints(cloud, seg, room.color, begin) if self.superpoint else None
         begin("write")
         arrays, origin = room._asdict(), cloud.origin.tolist()
-        files = write_pointcept_scene(
-            folder, arrays, seg, superpoint=self.superpoint, origin=origin
-        )
+        files = write_pointcept_scene(folder, arrays, seg, superpoint=parts, origin=origin)
         repairs = tuple(
             f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
             for r in room.report.repairs

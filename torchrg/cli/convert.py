@@ -71,7 +71,7 @@ class CloudArguments(Arguments):
     """What data sets of clouds have beside."""
 
     superpoint: bool = False
-    """Write the planes of scans in Pointcept's layout as superpoint.npy too."""
+    """Write superpoints as superpoint.npy too: a partition of all points, for networks on them."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 

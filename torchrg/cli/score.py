@@ -1,4 +1,4 @@
-"""``torchrg score``: labels and normals against a truth, of one scan or of folders of scans."""
+"""``torchrg score``: labels, normals, superpoints against a truth, of one scan or of folders."""
 
 import csv
 import io
@@ -18,14 +18,15 @@ from torchrg.datasets.folder import natural_key
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, atomic_path, read_cloud
 from torchrg.io.files import check_place
-from torchrg.metrics import score_labels, score_normals
+from torchrg.metrics import score_labels, score_normals, score_partition
 
 Scores: TypeAlias = dict[str, dict[str, Any]]
-"""Indices by part (``labels``, ``normals``) and name."""
+"""Indices by part (``labels``, ``normals``, ``superpoints``) and name."""
 
 _SHOWN = {
     "labels": ("f1", "precision", "recall", "regions", "faces", "recall_iou50", "mean_best_iou"),
     "normals": ("rms", "mean", "under_10_deg"),
+    "superpoints": ("count", "asa", "oracle_miou", "boundary_recall"),
 }
 """What a table of scans shows of each; the mean, --json and --csv have everything."""
 _MOST_NAMED = 5
@@ -44,6 +45,13 @@ class Arguments:
     """File with labels or normals, as torchrg segment writes it, or a folder of such files."""
     truth: Annotated[Path, tyro.conf.Positional]
     """File with the true labels or normals, or a folder with such a file for each result."""
+    superpoints: bool = False
+    """Score superpoints against the true labels, as torchrg segment --superpoints writes them."""
+    ignore: int | None = None
+    """True label of points that are not of any part, for superpoints. -1 always is one."""
+    boundary_distance: float | None = None
+    """How far apart borders of superpoints and true ones may be and still agree, in the unit of the
+    cloud. Default: the median distance to the 8th nearest neighbour."""
     json: bool = False
     """Print one JSON object instead of a table; for folders with the keys "scans" and "mean"."""
     csv: Path | None = None
@@ -62,11 +70,11 @@ def run(argv: list[str]) -> int:
     if predicted.is_dir():
         pairs = _pair_scans(predicted, truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
-        scans = {name: _score_files(*files) for name, files in bar}
+        scans = {name: _score_files(arguments, *files) for name, files in bar}
         scores = _mean(scans)
         rows, printed = {**scans, "mean": scores}, {"scans": scans, "mean": scores}
     else:
-        scores = _score_files(predicted, truth)
+        scores = _score_files(arguments, predicted, truth)
         rows, printed = {predicted.stem: scores}, scores
     if arguments.csv is not None:
         with atomic_path(arguments.csv) as path:
@@ -127,7 +135,7 @@ def _named(names: Iterable[str]) -> str:
     return ", ".join(ordered[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _score_files(predicted: Path, truth: Path) -> Scores:
+def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     """Return the scores of whatever two files of the same points both have."""
     ours, theirs = read_cloud(predicted), read_cloud(truth)
     if len(ours) != len(theirs):
@@ -137,16 +145,32 @@ def _score_files(predicted: Path, truth: Path) -> Scores:
     scores: Scores = {}
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
-            values = score(ours.fields[part], theirs.fields[part])._asdict()
-            # None was not asked for; JSON knows null, but no NaN.
-            scores[part] = {
-                name: None if isinstance(value, float) and math.isnan(value) else value
-                for name, value in values.items()
-                if value is not None
-            }
+            scores[part] = _known(score(ours.fields[part], theirs.fields[part])._asdict())
+    if arguments.superpoints:
+        for path, cloud, field in ((predicted, ours, "superpoints"), (truth, theirs, "labels")):
+            if field not in cloud.fields:
+                named = ", ".join(cloud.fields) or "points alone"
+                raise FormatError(f"{path}: expected {field} for --superpoints, got {named}.")
+        found = score_partition(
+            ours.fields["superpoints"],
+            theirs.fields["labels"],
+            ours.points,
+            boundary_distance=arguments.boundary_distance,
+            ignore=arguments.ignore,
+        )
+        scores["superpoints"] = _known(found._asdict())
     if not scores:
         raise FormatError(f"{predicted}: shares neither labels nor normals with {truth}.")
     return scores
+
+
+def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores that were asked for; JSON knows null, but no NaN."""
+    return {
+        name: None if isinstance(value, float) and math.isnan(value) else value
+        for name, value in values.items()
+        if value is not None
+    }
 
 
 def _mean(scans: Mapping[str, Scores]) -> Scores:

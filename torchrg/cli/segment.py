@@ -12,11 +12,13 @@ from tqdm import tqdm
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
+from torchrg.config import SuperpointsConfig
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import color_planes, render_cloud, write_png
-from torchrg.transforms import segment_voxels
+from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
@@ -40,6 +42,11 @@ class Arguments:
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
+    superpoints: bool = False
+    """Add superpoints, a partition of all points: of the first strength as "superpoints", the
+    coarser ones as "superpoints_1" and so on. The picture shows them instead of the planes. Colours
+    of the cloud play a part."""
+    partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
@@ -52,6 +59,10 @@ def run(argv: list[str]) -> int:
         inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
     )
     arguments = console.parse(Arguments, argv, prog="torchrg segment", default=start)
+    if not arguments.superpoints and arguments.partition != SuperpointsConfig():
+        raise ConfigError(
+            "segment: expected --superpoints with --partition flags, got none; add it."
+        )
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     pictures = console.picture_paths(outputs, arguments.picture)
@@ -80,20 +91,31 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
         console.warn(f"{source}: {note}.")
     check_output(target, cloud)
     settings, voxel = arguments.settings.resolved, arguments.voxel
-    with tqdm(total=len(STAGES), desc=source.name, unit="stage", leave=False, disable=None) as bar:
+    stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
+    with tqdm(total=len(stages), desc=source.name, unit="stage", leave=False, disable=None) as bar:
 
         def advance(stage: str) -> None:
             bar.set_postfix_str(stage)
             bar.update(stage != STAGES[0])
 
-        if voxel is None:
+        voxels = None if voxel is None else sample_voxels(cloud.points, voxel)
+        if voxels is None:
             seg = segment_planes(cloud.points, settings, on_stage=advance)
         else:
-            seg = segment_voxels(cloud.points, voxel, settings, on_stage=advance)
-    provenance = describe_run(source, settings) | ({} if voxel is None else {"voxel": voxel})
-    write_cloud(target, cloud, seg, provenance=provenance)
+            seg = segment_voxels(cloud.points, voxels, settings, on_stage=advance)
+        parts, shown, provenance = None, seg.labels, describe_run(source, settings)
+        if arguments.superpoints:
+            advance("superpoints")
+            parts = partition_voxels(
+                cloud.points, voxels, seg, arguments.partition, colors=cloud.fields.get("color")
+            )
+            shown = parts.labels
+            provenance["superpoints"] = dataclasses.asdict(arguments.partition)
+    if voxel is not None:
+        provenance["voxel"] = voxel
+    write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
-        colors = color_planes(seg.labels, cloud.points)
+        colors = color_planes(shown, cloud.points)
         write_png(picture, render_cloud(cloud.points, colors, normals=seg.normals))
     seconds = time.perf_counter() - begin
     num_planes = len(seg.planes.count)
@@ -101,6 +123,9 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
         kept = cloud.coordinates[cloud.finite]
         reason = "all points are equal" if (kept == kept[0]).all() else "no region is large enough"
         console.warn(f"{source}: no plane found: {reason}.")
+    if parts is not None:
+        found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
+        print(f"{source}: superpoints of each level: {found}")
     share = float((seg.labels >= 0).double().mean()) * 100
     print(
         f"{source}: {len(cloud):,} points, {num_planes:,} planes, {share:.1f} % of the points "

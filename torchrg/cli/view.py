@@ -21,13 +21,14 @@ from torchrg.render import (
 )
 from torchrg.structures import Cloud
 
-ColorBy = Literal["plane", "normal", "curvature", "sharp", "color"]
+ColorBy = Literal["plane", "superpoint", "normal", "curvature", "sharp", "color"]
 FIELDS: dict[str, str] = {
     "plane": "labels",
     "color": "color",
     "normal": "normals",
     "curvature": "curvature",
     "sharp": "sharp",
+    "superpoint": "superpoints",
 }
 """What a cloud can be coloured by, the first that it has by default, and the field it needs."""
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -91,7 +92,7 @@ def _colors(cloud: Cloud, color: ColorBy | None) -> Tensor:
     if color is None:
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
     values = torch.from_numpy(cloud.fields[FIELDS[color]])
-    if color == "plane":
+    if color in ("plane", "superpoint"):
         return color_planes(values, cloud.points)
     if color == "normal":
         return color_normals(values)

@@ -72,7 +72,7 @@ def write_pointcept_scene(
     sample: Mapping[str, Any],
     segmentation: Segmentation,
     *,
-    superpoint: bool = False,
+    superpoint: Tensor | NDArray[np.integer] | None = None,
     origin: Sequence[float] | None = None,
 ) -> list[str]:
     """Write a scene folder, or complete one that Pointcept wrote.
@@ -87,7 +87,8 @@ def write_pointcept_scene(
             ``instance``, as tensors or arrays. Without ``normal`` those of the segmentation are
             written.
         segmentation: What :func:`torchrg.segment_planes` said about ``coord``.
-        superpoint: Whether the plane labels are written as ``superpoint`` too, -1 for no plane.
+        superpoint: Superpoint of each point, shape ``(N,)``, to be written as ``superpoint`` too,
+            which ScanNet's data sets have. Default: none are.
         origin: Where the origin of ``coord`` is, for the plane table; see
             :func:`describe_planes`. Default: ``coord`` is in the coordinates of the data set.
 
@@ -177,14 +178,18 @@ def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
 
 
 def _arrays_of(
-    place: Path, sample: Mapping[str, Any], segmentation: Segmentation, *, superpoint: bool
+    place: Path,
+    sample: Mapping[str, Any],
+    segmentation: Segmentation,
+    *,
+    superpoint: Tensor | NDArray[np.integer] | None,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of a scene in Pointcept's types."""
     found: dict[str, Any] = {"normal": segmentation.normals}
     found |= {name: sample[name] for name in POINT_ARRAYS[:6] if name in sample}
     found |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
-    if superpoint:
-        found["superpoint"] = segmentation.labels
+    if superpoint is not None:
+        found["superpoint"] = superpoint
     dtypes = {"color": np.uint8, "plane": np.int32, "superpoint": np.int32}
     arrays = {}
     for name in (name for name in POINT_ARRAYS if name in found):

@@ -25,7 +25,7 @@ from torchrg.io.npy import (
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
 from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
     "FORMATS",
@@ -112,6 +112,7 @@ def write_cloud(
     cloud: Cloud,
     segmentation: Segmentation | None = None,
     *,
+    superpoints: Superpoints | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a point cloud, or the result of segmenting it; the suffix says how.
@@ -130,12 +131,14 @@ def write_cloud(
         ``outline_points``, ``outline_ring_sizes`` and ``outline_ring_planes`` (rings one after the
         other: their lengths, and the planes they belong to), all in the input's own coordinates,
         and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
-        identifiers).
+        identifiers). Superpoints are ``superpoints``, and ``superpoints_1`` and so on for the
+        coarser levels; in ``.npz`` also ``plane_of_superpoint``.
 
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
         cloud: The cloud.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
+        superpoints: What :func:`torchrg.make_superpoints` said about them.
         provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
 
     Raises:
@@ -154,14 +157,17 @@ def write_cloud(
     found = _format_of(target)
     check_output(target, cloud)
     cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
-    if segmentation is not None and len(segmentation.labels) != len(cloud):
-        raise FormatError(
-            f"{target}: expected a segmentation of {len(cloud)} points, got "
-            f"{len(segmentation.labels)}; pass the cloud that was segmented."
-        )
+    for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
+        if result is not None and len(result.labels) != len(cloud):
+            raise FormatError(
+                f"{target}: expected {what} of {len(cloud)} points, got {len(result.labels)}; pass "
+                "the cloud that was segmented."
+            )
     if found.write is write_npz:
-        write_npz(target, cloud, segmentation, provenance)
+        write_npz(target, cloud, segmentation, provenance, superpoints)
         return
+    if superpoints is not None:
+        cloud = replace(cloud, fields={**cloud.fields, **superpoints.by_level()})
     if segmentation is not None:
         names = ("labels", "normals", "curvature")
         kept = {name: values for name, values in cloud.fields.items() if name not in names}

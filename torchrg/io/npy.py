@@ -33,7 +33,7 @@ from torchrg.io.fields import (
     to_records,
 )
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
-from torchrg.structures import PLANE_KINDS, Cloud, Segmentation
+from torchrg.structures import PLANE_KINDS, Cloud, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
 _NOT_PER_POINT = "plane_"
@@ -104,6 +104,7 @@ def write_npz(
     cloud: Cloud,
     segmentation: Segmentation | None = None,
     provenance: Mapping[str, Any] | None = None,
+    superpoints: Superpoints | None = None,
 ) -> None:
     """Write ``points`` and every field under its name, or the arrays of a result, and provenance.
 
@@ -119,6 +120,9 @@ def write_npz(
         arrays = {"points": cloud.coordinates, **cloud.fields}
     else:
         arrays = _result(cloud, segmentation)
+    if superpoints is not None:
+        arrays |= superpoints.by_level()
+        arrays["plane_of_superpoint"] = superpoints.plane.numpy(force=True)
     if provenance is not None:
         arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
     for name, values in arrays.items():

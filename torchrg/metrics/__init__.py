@@ -1,4 +1,4 @@
-"""Scores of plane labels, of clusters on the Gaussian sphere, and of normals.
+"""Scores of plane labels, of superpoints, of clusters on the Gaussian sphere, and of normals.
 
 ``METRICS`` says of every index its unit and whether more is better. The forms for torchmetrics
 are in :mod:`torchrg.metrics.modules`, which needs the extra ``metrics``.
@@ -19,6 +19,7 @@ from torchrg.metrics.labels import (
     segmentation_covering,
 )
 from torchrg.metrics.normals import NormalScore, score_normals
+from torchrg.metrics.partition import PartitionScore, score_partition
 from torchrg.metrics.protocols import EvopsScore, SegCompCounts, count_segcomp, score_evops
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "Index",
     "LabelScore",
     "NormalScore",
+    "PartitionScore",
     "SegCompCounts",
     "adjusted_rand_index",
     "contingency_table",
@@ -39,6 +41,7 @@ __all__ = [
     "score_evops",
     "score_labels",
     "score_normals",
+    "score_partition",
     "segmentation_covering",
 ]
 
@@ -65,6 +68,11 @@ _LABELS = {
     "evops_precision evops_recall evops_f1 evops_mean_iou evops_mean_dice "
     "share_labeled covering ari nmi",
     Index("", False): "evops_over_segmented evops_under_segmented evops_missed evops_noise",
+}
+_SUPERPOINTS = {
+    Index("", True): "asa oracle_miou boundary_recall boundary_precision",
+    Index("", None): "boundary_distance",
+    Index("count", None): "count points_per_superpoint points",
 }
 _CLUSTERS = {
     Index("rad", False): "cp",
@@ -95,11 +103,12 @@ def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str
 METRICS: Mapping[str, Mapping[str, Index]] = MappingProxyType(
     {
         "labels": _by_name(LabelScore._fields, _LABELS),
+        "superpoints": _by_name(PartitionScore._fields, _SUPERPOINTS),
         "clusters": _by_name(ClusterScore._fields, _CLUSTERS),
         "normals": _by_name(NormalScore._fields, _NORMALS),
     }
 )
-"""The fields of ``LabelScore``, ``ClusterScore`` and ``NormalScore``, by part and name.
+"""The fields of the scores, by part and name.
 
 Example:
     >>> METRICS["labels"]["f1"]

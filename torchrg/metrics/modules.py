@@ -15,9 +15,11 @@ from torchrg.metrics import (
     ClusterScore,
     LabelScore,
     NormalScore,
+    PartitionScore,
     score_clusters,
     score_labels,
     score_normals,
+    score_partition,
 )
 
 if TYPE_CHECKING:
@@ -25,8 +27,9 @@ if TYPE_CHECKING:
 else:
     Metric = require("torchmetrics", extra="metrics", purpose="use torchrg.metrics.modules").Metric
 
-_SCORES: dict[str, Callable[..., LabelScore | ClusterScore | NormalScore]] = {
+_SCORES: dict[str, Callable[..., LabelScore | PartitionScore | ClusterScore | NormalScore]] = {
     "labels": score_labels,
+    "superpoints": score_partition,
     "clusters": score_clusters,
     "normals": score_normals,
 }
@@ -40,10 +43,12 @@ class PlaneMetric(Metric):
     addition, and the metrics of one part in a ``MetricCollection`` score each scan once.
 
     Args:
-        index: A part of :data:`torchrg.metrics.METRICS` (``"labels"``, ``"clusters"`` or
-            ``"normals"``), for a dict of all its indices; or an index of one, as in ``"f1"``.
-        **settings: Settings of :func:`torchrg.metrics.score_labels`, ``score_clusters`` or
-            ``score_normals``, as in ``min_size=50``, and those of :class:`torchmetrics.Metric`.
+        index: A part of :data:`torchrg.metrics.METRICS` (``"labels"``,
+            ``"superpoints"``, ``"clusters"`` or ``"normals"``), for a dict of all its indices; or
+            an index of one, as in ``"f1"``.
+        **settings: Settings of :func:`torchrg.metrics.score_labels`, ``score_partition``,
+            ``score_clusters`` or ``score_normals``, as in ``min_size=50``, and those of
+            :class:`torchmetrics.Metric`.
 
     Attributes:
         part: The part of ``METRICS`` that the index is of.
@@ -93,7 +98,8 @@ class PlaneMetric(Metric):
     def update(self, *tensors: Tensor, **named: Tensor) -> None:
         """Add the score of one scan, given the tensors that the function of the part takes.
 
-        Labels: predicted and true label of each point, both ``(N,)``. Clusters: normals ``(N, 3)``
+        Labels: predicted and true label of each point, both ``(N,)``. Superpoints: the same, then,
+        for borders, points ``(N, 3)``. Clusters: normals ``(N, 3)``
         and the cluster of each, ``(N,)``. Normals: estimated and true normals ``(N, 3)``; then, if
         there are, sharp points and ``valid``, both ``(N,)``.
         """

@@ -6,9 +6,9 @@
 
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
-from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes
+from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes, Superpoints
 from torchrg.transforms.sample import CenterCloud, KeepFinite
-from torchrg.transforms.voxels import SampleVoxels, segment_voxels
+from torchrg.transforms.voxels import SampleVoxels, partition_voxels, segment_voxels
 
 __all__ = [
     "CenterCloud",
@@ -19,7 +19,9 @@ __all__ = [
     "SampleVoxels",
     "SegmentDepth",
     "SegmentPlanes",
+    "Superpoints",
     "fuse_depth",
+    "partition_voxels",
     "restore_points",
     "sample_voxels",
     "segment_voxels",

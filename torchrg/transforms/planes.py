@@ -1,4 +1,4 @@
-"""Normals and plane labels as modules."""
+"""Normals, plane labels and superpoints as modules."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -7,11 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg.config import DEFAULT_PRESET, GrowingConfig, NormalsConfig, PipelineConfig, load_config
+from torchrg.config import (
+    DEFAULT_PRESET,
+    GrowingConfig,
+    NormalsConfig,
+    PipelineConfig,
+    SuperpointsConfig,
+    load_config,
+)
+from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals import estimate_normals
 from torchrg.pipeline import segment_planes
-from torchrg.regions import grow_regions
+from torchrg.regions import grow_regions, partition_points
 from torchrg.structures import UNLABELED
 from torchrg.transforms.sample import CloudTransform
 
@@ -141,3 +149,47 @@ class SegmentPlanes(CloudTransform):
         """Return plane labels, normals and curvature of a cloud."""
         seg = segment_planes(cloud["coord"], self.config)
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
+
+
+class Superpoints(CloudTransform):
+    """Add superpoints, a partition of all points; see :func:`torchrg.make_superpoints`.
+
+    Reads ``coord``, ``normal`` ``(N, 3)`` and ``plane`` ``(N,)``, as :class:`SegmentPlanes` adds
+    them; adds ``superpoint`` ``(N,)``, int64, of the first strength.
+
+    Args:
+        config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
+        white: Largest value of a colour, 255 or 1, to read ``color`` ``(N, 3)`` too. Default:
+            colours play no part.
+        keys: Other names for the keys.
+        **changes: Single settings, as in ``strengths=(2.0,)``.
+
+    Example:
+        >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
+        >>> sample = SegmentPlanes()({"coord": torch.stack([x, y, 10 * (x > 9)], dim=1)})
+        >>> Superpoints()(sample)["superpoint"].unique(return_counts=True)[1]
+        tensor([200, 200])
+    """
+
+    def __init__(
+        self,
+        config: SuperpointsConfig | None = None,
+        *,
+        white: float | None = None,
+        keys: Mapping[str, str] | None = None,
+        **changes: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(keys=keys)
+        if white is not None and not white > 0:
+            raise ConfigError(f"Superpoints: expected white > 0 or none, got {white!r}.")
+        self.config = dataclasses.replace(config or SuperpointsConfig(), **changes)
+        self.white = white
+        self.reads = ("coord", "normal", "plane", *["color"] * (white is not None))
+
+    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the superpoints of a cloud."""
+        colors = None if self.white is None else cloud["color"].double() / self.white
+        found = partition_points(
+            cloud["coord"], cloud["normal"], cloud["plane"].reshape(-1), self.config, colors
+        )
+        return {"superpoint": found.labels}

@@ -23,7 +23,7 @@ import numpy as np
 
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
-from torchrg.transforms.planes import GrowRegions
+from torchrg.transforms.planes import GrowRegions, Superpoints
 from torchrg.transforms.rows import OUR_KEYS, with_listed
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform
 from torchrg.transforms.voxels import SampleVoxels
@@ -83,7 +83,15 @@ def point_collate_fn(batch: Sequence[Mapping[str, Any]], mix_prob: float = 0) ->
     return joined
 
 
-_TRANSFORMS = (CenterCloud, EstimateNormals, GrowRegions, KeepFinite, SampleVoxels, SegmentPlanes)
+_TRANSFORMS = (
+    CenterCloud,
+    EstimateNormals,
+    GrowRegions,
+    KeepFinite,
+    SampleVoxels,
+    SegmentPlanes,
+    Superpoints,
+)
 """What configs can name."""
 _OWN: dict[str, Callable[..., dict[str, Any]]] = {}
 """Pointcept's own functions, behind those that take their places."""

@@ -29,7 +29,9 @@ from torchrg.transforms.rows import (
     with_listed,
 )
 
-KEYS = ("coord", "normal", "curvature", "residual", "plane", "inverse", "origin")
+KEYS = (
+    "coord", "normal", "curvature", "residual", "plane", "inverse", "origin", "color", "superpoint",
+)  # fmt: skip
 """Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
 """Names that a PyG ``Data`` has instead of ours, unless others are given. PyG makes entries with

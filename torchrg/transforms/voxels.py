@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
-from torchrg.config import PipelineConfig, load_config
+from torchrg.config import PipelineConfig, SuperpointsConfig, load_config
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows, restore_points, sample_voxels
-from torchrg.pipeline import segment_planes
+from torchrg.neighbors import Voxels, finite_rows, restore_points, sample_voxels
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions import summarize_planes
-from torchrg.structures import UNLABELED, PlaneAdjacency, Segmentation
+from torchrg.structures import UNLABELED, PlaneAdjacency, Segmentation, Superpoints
 from torchrg.transforms.rows import rows_of_clouds
 from torchrg.transforms.sample import SampleTransform
 
@@ -71,7 +71,7 @@ class SampleVoxels(SampleTransform):
 
 def segment_voxels(
     points: Tensor | NDArray[np.floating],
-    size: float,
+    size: float | Voxels,
     config: PipelineConfig | None = None,
     *,
     on_stage: Callable[[str], None] | None = None,
@@ -80,7 +80,8 @@ def segment_voxels(
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64.
-        size: Side of a voxel, in the unit of the cloud.
+        size: Side of a voxel, in the unit of the cloud; or the voxels of the points, if they are
+            known already.
         config: See :func:`torchrg.segment_planes`; sizes of regions are counted in voxels.
         on_stage: See :func:`torchrg.segment_planes`.
 
@@ -100,7 +101,7 @@ def segment_voxels(
     """
     tensor = as_tensor("segment_voxels", "points", points)
     config = load_config() if config is None else config
-    voxels = sample_voxels(tensor, size)
+    voxels = size if isinstance(size, Voxels) else sample_voxels(tensor, size)
     seg = segment_planes(tensor[voxels.rows], config, on_stage=on_stage)
     labels = restore_points(seg.labels, voxels.inverse, fill=UNLABELED)
     counts = torch.bincount(labels[labels >= 0], minlength=len(seg.planes.count))
@@ -113,6 +114,54 @@ def segment_voxels(
     planes = summarize_planes(tensor[rows], normals[rows], labels[rows], up=up, outline=outline)
     planes = planes._replace(adjacency=_renumbered(seg.planes.adjacency, place))
     return Segmentation(labels, normals, curvature, sharp, valid, planes)
+
+
+def partition_voxels(
+    points: Tensor | NDArray[np.floating],
+    voxels: Voxels | None,
+    seg: Segmentation,
+    config: SuperpointsConfig | None = None,
+    *,
+    colors: Tensor | NDArray[np.generic] | None = None,
+) -> Superpoints:
+    """Make superpoints of the points that stand for voxels, and give every point that of its voxel.
+
+    Args:
+        points: Points, shape ``(N, 3)``, float32 or float64.
+        voxels: What :func:`sample_voxels` said about them. None: every point stands for itself.
+        seg: What :func:`segment_voxels` said about all of them.
+        config: See :func:`torchrg.make_superpoints`; sizes are counted in voxels.
+        colors: See there.
+
+    Returns:
+        A partition of all points, superpoints numbered by their number of voxels.
+
+    Raises:
+        ShapeError: If a shape or dtype is wrong.
+
+    Example:
+        >>> grid = torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0), torch.zeros(1))
+        >>> voxels = sample_voxels(grid, 2.0)
+        >>> found = partition_voxels(grid, voxels, segment_voxels(grid, voxels))
+        >>> found.labels.shape, found.plane.tolist()
+        (torch.Size([1600]), [0])
+    """
+    if voxels is None:
+        return make_superpoints(points, seg, config, colors=colors)
+    tensor = as_tensor("partition_voxels", "points", points)
+    shades = None if colors is None else as_tensor("partition_voxels", "colors", colors)
+    rows = voxels.rows
+    found = make_superpoints(
+        tensor[rows],
+        seg._replace(labels=seg.labels[rows], normals=seg.normals[rows]),
+        config,
+        colors=None if shades is None else shades[rows],
+    )
+    labels, *levels = (
+        restore_points(level, voxels.inverse, fill=UNLABELED)
+        for level in (found.labels, *found.levels)
+    )
+    return Superpoints(labels, found.plane, tuple(levels))
 
 
 def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:

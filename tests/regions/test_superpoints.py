@@ -1,0 +1,312 @@
+"""Superpoints: a literal form of the merging, and what every partition promises."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from torchrg import make_superpoints, read_cloud, segment_planes
+from torchrg.config import SuperpointsConfig
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.metrics import score_partition
+from torchrg.regions import partition_points, superpoints
+from torchrg.scenes import RoomLayout, make_room
+
+CONFIG = SuperpointsConfig(strengths=(0.3, 1.0, 4.0), min_size=4)
+
+OFFICE = RoomLayout(
+    size=(5.4, 4.4, 2.6),
+    num_doors=1,
+    num_windows=1,
+    num_cabinets=1,
+    num_tables=2,
+    num_boxes=1,
+    num_pillars=0,
+    num_small_boxes=2,
+)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Points, true normals, and true faces with every fifth point, and small faces, left out."""
+    scene = make_room(6000, noise=0.003, seed=2, layout=OFFICE)
+    small = torch.bincount(scene.labels)[scene.labels] < 50
+    planes = torch.where(small | (torch.arange(6000) % 5 == 0), -1, scene.labels)
+    return scene.points, scene.normals, planes
+
+
+@pytest.fixture(scope="module")
+def parts(room):
+    return partition_points(*room, CONFIG)
+
+
+def crumpled(rng, count=120, *, crumple=1.0):
+    """Points at random in a flat box, their normals spread about z, and a part on two planes."""
+    points = torch.rand(count, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.1])
+    spread = crumple * torch.randn(count, 3, generator=rng)
+    normals = torch.nn.functional.normalize(torch.tensor([0.0, 0, 1]) + spread, dim=1)
+    planes = torch.where(points[:, 0] < 0.4, (points[:, 1] < 0.5).long(), -1)
+    return points, normals, planes
+
+
+def literal_merging(points, normals, planes, config):
+    """Whole planes and points merge, those first that are best partners, all from the points."""
+    near = cKDTree(points).query(points, k=9)[1][:, 1:]
+    contacts = [(i, int(j)) for i in range(len(points)) for j in near[i]]
+    tensors = np.einsum("ni,nj->nij", normals, normals).reshape(len(points), 9)
+    groups = {i: {i} for i in range(len(points))}
+    of = list(groups)
+
+    def join(a, b):
+        a, b = sorted((a, b))
+        groups[a] |= groups.pop(b)
+        for i in groups[a]:
+            of[i] = a
+
+    for i, j in contacts:
+        if planes[i] == planes[j] >= 0 and of[i] != of[j]:
+            join(of[i], of[j])
+
+    def cost(a, b):
+        links = [(i, j) for i, j in contacts if {of[i], of[j]} == {a, b}]
+        chord = np.mean([2 - 2 * abs(normals[i] @ normals[j]) for i, j in links])
+        mean_a, mean_b = (tensors[list(groups[g])].mean(axis=0) for g in (a, b))
+        n_a, n_b = len(groups[a]), len(groups[b])
+        difference = ((mean_a - mean_b) ** 2).sum() + chord + 0.01
+        return n_a * n_b / (n_a + n_b) * difference / np.sqrt(len(links))
+
+    levels = []
+    for strength in config.strengths:
+        for least in (0, config.min_size):
+            while True:
+                touching = {tuple(sorted((of[i], of[j]))) for i, j in contacts if of[i] != of[j]}
+                found = [
+                    (cost(a, b), a, b)
+                    for a, b in touching
+                    if not least or min(len(groups[a]), len(groups[b])) < least
+                ]
+                found = [row for row in found if row[0] <= (np.inf if least else strength)]
+                best = {}
+                for row in sorted(found):
+                    for group in row[1:]:
+                        best.setdefault(group, row)
+                if not best:
+                    break
+                wanted = {a: sum(row[1:]) - a for a, row in best.items()}
+                small = {a for a, b in wanted.items() if len(groups[b]) >= 16 * len(groups[a])}
+                joining = [(a, b) for a, b in wanted.items() if a in small and b not in small]
+                joining += [
+                    (a, b)
+                    for a, b in wanted.items()
+                    if a > b and best[a] == best[b] and not {a, b} & small
+                ]
+                for a, b in joining:
+                    join(of[a], of[b])
+        levels.append(list(of))
+    return levels
+
+
+def same_partition(a, b):
+    pairs = set(zip(np.asarray(a).tolist(), np.asarray(b).tolist(), strict=True))
+    return len(pairs) == len(np.unique(a)) == len(np.unique(b))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_merging_is_that_of_literal_loops(seed):
+    rng = torch.Generator().manual_seed(seed)
+    points, normals, planes = crumpled(rng, 100, crumple=0.1 + 0.3 * seed)
+    config = SuperpointsConfig(
+        strengths=(0.008 + 0.1 * seed, 0.05 + 0.4 * seed), min_size=3, planes="whole"
+    )
+    order = superpoints.finite_rows(points)
+    points, normals, planes = points[order], normals[order], planes[order]
+    found = partition_points(points, normals, planes, config)
+    expected = literal_merging(points.double().numpy(), normals.double().numpy(), planes, config)
+    assert len(set(expected[0])) > len(set(expected[1])) > 1
+    for level, literal in zip((found.labels, *found.levels), expected, strict=True):
+        assert same_partition(level, literal)
+
+
+def test_every_point_is_in_one_superpoint_and_levels_are_nested(room, parts):
+    sizes = torch.bincount(parts.labels)
+    assert (parts.labels >= 0).all()
+    assert (sizes >= CONFIG.min_size).all()
+    assert (sizes[1:] <= sizes[:-1]).all()
+    assert len(parts.plane) == len(sizes)
+    finer = parts.labels
+    for level in parts.levels:
+        pairs = torch.unique(torch.stack([finer, level]), dim=1)
+        assert len(finer.unique()) == pairs.shape[1] > len(level.unique()) > 1
+        finer = level
+
+
+def test_superpoints_are_connected(room, parts):
+    points = room[0]
+    near = cKDTree(points).query(points, k=9)[1]
+    for level in (parts.labels, *parts.levels):
+        links = {}
+        for i, row in enumerate(near.tolist()):
+            for j in row[1:]:
+                if level[i] == level[j]:
+                    links.setdefault(i, []).append(j)
+                    links.setdefault(j, []).append(i)
+        for number in level.unique().tolist():
+            members = torch.nonzero(level == number).squeeze(1).tolist()
+            reached, waiting = {members[0]}, [members[0]]
+            while waiting:
+                new = set(links.get(waiting.pop(), [])) - reached
+                reached |= new
+                waiting += new
+            assert reached == set(members)
+
+
+def test_planes_are_what_most_points_are_on(room, parts):
+    planes = room[2]
+    for number, plane in enumerate(parts.plane.tolist()):
+        inside = planes[parts.labels == number]
+        shares = {p: float((inside == p).double().mean()) for p in inside.unique().tolist()}
+        most = [p for p, share in shares.items() if share > 0.5 and p >= 0]
+        assert plane == (most[0] if most else -1)
+    assert 5 < (parts.plane >= 0).sum() < len(parts.plane)
+
+
+def test_order_threads_and_chunks_change_nothing(room, parts, monkeypatch):
+    order = torch.randperm(6000, generator=torch.Generator().manual_seed(1))
+    moved = partition_points(*(values[order] for values in room), CONFIG)
+    assert torch.equal(moved.labels, parts.labels[order])
+    assert torch.equal(moved.plane, parts.plane)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2 if before == 1 else 1)
+    try:
+        assert torch.equal(partition_points(*room, CONFIG).levels[1], parts.levels[1])
+    finally:
+        torch.set_num_threads(before)
+    monkeypatch.setattr(superpoints, "ROWS_AT_ONCE", 77)
+    assert torch.equal(partition_points(*room, CONFIG).labels, parts.labels)
+
+
+def test_unit_and_origin_change_nothing(room, parts):
+    points, normals, planes = room
+    far = points.double() * 2.0**-12 + torch.tensor([2.0**22, -(2.0**21), 0.0])
+    assert torch.equal(partition_points(far, normals, planes, CONFIG).labels, parts.labels)
+
+
+def test_duplicates_stay_together_and_points_that_are_not_finite_stay_out(room):
+    points, normals, planes = room
+    copies = torch.cat([torch.arange(6000), torch.arange(40).repeat(30), torch.tensor([7, 8])])
+    cloud = points[copies]
+    cloud[-1, 1], cloud[-2, 2] = torch.nan, torch.inf
+    found = partition_points(cloud, normals[copies], planes[copies], CONFIG)
+    assert found.labels[-2:].tolist() == [-1, -1]
+    assert torch.equal(found.labels[6000:-2], found.labels[:40].repeat(30))
+    alone = partition_points(points, normals, planes, CONFIG)
+    assert same_partition(found.labels[:6000], alone.labels)
+    assert torch.bincount(found.labels[:-2]).diff().le(0).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 30])
+def test_few_or_equal_points_are_one_superpoint(count):
+    for points in (torch.ones(count, 3), torch.arange(3.0 * count).reshape(count, 3)):
+        found = make_superpoints(points)
+        assert found.labels.tolist() == [0] * count
+        assert len(found.plane) == min(count, 1)
+        assert all(level.tolist() == [0] * count for level in found.levels)
+    assert make_superpoints(torch.full((4, 3), torch.nan)).labels.tolist() == [-1] * 4
+
+
+def test_an_island_without_neighbours_stays_small(rng):
+    points, normals, planes = crumpled(rng)
+    points[:9] += 50.0
+    config = dataclasses.replace(CONFIG, min_size=40)
+    found = partition_points(points, normals, planes, config)
+    assert len(found.labels[:9].unique()) == 1
+    assert torch.bincount(found.labels).min() == 9
+
+
+def test_a_floor_takes_in_its_specks_together(rng, monkeypatch):
+    points = torch.rand(3000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
+    normals = torch.tensor([0.0, 0, 1]).expand(3000, 3)
+    planes = torch.where(torch.rand(3000, generator=rng) < 0.1, -1, 0)
+    merge, turns = superpoints._merge, []
+    monkeypatch.setattr(superpoints, "_merge", lambda *args: turns.append(1) or merge(*args))
+    config = dataclasses.replace(CONFIG, planes="whole")
+    assert len(partition_points(points, normals, planes, config).plane) == 1
+    assert len(turns) < 10
+
+
+def test_whole_planes_are_not_cut_and_extents_are_bounded(room):
+    points, _, planes = room
+    bounded = dataclasses.replace(CONFIG, max_extent=0.8)
+    whole = partition_points(*room, dataclasses.replace(bounded, planes="whole"))
+    cut = partition_points(*room, bounded)
+    largest = torch.bincount(planes[planes >= 0]).argmax()
+    most = [torch.bincount(found.labels[planes == largest]).max() for found in (whole, cut)]
+    assert most[0] > 0.95 * (planes == largest).sum() > 2 * most[1]
+    for level in (cut.labels, *cut.levels):
+        for number in level.unique():
+            assert np.ptp(points[level == number].numpy(), axis=0).max() <= 0.8
+
+
+def test_specks_on_both_sides_do_not_exceed_an_extent():
+    points = torch.cat([torch.linspace(0, 1, 101), torch.tensor([-0.02, 1.02])])[:, None]
+    points = torch.cat([points, torch.zeros(103, 2)], dim=1)
+    normals = torch.tensor([0.0, 0, 1]).expand(103, 3)
+    planes = torch.where((points[:, 0] < 0) | (points[:, 0] > 1), -1, 0)
+    config = SuperpointsConfig((50.0,), min_size=1, planes="whole", max_extent=1.03)
+    found = partition_points(points, normals, planes, config)
+    sizes = [np.ptp(points[found.labels == i, 0].numpy()) for i in found.labels.unique()]
+    assert max(sizes) == pytest.approx(1.02, abs=1e-6)
+
+
+def test_colours_tell_flat_things_apart():
+    x, y = torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0)).unbind(1)
+    floor = torch.stack([x, y, 0 * x], dim=1)
+    seg = segment_planes(floor)
+    shade = torch.where(x < 17, 250, 20)[:, None].expand(-1, 3).to(torch.uint8)
+    config = SuperpointsConfig(strengths=(12.0,))
+    plain = make_superpoints(floor, seg, config)
+    colored = make_superpoints(floor, seg, config, colors=shade)
+    scaled = make_superpoints(floor, seg, config, colors=shade.double() / 255)
+    assert len(plain.plane) == 1
+    assert score_partition(colored.labels, (x < 17).long()).asa > 0.9
+    assert 1 < len(colored.plane) < 8
+    assert torch.equal(colored.labels, scaled.labels)
+
+
+def test_arguments_are_checked(room):
+    points = room[0]
+    with pytest.raises(ShapeError, match="expected points of shape"):
+        make_superpoints(points[:, :2])
+    with pytest.raises(ShapeError, match="expected colors of shape"):
+        make_superpoints(points, colors=points[:5])
+    seg = segment_planes(points[:100])
+    with pytest.raises(ShapeError, match="expected seg of 6,000 points, got 100"):
+        make_superpoints(points, seg)
+    for wrong in ({"strengths": ()}, {"strengths": (2.0, 1.0)}, {"max_extent": 0.0}):
+        with pytest.raises(ConfigError, match="SuperpointsConfig: expected"):
+            SuperpointsConfig(**wrong)
+
+
+def test_a_made_room_is_parted_at_its_objects():
+    scene = make_room(20_000, noise=0.003, seed=5, layout=OFFICE)
+    found = make_superpoints(scene.points, config=SuperpointsConfig(strengths=(0.1,)))
+    score = score_partition(found.labels, scene.objects[scene.labels], scene.points)
+    assert score.count < 400
+    assert score.asa > 0.98
+    assert score.oracle_miou > 0.85
+    assert score.boundary_recall > 0.9
+
+
+@pytest.mark.slow
+def test_office_parts_need_half_the_superpoints_of_cut_pursuit(scan):
+    cloud = read_cloud(scan("office_parts.pcd"))
+    found = make_superpoints(cloud.points)
+    fine, coarse = (
+        score_partition(level, cloud.fields["labels"], ignore=0) for level in found.levels[1:]
+    )
+    assert fine.count <= 900
+    assert fine.asa >= 0.95
+    assert coarse.count <= 390
+    assert coarse.asa >= 0.93

@@ -1,0 +1,170 @@
+"""Scores of superpoints: how well a partition of all points keeps to the objects of a truth."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg.errors import ConfigError
+from torchrg.metrics.contingency import check_labels, contingency_table
+from torchrg.metrics.protocols import share
+from torchrg.neighbors import search_knn
+from torchrg.structures import UNLABELED
+
+_NUM_NEIGHBORS = 8
+"""So many neighbours surround a point of a surface: a border runs between it and one of them."""
+
+
+class PartitionScore(NamedTuple):
+    """Quality of superpoints; see :func:`score_partition`.
+
+    Attributes:
+        asa: Achievable segmentation accuracy: share of the points that are right when every
+            superpoint takes its most frequent part.
+        oracle_miou: Mean IoU over the parts of that labelling.
+        boundary_recall: Share of the points at a true border that have one at a border of
+            superpoints within ``boundary_distance``; None without coordinates.
+        boundary_precision: Share of the points at a border of superpoints that have one at a true
+            border within ``boundary_distance``; None without coordinates.
+        boundary_distance: That distance, in the unit of the cloud; None without coordinates.
+        count: Superpoints, those without a scored point included.
+        points_per_superpoint: Mean number of points of a superpoint, all points counted.
+        points: Scored points.
+    """
+
+    asa: float
+    oracle_miou: float
+    boundary_recall: float | None
+    boundary_precision: float | None
+    boundary_distance: float | None
+    count: int  # type: ignore[assignment]
+    points_per_superpoint: float
+    points: int
+
+
+def score_partition(
+    superpoints: Tensor | NDArray[Any],
+    truth: Tensor | NDArray[Any],
+    points: Tensor | NDArray[np.floating] | None = None,
+    *,
+    boundary_distance: float | None = None,
+    ignore: int | None = None,
+) -> PartitionScore:
+    """Score a partition of a cloud by what a perfect classifier of its parts would reach.
+
+    Achievable segmentation accuracy and boundary recall are those of superpixels [1, 2]; the
+    labelling by the most frequent part is the oracle of superpoint graphs [3]. More superpoints
+    are never worse, so compare partitions of equally many.
+
+    Convention:
+        * Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored;
+          their superpoints count in ``count``.
+        * A point whose superpoint is -1 belongs to none, and is wrong.
+        * Of equally frequent parts a superpoint takes that of the lowest label.
+        * A point is at a border when one of its 8 nearest scored points has another label.
+
+    Args:
+        superpoints: Superpoint of each point, shape ``(N,)``, integers.
+        truth: True part or object of each point, shape ``(N,)``, integers.
+        points: Points, shape ``(N, 3)``, for the scores of borders; those that are not finite
+            count for no border. Default: these scores are None.
+        boundary_distance: How far apart two borders may be and still agree, in the unit of the
+            cloud. Default: the median distance to the 8th nearest neighbour.
+        ignore: Another true label that is not scored.
+
+    Returns:
+        The scores. A share of nothing is 0.
+
+    Raises:
+        ShapeError: If the labels are not integers, the points not floating, or lengths differ.
+        ConfigError: If ``boundary_distance`` is not positive.
+
+    References:
+        [1] M.-Y. Liu et al. Entropy rate superpixel segmentation. CVPR, 2011.
+        [2] A. Levinshtein et al. TurboPixels: fast superpixels using geometric flows. TPAMI, 2009.
+        [3] L. Landrieu, M. Simonovsky. Large-scale point cloud semantic segmentation with
+        superpoint graphs. CVPR, 2018.
+
+    Example:
+        >>> score = score_partition(torch.tensor([0, 0, 0, 1, 1]), torch.tensor([5, 5, 6, 6, 6]))
+        >>> score.asa, round(score.oracle_miou, 3), score.count, score.points_per_superpoint
+        (0.8, 0.667, 2, 2.5)
+    """
+    superpoints, truth = check_labels("score_partition", superpoints=superpoints, truth=truth)
+    if boundary_distance is not None and not 0 < boundary_distance < float("inf"):
+        raise ConfigError(
+            f"score_partition: expected boundary_distance > 0, got {boundary_distance!r}."
+        )
+    if points is not None:
+        points = as_tensor("score_partition", "points", points)
+        check_shapes("score_partition", points=(points, "N 3"), truth=(truth, "N"))
+        check_floating("score_partition", points=points)
+    scored = truth != UNLABELED if ignore is None else (truth != UNLABELED) & (truth != ignore)
+    has_one = superpoints != UNLABELED
+    count = len(torch.unique(superpoints[has_one]))
+    num_right, miou = _score_oracle(superpoints[scored], truth[scored])
+    recall = precision = None
+    if points is not None:
+        used = scored & points.isfinite().all(dim=1)
+        recall, precision, boundary_distance = _score_borders(
+            superpoints[used], truth[used], points[used].detach(), boundary_distance
+        )
+    num_scored = int(scored.sum())
+    return PartitionScore(
+        asa=share(num_right, num_scored),
+        oracle_miou=miou,
+        boundary_recall=recall,
+        boundary_precision=precision,
+        boundary_distance=boundary_distance if points is not None else None,
+        count=count,
+        points_per_superpoint=share(int(has_one.sum()), count),
+        points=num_scored,
+    )
+
+
+def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
+    """Return how many points the most frequent parts get right, and their mean IoU."""
+    table = contingency_table(superpoints, truth)
+    num_parts = len(table.face_sizes)
+    # Overlaps are sorted by superpoint, then by part: the first largest is of the lowest label.
+    most = torch.zeros_like(table.region_sizes).scatter_reduce(
+        0, table.regions, table.overlaps, "amax"
+    )
+    largest = table.overlaps == most[table.regions]
+    part = torch.full_like(table.region_sizes, num_parts).scatter_reduce(
+        0, table.regions[largest], table.faces[largest], "amin"
+    )
+    right = torch.zeros_like(table.face_sizes).index_add(0, part, most)
+    given = torch.zeros_like(table.face_sizes).index_add(0, part, table.region_sizes)
+    iou = right.double() / (given + table.face_sizes - right)
+    return int(right.sum()), share(float(iou.sum()), num_parts)
+
+
+def _score_borders(
+    superpoints: Tensor, truth: Tensor, points: Tensor, distance: float | None
+) -> tuple[float, float, float]:
+    """Return recall and precision of the borders of superpoints, and the distance they are at."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return 0.0, 0.0, distance or 0.0
+    indices = search_knn(points, min(_NUM_NEIGHBORS + 1, len(points))).indices[:, 1:].long()
+    if distance is None:
+        reach = (points[indices[:, -1]].double() - points.double()).norm(dim=1)
+        distance = float(reach.median())
+    ours, theirs = (
+        points[(labels[indices] != labels[:, None]).any(dim=1)].double().cpu().numpy()
+        for labels in (superpoints, truth)
+    )
+    if len(ours) == 0 or len(theirs) == 0:
+        return 0.0, 0.0, distance
+    shares = []
+    for of, near in ((theirs, ours), (ours, theirs)):
+        # The bound of the search excludes the distance itself.
+        limit = np.nextafter(distance, np.inf)
+        found = cKDTree(near).query(of, distance_upper_bound=limit)[0]
+        shares.append(float(np.isfinite(found).mean()))
+    return shares[0], shares[1], distance
