@@ -1,6 +1,7 @@
 """The files that ``segment_planes`` runs through, in the order in which it first enters them.
 
     python scripts/trace_path.py consensus
+    python scripts/trace_path.py consensus --brief
 
 The map to read the code by: each file with the functions by which other files enter it. What runs
 only at import does not count.
@@ -8,6 +9,7 @@ only at import does not count.
 
 import argparse
 import sys
+import textwrap
 from pathlib import Path
 from types import FrameType
 
@@ -19,6 +21,9 @@ from torchrg.config import preset_names
 PACKAGE = Path(torchrg.__file__).parent
 NUM_POINTS = 8_000
 """Enough for neighbours by cells, several chunks and every kind of surface."""
+
+WIDTH = 118
+"""Characters of a line of text."""
 
 LONGEST = {"classic": 18, "paper": 28, "consensus": 26}
 """Most files on the path of a preset: a test keeps it."""
@@ -59,11 +64,19 @@ def as_lines(path: dict[str, list[str]]) -> list[str]:
     return [*lines, f"{len(path)} files"]
 
 
+def as_paragraph(path: dict[str, list[str]]) -> list[str]:
+    """Return the files of a path alone, in lines of text."""
+    return textwrap.wrap(" > ".join(path), WIDTH, break_on_hyphens=False)
+
+
 def main() -> None:
     """Print the path of a preset."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("preset", nargs="?", default="consensus", choices=preset_names())
-    print(*as_lines(trace(parser.parse_args().preset)), sep="\n")
+    parser.add_argument("--brief", action="store_true", help="file names alone")
+    arguments = parser.parse_args()
+    path = trace(arguments.preset)
+    print(*(as_paragraph(path) if arguments.brief else as_lines(path)), sep="\n")
 
 
 if __name__ == "__main__":

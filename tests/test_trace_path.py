@@ -18,4 +18,4 @@ def test_path_of_a_preset_stays_short(preset):
 
 def test_readme_shows_the_path():
     (shown,) = re.findall(r"```text\n(pipeline\.py .*?)\n```", README.read_text(), re.DOTALL)
-    assert shown.splitlines() == trace_path.as_lines(trace("consensus"))
+    assert shown.splitlines() == trace_path.as_paragraph(trace("consensus"))
