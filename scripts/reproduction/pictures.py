@@ -12,9 +12,8 @@ from torch import Tensor
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
 from reproduction.tiles import tile_pictures
-from torchrg.metrics import contingency_table, match_regions
 from torchrg.render import color_planes, render_cloud, write_png
-from torchrg.structures import UNLABELED
+from torchrg.render.outcomes import OUTCOMES, outcomes_of
 
 _GRAY = 190
 """Of clouds without colours."""
@@ -22,14 +21,6 @@ _WIDTH = 1000
 """Of a picture, in pixels."""
 _LONG = 2.2
 """Width over height of a picture that takes the place of two."""
-
-OUTCOMES = {
-    "right": ((214, 224, 214), "in the region of their face"),
-    "part": ((245, 170, 40), "in a second region of their face"),
-    "other": ((205, 45, 60), "in the region of another face"),
-    "none": ((50, 95, 190), "in no region"),
-}
-"""What can become of a point: colour, and what it means."""
 
 
 def draw_side_by_side(
@@ -68,44 +59,13 @@ def draw_outcomes(
     folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]
 ) -> str:
     """Draw what became of every point of a cloud with truth, in the colours of :data:`OUTCOMES`."""
+    if cloud.labels is None:
+        raise ValueError("draw_outcomes: expected a cloud with truth.")
     colors = torch.tensor([color for color, _ in OUTCOMES.values()], dtype=torch.uint8)
     paints = {
         title: colors[outcomes_of(labels, cloud.labels)] for title, labels in labelings.items()
     }
     return _tile(folder, name, cloud, paints, legend=OUTCOMES.values())
-
-
-def outcomes_of(labels: Tensor, truth: Tensor | None) -> Tensor:
-    """Return what became of each point, as a place in :data:`OUTCOMES`.
-
-    Args:
-        labels: Regions, shape ``(N,)``.
-        truth: Faces, shape ``(N,)``.
-
-    Returns:
-        Shape ``(N,)``, int64: 0 where the region of the point is the partner of its face, 1 where
-        it is another one whose largest part is that face, 2 where it is mostly of other faces, 3
-        where the point is in no region.
-    """
-    if truth is None:
-        raise ValueError("outcomes_of: expected a cloud with truth.")
-    table = contingency_table(labels, truth)
-    pairs = match_regions(table)
-    partner = torch.full_like(table.region_labels, UNLABELED - 1)
-    partner[table.regions[pairs]] = table.face_labels[table.faces[pairs]]
-    # Overlaps by region, the largest first; the first of each region is that with its main face.
-    order = np.lexsort((-table.overlaps.numpy(), table.regions.numpy()))
-    regions, first = np.unique(table.regions.numpy()[order], return_index=True)
-    main = torch.full_like(table.region_labels, UNLABELED - 1)
-    main[regions] = table.face_labels[table.faces[order[first]]]
-    outcome = torch.full_like(labels, 3)
-    labeled = labels != UNLABELED
-    rows = torch.searchsorted(table.region_labels, labels[labeled])
-    faces = truth[labeled]
-    outcome[labeled] = torch.where(
-        partner[rows] == faces, 0, torch.where(main[rows] == faces, 1, 2)
-    )
-    return outcome
 
 
 def _tile(

@@ -6,7 +6,7 @@ from reproduction.cells import Record
 from reproduction.clouds import TITLES
 from reproduction.methods import DRAWN, METHODS
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
-from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side, outcomes_of
+from reproduction.pictures import draw_outcomes, draw_side_by_side
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
 from reproduction.segmentations import SAMPLE_SIZE, read_segmented, score
