@@ -31,8 +31,9 @@ MODES = {
 }
 """Meanings of colours: what a page calls them, and the field that they need."""
 
-_OCTAHEDRON_STEPS = 255
-"""Steps along the sides of the square onto which directions are mapped: about one degree."""
+_OCTAHEDRON_STEPS = 254
+"""Steps along the sides of the square onto which directions are mapped: about one degree. An even
+number, so that the axes are mapped exactly."""
 _DIRECTION_BITS = 6
 """Bits of each coordinate of that square that tell a colour."""
 _CURVATURE_END = 0.1
@@ -62,30 +63,22 @@ class Channel(NamedTuple):
     legend: Legend
 
 
-def list_channels(
+def channels_of(
     points: Tensor,
     fields: Mapping[str, Tensor],
     truth: Mapping[str, Tensor],
     *,
     reference: Tensor | None = None,
-) -> list[Channel]:
-    """Return all that the fields of points can be coloured by, in the order of :data:`MODES`.
+) -> Iterator[Channel]:
+    """Yield all that the fields of points can be coloured by, in the order of :data:`MODES`.
 
     Args:
         points: Shape ``(n, 3)``, finite; they tell which planes need unlike colours.
-        fields: Of a cloud, of those points; see :class:`torchrg.structures.Cloud`.
+        fields: Of a cloud, of those points; see :class:`torchrg.structures.Cloud`. Labels and
+            superpoints are numbered without gaps.
         truth: ``labels`` or ``normals`` of the same points.
         reference: Labels whose planes shall have the same colours, shape ``(n,)``.
     """
-    return list(_channels(points, fields, truth, reference))
-
-
-def _channels(
-    points: Tensor,
-    fields: Mapping[str, Tensor],
-    truth: Mapping[str, Tensor],
-    reference: Tensor | None,
-) -> Iterator[Channel]:
     if "labels" in fields:
         yield _of_regions("plane", fields["labels"], points, reference)
     if "superpoints" in fields:
@@ -112,12 +105,14 @@ def _channels(
 def _of_regions(
     mode: str, labels: Tensor, points: Tensor, reference: Tensor | None
 ) -> Channel:
-    """Return the colours of regions; the last colour is that of points in none."""
+    """Return the colours of regions by their number; the last colour is that of points in none."""
     rows, palette = palette_of_planes(labels, points, reference=reference, for_all_eyes=True)
-    none = len(palette) - 1
-    values = torch.where(rows < 0, none, rows).numpy().astype(np.min_scalar_type(none))
+    none = int(labels.max()) + 1 if len(labels) else 0
+    values = torch.where(labels < 0, none, labels)
+    colors = palette[-1:].repeat(none + 1, 1)
+    colors[values] = palette[rows]
     legend = [([UNLABELED_GRAY] * 3, "in none")] if bool((rows < 0).any()) else []
-    return Channel(mode, values, palette.numpy(), legend)
+    return Channel(mode, values.numpy().astype(np.min_scalar_type(none)), colors.numpy(), legend)
 
 
 def _of_normals(normals: Tensor) -> Channel:
@@ -171,7 +166,7 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
 
     Example:
         >>> encode_directions(torch.tensor([[0.0, 0, 1], [1, 0, 0]])).tolist()
-        [[128, 128], [255, 128]]
+        [[127, 127], [254, 127]]
     """
     size = directions.abs().sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     x, y, z = (directions / size).unbind(dim=1)
@@ -187,7 +182,7 @@ def decode_directions(places: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the unit vectors ``(n, 3)`` of :func:`encode_directions`.
 
     Example:
-        >>> decode_directions(np.array([[255, 128]], dtype=np.uint8)).round(2).tolist()
+        >>> decode_directions(np.array([[254, 127]], dtype=np.uint8)).tolist()
         [[1.0, 0.0, 0.0]]
     """
     x, y = (places.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
