@@ -97,7 +97,7 @@ const state = {
   top: 0, near: 0, size: 0, picked: null, share: 1, moving: false,
   camera: { target: [0, 0, 0], rotationOrbit: 0, rotationX: 30, zoom: 5 },
 };
-let drawing = null; // deck.gl's Deck.
+let drawing = null, CloudLayer = null; // deck.gl's Deck, and our kind of its layers.
 const frames = []; // Milliseconds between the last frames.
 
 function axesOfView() {
@@ -119,6 +119,8 @@ function sizeOfView() {
   return [clientWidth / page.clouds.length, clientHeight];
 }
 
+const focalLength = () => sizeOfView()[1] / 2 / Math.tan((FIELD_OF_VIEW / 2) * RADIANS);
+
 // The camera sees the points that are shown, but for the outermost ones.
 function showWhole() {
   const { right, up, toward } = axesOfView();
@@ -138,7 +140,7 @@ function showWhole() {
   const [width, height] = sizeOfView();
   const pixels = 0.9 * Math.min(width / reach[0][1], height / reach[1][1]);
   // What is in front of the target looks larger: step back by half of the depth.
-  const distance = height / 2 / Math.tan((FIELD_OF_VIEW / 2) * RADIANS) / pixels;
+  const distance = focalLength() / pixels;
   state.camera.zoom = Math.log2(pixels * distance / (distance + reach[2][1] * 0.35));
 }
 
@@ -194,63 +196,90 @@ function hide(cloud) {
   }
 }
 
-function makeExtension({ LayerExtension }) {
+// A layer of deck.gl that draws a point as one vertex; its own draws an instanced triangle for each.
+function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
+  const names = ["eye", "ahead", "light", "size", "limits"];
   const block = `layout(std140) uniform cutUniforms {
-    vec4 ahead; vec4 light; vec4 size; vec4 limits;
+    ${names.map((name) => `vec4 ${name};`).join("\n    ")}
   } cut;`;
-  // ahead: level direction to the viewer, and where it is cut; light: toward the light;
-  // size: radius in space, focal length, smallest and largest radius in pixels;
+  // eye: the viewer's place; ahead: level direction to the viewer, and where it is cut; light:
+  // toward the light; size: radius in space, focal length, smallest and largest radius in pixels;
   // limits: bits that are hidden, and the height of the cut.
   const module = {
     name: "cut", vs: block,
-    uniformTypes: { ahead: "vec4<f32>", light: "vec4<f32>", size: "vec4<f32>", limits: "vec4<f32>" },
+    uniformTypes: Object.fromEntries(names.map((name) => [name, "vec4<f32>"])),
   };
-  class CutExtension extends LayerExtension {
-    getShaders() {
-      return {
-        modules: [module],
-        inject: {
-          "vs:#decl": "in float instanceCovers;",
-          "vs:DECKGL_FILTER_SIZE": `
-            vec3 middle = project_position(geometry.worldPosition);
-            float away = distance(middle, project.cameraPosition);
-            size.xy *= clamp(cut.size.x * cut.size.y / away, cut.size.z, cut.size.w);`,
-          "vs:DECKGL_FILTER_GL_POSITION": `
-            bool gone = (int(instanceCovers * 255.0 + 0.5) & int(cut.limits.x)) != 0;
-            gone = gone || geometry.worldPosition.z > cut.limits.y;
-            gone = gone || dot(geometry.worldPosition, cut.ahead.xyz) > cut.ahead.w;
-            if (gone) position = vec4(0.0, 0.0, 2.0, 1.0);`,
-          "vs:DECKGL_FILTER_COLOR": `
-            vec3 surface = geometry.normal;
-            float facing = dot(surface, project.cameraPosition - geometry.position.xyz) < 0.0 ? -1.0 : 1.0;
-            float lit = dot(surface, surface) < 0.25 ? 0.4 : 0.5 + 0.5 * facing * dot(surface, cut.light.xyz);
-            color.rgb *= 0.62 + 0.38 * lit;`,
-        },
-      };
-    }
+  const vs = `#version 300 es
+    in vec3 places;
+    in vec3 normals;
+    in vec4 colors;
+    in float covers;
+    out vec4 vColor;
+    void main(void) {
+      geometry.worldPosition = places;
+      int number = gl_VertexID + 1; // As deck.gl counts what is picked: 0 is nothing.
+      geometry.pickingColor = vec3(number & 255, number >> 8 & 255, number >> 16 & 255);
+      gl_Position = project_position_to_clipspace(places, vec3(0.0), vec3(0.0), geometry.position);
+      bool gone = (int(covers * 255.0 + 0.5) & int(cut.limits.x)) != 0;
+      gone = gone || places.z > cut.limits.y || dot(places, cut.ahead.xyz) > cut.ahead.w;
+      if (gone) gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+      vec3 sight = cut.eye.xyz - places;
+      float radius = clamp(cut.size.x * cut.size.y / length(sight), cut.size.z, cut.size.w);
+      gl_PointSize = 2.0 * radius * project.devicePixelRatio;
+      float facing = dot(normals, sight) < 0.0 ? -1.0 : 1.0;
+      float lit = dot(normals, normals) < 0.25 ? 0.6 : 0.5 + 0.5 * facing * dot(normals, cut.light.xyz);
+      vColor = vec4(colors.rgb * (0.62 + 0.38 * lit), 1.0);
+      DECKGL_FILTER_COLOR(vColor, geometry);
+    }`;
+  const fs = `#version 300 es
+    precision highp float;
+    in vec4 vColor;
+    out vec4 fragColor;
+    void main(void) {
+      vec2 offset = 2.0 * gl_PointCoord - 1.0;
+      if (dot(offset, offset) > 1.0) discard;
+      fragColor = vColor;
+      DECKGL_FILTER_COLOR(fragColor, geometry);
+    }`;
+  class CloudLayer extends Layer {
     initializeState() {
-      this.getAttributeManager().addInstanced({
-        instanceCovers: { size: 1, type: "unorm8", accessor: "getCovers", defaultValue: 0 },
+      const attributes = this.getAttributeManager();
+      attributes.remove(["instancePickingColors"]);
+      attributes.add({
+        places: { size: 3, accessor: "getPosition" },
+        normals: { size: 3, accessor: "getNormal" },
+        colors: { size: 4, type: "unorm8", accessor: "getColor" },
+        covers: { size: 1, type: "unorm8", accessor: "getCovers" },
       });
+      const model = new Model(this.context.device, {
+        ...this.getShaders(), id: this.props.id, topology: "point-list", isInstanced: false,
+        bufferLayout: attributes.getBufferLayouts(),
+      });
+      this.setState({ model });
     }
-    draw() { this.setShaderModuleProps({ cut: this.props.cut }); }
+    getShaders() { return super.getShaders({ vs, fs, modules: [project32, picking, module] }); }
+    draw() {
+      const { model } = this.state;
+      model.setVertexCount(this.props.data.length);
+      model.shaderInputs.setProps({ cut: this.props.cut });
+      model.draw(this.context.renderPass);
+    }
   }
-  CutExtension.extensionName = "CutExtension";
-  CutExtension.defaultProps = {
-    getCovers: { type: "accessor", value: 0 }, cut: { type: "object", value: {}, compare: false },
-  };
-  return new CutExtension();
+  CloudLayer.layerName = "CloudLayer";
+  CloudLayer.defaultProps = Object.fromEntries(["getPosition", "getNormal", "getColor", "getCovers"]
+    .map((name) => [name, { type: "accessor", value: [0, 0, 0, 0] }]));
+  return CloudLayer;
 }
 
-function layersOf({ PointCloudLayer, PathLayer, LineLayer }, pickable) {
+function layersOf({ PathLayer, LineLayer }) {
   return page.clouds.flatMap((cloud, c) => {
     const { bits, ahead, top, near } = limits(cloud);
     const { toward, right, up } = axesOfView();
     const light = unit(plus(plus(scaled(right, -0.45), scaled(up, 0.7)), scaled(toward, 0.55)));
-    const level = pickable ? cloud.levels.length : Math.max(1, Math.round(state.share * cloud.levels.length));
+    const level = Math.max(1, Math.round(state.share * cloud.levels.length));
     const length = cloud.levels[level - 1] ?? 0;
-    const radius = cloud.spacing * 0.75 * 1.15 ** state.size * Math.sqrt(cloud.shown / Math.max(length, 1));
-    const focal = sizeOfView()[1] / 2 / Math.tan((FIELD_OF_VIEW / 2) * RADIANS);
+    const radius = 1.2 * cloud.spacing * 1.15 ** state.size * Math.sqrt(cloud.shown / Math.max(length, 1));
+    const eye = plus(state.camera.target, scaled(toward, focalLength() / 2 ** state.camera.zoom));
     const isCut = cutOf(cloud);
     const inView = ({ sides, rings }, plane) => !cloud.hidden.has(plane) && !(sides & bits)
       && rings[0].every((p) => p[2] <= top && dot(p, ahead) <= near);
@@ -259,24 +288,24 @@ function layersOf({ PointCloudLayer, PathLayer, LineLayer }, pickable) {
       chosen(plane, number) ? plane.rings.map((ring) => ({ ring: [...ring, ring[0]] })) : []);
     const lines = (id, data, color, width) => new PathLayer({
       id: `${id}-${c}`, data, getPath: (row) => row.ring, getColor: color, getWidth: width,
-      widthUnits: "pixels", jointRounded: true, capRounded: true, getPolygonOffset: () => [0, -4000],
+      widthUnits: "pixels", jointRounded: true, capRounded: true,
+      ...(id === "outlines" ? { getPolygonOffset: () => [0, -4000] } : { parameters: { depthCompare: "always" } }),
     });
     return [
-      new PointCloudLayer({
-        id: `points-${c}`, pickable, material: false, pointSize: 1, sizeUnits: "pixels",
+      new CloudLayer({
+        id: `points-${c}`, pickable: true,
         data: {
           length,
           attributes: {
             getPosition: { value: cloud.positions, size: 3 },
             getNormal: { value: cloud.normals, size: 3 },
-            getColor: { value: cloud.colors, size: 4 },
-            getCovers: { value: cloud.mask, size: 1 },
+            getColor: { value: cloud.colors, size: 4, normalized: true },
+            getCovers: { value: cloud.mask, size: 1, normalized: true },
           },
         },
-        extensions: [extension],
         cut: {
-          ahead: [...ahead, near], light: [...light, 0], size: [radius, focal, 0.8, 30],
-          limits: [bits, top, 0, 0],
+          eye: [...eye, 0], ahead: [...ahead, near], light: [...light, 0],
+          size: [radius, focalLength(), 0.8, 30], limits: [bits, top, 0, 0],
         },
       }),
       state.outlines && lines("outlines", rings(inView), [20, 28, 40, 210], 1.5),
@@ -302,9 +331,8 @@ function normalLines(cloud, isCut) {
   return lines;
 }
 
-let extension = null;
-function draw(pickable = false) {
-  drawing.setProps({ layers: layersOf(globalThis.deck, pickable), viewState: { ...state.camera } });
+function draw() {
+  drawing.setProps({ layers: layersOf(globalThis.deck), viewState: { ...state.camera } });
   showScale();
 }
 
@@ -368,6 +396,10 @@ function showScale() {
 // ---- Picking ---------------------------------------------------------------------------------
 
 const number = (value, digits = 4) => Number(value.toPrecision(digits)).toLocaleString("en", { maximumSignificantDigits: digits });
+// Places of a point to a ten-thousandth of the cloud or better.
+const decimals = Math.max(0, 4 - Math.floor(Math.log10(page.frame.scale * 10)));
+const place = (value) => (Math.round(value * 10 ** decimals) / 10 ** decimals + 0)
+  .toLocaleString("en", { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
 const inFile = (point) => {
   const { origin, rotation, scale } = page.frame;
   return [0, 1, 2].map((axis) =>
@@ -377,8 +409,9 @@ const inFileDirection = (v) => [0, 1, 2].map((axis) =>
   page.frame.rotation[0][axis] * v[0] + page.frame.rotation[1][axis] * v[1] + page.frame.rotation[2][axis] * v[2]);
 
 function pick(x, y) {
-  draw(true);
+  drawing.setProps({ _pickable: true });
   const found = drawing.pickObject({ x, y, radius: 5 });
+  drawing.setProps({ _pickable: false });
   const c = found ? Number(found.layer.id.split("-")[1]) : -1;
   choose(found && found.layer.id.startsWith("points") ? { cloud: c, point: found.index,
     plane: planeOf(page.clouds[c], found.index) } : null);
@@ -426,9 +459,8 @@ function describePicked() {
   if (page.clouds.length > 1) add("in", cloud.name);
   if (own >= 0) {
     const plane = cloud.planes[own];
-    const [a, b, d] = [plane.normal[0], plane.normal[1], plane.normal[2]].map((v) => v.toFixed(4));
     add("plane", `${plane.name}${plane.curved ? " (curved)" : ""}, ${page.kinds[plane.kind]}`);
-    add("equation", `${a} x ${sign(b)} y ${sign(d)} z = ${number(plane.offset, 6)}`);
+    add("equation", equation(plane));
     add("area", number(plane.area));
     add("extent", plane.extent.map((side) => number(side)).join(" × "));
     add("rms", number(plane.rms, 3));
@@ -440,7 +472,7 @@ function describePicked() {
     if (met.length) add("meets", ...met);
   } else add("plane", "none");
   if (point !== undefined) {
-    add("at", inFile(at(cloud.positions, point)).map((v) => number(v, 6)).join("  "));
+    add("at", inFile(at(cloud.positions, point)).map(place).join("  "));
     const normal = at(cloud.normals, point);
     if (dot(normal, normal) > 0) add("normal", inFileDirection(normal).map((v) => v.toFixed(2)).join("  "));
     if (cloud.values.curvature) add("curvature", number(0.1 * (cloud.values.curvature[point] / 255) ** 2, 2));
@@ -462,7 +494,12 @@ function describePicked() {
   box.append(row);
 }
 
-const sign = (digits) => (digits.startsWith("-") ? `− ${digits.slice(1)}` : `+ ${digits}`);
+function equation({ normal, offset }) {
+  const terms = ["x", "y", "z"].map((axis, i) => [normal[i], `${Math.abs(normal[i]).toFixed(4)} ${axis}`])
+    .filter(([value]) => Math.abs(value) >= 0.00005);
+  const left = terms.map(([value, text], i) => (value < 0 ? (i ? "− " : "−") : i ? "+ " : "") + text).join(" ");
+  return `${left} = ${place(offset)}`;
+}
 
 function lookAt(c, own) {
   const ring = page.clouds[c].planes[own].rings[0];
@@ -540,7 +577,9 @@ function markRow() {
   for (const row of $("planes").querySelectorAll("tr")) {
     const marked = state.picked?.cloud === c && Number(row.dataset.plane) === state.picked.plane;
     row.setAttribute("aria-selected", marked);
-    if (marked) row.scrollIntoView({ block: "nearest" });
+    if (!marked) continue;
+    const [box, above] = [$("planes"), row.offsetTop - $("planes").offsetTop];
+    if (above < box.scrollTop || above > box.scrollTop + box.clientHeight - 24) box.scrollTop = above - 60;
   }
 }
 
@@ -647,7 +686,7 @@ async function begin() {
     throw new Error("This browser offers no WebGL 2, which drawing needs.");
   document.head.append(library); // Runs at once: the page's policy knows it by its hash.
   const { Deck, OrbitView } = globalThis.deck;
-  extension = makeExtension(globalThis.deck);
+  CloudLayer = makeCloudLayer(globalThis.deck, globalThis.luma);
   page.clouds.forEach(paint);
   lookFrom(page.toward);
   showWhole();
@@ -666,13 +705,21 @@ async function begin() {
       moved();
     },
     onAfterRender: afterFrame,
-    onError: (error) => say(`Drawing failed: ${error.message}`),
+    onError: fail,
     onLoad: () => { say(""); page.ready = true; },
-    layers: [],
+    _pickable: false, // Until one clicks: looking for what is under the mouse costs a frame each time.
+    layers: layersOf(globalThis.deck),
   });
   listen();
-  draw();
+  showScale();
+}
+
+let failed = false;
+function fail(error) { // The first error tells the reason; others follow from it.
+  if (!failed) say(`This page cannot be drawn: ${error.message}`);
+  failed = true;
+  console.error(error.message);
 }
 
 globalThis.torchrg = { page, state, frames, pick, choose, setMode, setHidden, turn, home, draw, deck: () => drawing };
-begin().catch((error) => { say(error.message); console.error(error); });
+begin().catch(fail);

@@ -295,6 +295,13 @@ def _describe_cloud(
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     channels = list(channels_of(shown.points, shown.fields, true_fields, reference=reference))
     surfaces, covered, spacing = _outer_surfaces(shown.points)
+    planes = _describe_planes(cloud, shown, frame)
+    if planes:
+        sides = _sides_of(shown.fields["labels"], covered, len(planes))
+        # What stands against a wall, and the floor along it, is not part of the wall.
+        covered &= torch.cat([sides, sides.new_full((1,), 255)])[shown.fields["labels"]]
+        for plane, side in zip(planes, sides.tolist(), strict=True):
+            plane["sides"] = side
     low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
     steps = ((shown.points - low) * (_STEPS / _PAGE_EXTENT)).round().clamp(0, _STEPS)
     arrays: dict[str, NDArray[Any]] = {"positions": steps.numpy().astype(np.uint16)}
@@ -318,7 +325,7 @@ def _describe_cloud(
         "spacing": spacing,
         "surfaces": [_rounded(surface.direction) for surface in surfaces],
         "channels": {channel.mode: _describe_channel(channel) for channel in channels},
-        "planes": _describe_planes(cloud, shown, covered, frame),
+        "planes": planes,
         "arrays": manifest,
     }
     return scene, blob
@@ -355,9 +362,7 @@ def _direction_of_view(
     return choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg).toward
 
 
-def _describe_planes(
-    cloud: Cloud, shown: _Shown, covered: Tensor, frame: _Frame
-) -> list[dict[str, Any]]:
+def _describe_planes(cloud: Cloud, shown: _Shown, frame: _Frame) -> list[dict[str, Any]]:
     """Return what a page says about each plane, by the number that its points have there."""
     if "labels" not in shown.fields:
         return []
@@ -375,7 +380,6 @@ def _describe_planes(
         normals = given.to(points.dtype).nan_to_num(0, 0, 0)
     table = summarize_planes(points, normals, labels, up=frame.rotation[2].tolist())
     drawn = _planes_to_draw(shown, len(names))
-    sides = _sides_of(shown.fields["labels"], covered, len(names))
     offset = table.offset.double() + table.normal.double() @ torch.from_numpy(cloud.origin)
     kinds = table.kind if table.kind is not None else torch.zeros_like(table.count)
     rows = zip(
@@ -388,14 +392,12 @@ def _describe_planes(
         offset.tolist(),
         kinds.tolist(),
         (table.curved & has_normals).tolist(),
-        sides.tolist(),
         _rectangles(table, frame, cloud.origin),
         strict=True,
     )
     planes = []
-    for number, (name, count, area, rms, extent, normal, height, kind, curved, side, corners) in (
-        enumerate(rows)
-    ):
+    for number, row in enumerate(rows):
+        name, count, area, rms, extent, normal, height, kind, curved, corners = row
         rings, met = drawn.get(number, ([], []))
         planes.append(
             {
@@ -408,7 +410,6 @@ def _describe_planes(
                 "offset": height,
                 "kind": kind,
                 "curved": curved,
-                "sides": side,
                 "rings": rings or [corners],
                 "meets": met,
             }
@@ -451,10 +452,10 @@ def _sides_of(labels: Tensor, covered: Tensor, num_planes: int) -> Tensor:
     labeled = labels >= 0
     own, bits = labels[labeled], covered[labeled].long()
     counts = torch.bincount(own, minlength=num_planes)
-    sides = torch.zeros_like(counts)
+    sides = torch.zeros(num_planes, dtype=torch.uint8)
     for place in range(_MAX_SURFACES):
         inside = torch.bincount(own[(bits >> place & 1).bool()], minlength=num_planes)
-        sides |= (2 * inside > counts).long() << place
+        sides |= (2 * inside > counts).to(torch.uint8) << place
     return sides
 
 
