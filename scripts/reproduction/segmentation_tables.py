@@ -12,6 +12,7 @@ from reproduction.sections import Block, figure, mark_best, section, table, text
 from reproduction.segmentations import SAMPLE_SIZE, read_segmented, score
 from reproduction.trends import INTERNAL, face_recalls, internal_claim, trend_claims
 from torchrg.metrics import METRICS
+from torchrg.render.outcomes import OUTCOMES, outcomes_of
 
 CLOUDS = {"tutorial": "Figure 7", "hallway": "Figure 8"}
 """Clouds of Table 2, and the figures that show them."""

@@ -58,7 +58,7 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(Arguments, argv, prog="torchrg depth")
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out, suffix=".png")
-    pictures = console.picture_paths(outputs, arguments.picture)
+    pictures = console.picture_paths(outputs, arguments.picture, suffixes=(".png",))
     return console.run_each(_segment_image, arguments, outputs, pictures)
 
 

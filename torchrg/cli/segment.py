@@ -15,7 +15,9 @@ from torchrg.cli import console
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
-from torchrg.render import color_planes, render_cloud, write_png
+from torchrg.render import make_page, write_page
+from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
+from torchrg.render.page import check_library
 from torchrg.transforms import segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -36,7 +38,11 @@ class Arguments:
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
-    """Picture of the planes to write too, a .png file; for several inputs a directory."""
+    """Picture of the planes to write too, a .png file, or page, a .html file; for several inputs a
+    directory of pictures."""
+    pages: bool = False
+    """Beside each picture in the directory write a page for the browser to turn the cloud in, and
+    index.html, in which the pictures lead to their pages (pip install 'torchrg[view]')."""
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
@@ -55,7 +61,26 @@ def run(argv: list[str]) -> int:
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     pictures = console.picture_paths(outputs, arguments.picture)
-    return console.run_each(_segment_file, arguments, outputs, pictures)
+    if arguments.pages:
+        _check_pages(arguments)
+    code = console.run_each(_segment_file, arguments, outputs, pictures)
+    if arguments.pages and arguments.picture is not None:
+        done = [path for path in pictures if path is not None and _page_of(path).is_file()]
+        entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
+        print(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
+    return code
+
+
+def _check_pages(arguments: Arguments) -> None:
+    """Refuse pages without a directory for them, or without what they need."""
+    if arguments.picture is None or not arguments.picture.is_dir():
+        raise ConfigError("expected --pages together with --picture DIRECTORY.")
+    check_library()
+
+
+def _page_of(picture: Path) -> Path:
+    """Return where the page of a picture is."""
+    return picture.with_suffix(".html")
 
 
 def _refuse_images(argv: list[str]) -> None:
@@ -93,8 +118,13 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
     provenance = describe_run(source, settings) | ({} if voxel is None else {"voxel": voxel})
     write_cloud(target, cloud, seg, provenance=provenance)
     if picture is not None:
-        colors = color_planes(seg.labels, cloud.points)
-        write_png(picture, render_cloud(cloud.points, colors, normals=seg.normals))
+        result = with_results(cloud, seg)
+        if arguments.pages:
+            draw_entry(picture.parent, picture.stem, result)
+        elif console.is_page(picture):
+            write_page(picture, make_page(result))
+        else:
+            draw_planes(picture, result)
     seconds = time.perf_counter() - begin
     num_planes = len(seg.planes.count)
     if num_planes == 0:

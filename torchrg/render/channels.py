@@ -102,9 +102,7 @@ def channels_of(
         yield _of_angles(unsigned_angle_deg(fields["normals"], truth["normals"]))
 
 
-def _of_regions(
-    mode: str, labels: Tensor, points: Tensor, reference: Tensor | None
-) -> Channel:
+def _of_regions(mode: str, labels: Tensor, points: Tensor, reference: Tensor | None) -> Channel:
     """Return the colours of regions by their number; the last colour is that of points in none."""
     rows, palette = palette_of_planes(labels, points, reference=reference, for_all_eyes=True)
     none = int(labels.max()) + 1 if len(labels) else 0

@@ -357,7 +357,7 @@ function afterFrame() {
     const time = now - lastFrame;
     frames.push(time);
     if (frames.length > 120) frames.shift();
-    if (time > SLOW_MS) state.share = Math.max(0.125, state.share * 0.7);
+    if (time > SLOW_MS) state.share = Math.max(0.125, state.share * Math.max(0.3, FAST_MS / time));
     else if (time < FAST_MS) state.share = Math.min(1, state.share * 1.2);
   }
   lastFrame = now;

@@ -218,7 +218,6 @@ def check_library() -> None:
 
 def _read_library() -> str:
     """Return the JavaScript of deck.gl."""
-    require("jinja2", extra="view", purpose="write pages")
     found = require("pydeck", extra="view", purpose="write pages")
     source = Path(str(found.__file__)).parent / _LIBRARY
     if not source.is_file():
@@ -354,12 +353,14 @@ def _direction_of_view(
 ) -> Tensor:
     """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
     if view == "sensor":
-        return -frame.rotation[:, 2].float()
+        behind: Tensor = -frame.rotation[:, 2].float()
+        return behind
     grid = build_grid(points)
     if len(grid.levels) == 0:
         return functional.normalize(torch.tensor([-1.0, -1.0, 1.0]), dim=0)
     up = torch.tensor([0.0, 0.0, 1.0])
-    return choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg).toward
+    toward: Tensor = choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg)[0]
+    return toward
 
 
 def _describe_planes(cloud: Cloud, shown: _Shown, frame: _Frame) -> list[dict[str, Any]]:
@@ -509,19 +510,30 @@ def _encode(content: bytes) -> str:
 
 def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library: str) -> str:
     """Return the text of a page."""
-    from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
     script = (_ASSETS / "page.js").read_text(encoding="utf-8")
-    environment = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined)
-    template = environment.from_string((_ASSETS / "page.html.jinja").read_text(encoding="utf-8"))
-    return template.render(
+    html: str = template_of("page.html.jinja").render(
         title=description["title"],
         description=Markup(_json_for_html(description)),  # noqa: S704 Escaped there.
         blobs=[Markup(blob) for blob in blobs],  # noqa: S704 Base64.
         script=Markup(script),  # noqa: S704 Our own.
         hashes=[_script_hash(script), _script_hash(library)],
     )
+    return html
+
+
+def template_of(name: str) -> Any:  # noqa: ANN401
+    """Return one of the templates beside this file; what is put into it is escaped.
+
+    Raises:
+        MissingDependencyError: If jinja2 is not installed.
+    """
+    jinja2 = require("jinja2", extra="view", purpose="write pages")
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string((_ASSETS / name).read_text(encoding="utf-8"))
 
 
 def _json_for_html(value: object) -> str:
