@@ -33,8 +33,9 @@ Direction = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Arguments:
-    """Draw a cloud, coloured by its planes if it has labels: a PNG file, or a page for the browser
-    to turn the cloud in, point at planes, and compare.
+    """Draw a cloud, coloured by its planes if it has labels.
+
+    As a PNG file, or as a page for the browser: to turn the cloud, point at planes, and compare.
     """
 
     file: Annotated[Path, tyro.conf.Positional]

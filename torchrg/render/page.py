@@ -8,6 +8,7 @@ page's policy allows only the scripts that torchrg put there, and no connection.
 """
 
 import base64
+import functools
 import hashlib
 import json
 import math
@@ -16,7 +17,7 @@ import zlib
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import canonical_order, search_knn
+from torchrg.neighbors import finite_rows, search_knn
 from torchrg.regions import summarize_planes
 from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
 from torchrg.render.cutaway import (
@@ -96,12 +97,14 @@ class _Shown(NamedTuple):
     """The points of a cloud that a page shows.
 
     Attributes:
-        rows: Of the cloud, by strata, shape ``(n,)``.
+        finite: All finite rows of the cloud, in canonical order.
+        rows: Those that are shown, by strata, shape ``(n,)``.
         levels: Number of points in the first stratum, in the first two, and so on.
         points: In the axes of the page, shape ``(n, 3)``, float32.
         fields: Of those points; normals in the axes of the page, labels numbered without gaps.
     """
 
+    finite: Tensor
     rows: Tensor
     levels: list[int]
     points: Tensor
@@ -146,47 +149,36 @@ def make_page(
         ConfigError: If a setting is not as above, or the cloud lacks what the colours shall show.
         MissingDependencyError: If pydeck is not installed.
     """
-    if max_points < 1:
-        raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
-    if up is None:
-        up = (0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0)
-    if not any(up):
-        raise ConfigError("make_page: expected up to be a direction, got zeros.")
-    if truth is not None and len(truth) != len(cloud):
-        raise ConfigError(
-            f"make_page: expected a truth of {len(cloud):,} points, got {len(truth):,}; it has to "
-            "be of the same points in the same order."
-        )
+    up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
     frame = _frame_of(cloud, up)
     clouds = [cloud] if beside is None else [cloud, beside]
+    shown = [_choose_points(each, frame, max_points) for each in clouds]
+    truths: list[Cloud | None] = [truth]
+    references: list[Tensor | None] = [None]
+    if beside is not None:
+        is_same = np.array_equal(cloud.coordinates, beside.coordinates, equal_nan=True)
+        truths.append(truth if is_same else None)
+        references.append(shown[0].fields.get("labels") if is_same else None)
     scenes: list[dict[str, Any]] = []
     blobs: list[str] = []
-    first: tuple[Cloud, _Shown] | None = None
-    for each in clouds:
-        shown = _choose_points(each, frame, max_points)
-        reference = None
-        if first is not None and "labels" in first[1].fields and _same_points(first[0], each):
-            reference = first[1].fields["labels"]
-        scene, blob = _describe_cloud(each, shown, truth, frame, reference)
+    for parts in zip(clouds, shown, truths, references, strict=True):
+        scene, blob = _describe_cloud(*parts, frame)
         scenes.append(scene)
         blobs.append(blob)
-        first = first or (each, shown)
-        truth = None if beside is None or not _same_points(cloud, beside) else truth
     modes = [mode for mode in MODES if any(mode in scene["channels"] for scene in scenes)]
     if color is not None and color not in modes:
+        needed = f"{MODES[color][1]} for" if color in MODES else f"one of {', '.join(MODES)} as"
+        beyond = " and a truth" if color.endswith("error") else ""
         raise ConfigError(
-            f"{cloud.source or 'make_page'}: expected {MODES[color][1] if color in MODES else color}"
-            f" for the colour {color!r}, got {', '.join(cloud.fields) or 'points alone'}."
+            f"{cloud.source or 'make_page'}: expected {needed} the colour {color!r}{beyond}, got "
+            f"{', '.join(cloud.fields) or 'points alone'}."
         )
-    assert first is not None
-    toward = _direction_of_view(first[1].points, view, frame, azimuth_deg)
-    names = [scene["name"] for scene in scenes]
     description = {
-        "title": title or " and ".join(names),
+        "title": title or " and ".join(scene["name"] for scene in scenes),
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
-        "toward": _rounded(toward),
+        "toward": _rounded(_direction_of_view(shown[0].points, view, frame, azimuth_deg)),
         "cut": view in LEAST_FACING,
         "leastFacing": LEAST_FACING["above" if view == "above" else "cutaway"],
         "frame": {
@@ -197,8 +189,31 @@ def make_page(
         "kinds": PLANE_KINDS,
         "clouds": scenes,
     }
-    html = _fill_template(description, [_encode(library.encode()), *blobs], library)
+    html = _fill_template(description, [_encode_library(library), *blobs], library)
     return Page(html, tuple(scene["shown"] for scene in scenes))
+
+
+def _check_settings(
+    cloud: Cloud,
+    truth: Cloud | None,
+    up: tuple[float, float, float] | None,
+    view: View,
+    max_points: int,
+) -> tuple[float, float, float]:
+    """Return the upward direction, or say what is wrong with a setting."""
+    if view not in get_args(View):
+        names = ", ".join(get_args(View))
+        raise ConfigError(f"make_page: expected view to be one of {names}, got {view!r}.")
+    if max_points < 1:
+        raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
+    if up is not None and not any(up):
+        raise ConfigError("make_page: expected up to be a direction, got zeros.")
+    if truth is not None and len(truth) != len(cloud):
+        raise ConfigError(
+            f"{truth.source or 'make_page'}: expected a truth of {len(cloud):,} points, got "
+            f"{len(truth):,}; it has to be of the same points in the same order."
+        )
+    return up or ((0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0))
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:
@@ -244,19 +259,13 @@ def _frame_of(cloud: Cloud, up: tuple[float, float, float]) -> _Frame:
     return _Frame(low + (high - low) / 2, rotation, extent / _PAGE_EXTENT if extent > 0 else 1.0)
 
 
-def _same_points(cloud: Cloud, other: Cloud) -> bool:
-    """Return whether two clouds have the same points in the same order."""
-    return np.array_equal(cloud.coordinates, other.coordinates, equal_nan=True)
-
-
 def _choose_points(cloud: Cloud, frame: _Frame, max_points: int) -> _Shown:
     """Choose the points to show: the same whatever their order, and in random strata."""
-    rows = torch.from_numpy(cloud.finite).nonzero().squeeze(1)
-    rows = rows[canonical_order(cloud.points[rows])]
-    mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(rows))[:max_points])
+    finite = finite_rows(cloud.points)
+    mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
     strata = [part.sort().values for part in mixed.tensor_split(NUM_STRATA)]
     levels = torch.tensor([len(part) for part in strata]).cumsum(0).tolist()
-    rows = rows[torch.cat(strata)]
+    rows = finite[torch.cat(strata)]
     fields = {
         name: torch.from_numpy(np.ascontiguousarray(cloud.fields[name][rows.numpy()]))
         for _, name in MODES.values()
@@ -272,7 +281,7 @@ def _choose_points(cloud: Cloud, frame: _Frame, max_points: int) -> _Shown:
             distinct = _distinct(cloud, name)
             places = torch.searchsorted(distinct, fields[name].long())
             fields[name] = torch.where(fields[name] < 0, -1, places)
-    return _Shown(rows, levels, frame.place(cloud.points[rows], cloud.origin), fields)
+    return _Shown(finite, rows, levels, frame.place(cloud.points[rows], cloud.origin), fields)
 
 
 def _distinct(cloud: Cloud, name: str) -> Tensor:
@@ -282,7 +291,7 @@ def _distinct(cloud: Cloud, name: str) -> Tensor:
 
 
 def _describe_cloud(
-    cloud: Cloud, shown: _Shown, truth: Cloud | None, frame: _Frame, reference: Tensor | None
+    cloud: Cloud, shown: _Shown, truth: Cloud | None, reference: Tensor | None, frame: _Frame
 ) -> tuple[dict[str, Any], str]:
     """Return what a page says about a cloud, and the packed arrays of its points."""
     true_fields = {
@@ -353,14 +362,12 @@ def _direction_of_view(
 ) -> Tensor:
     """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
     if view == "sensor":
-        behind: Tensor = -frame.rotation[:, 2].float()
-        return behind
+        return frame.rotation[:, 2].float().neg()
     grid = build_grid(points)
     if len(grid.levels) == 0:
         return functional.normalize(torch.tensor([-1.0, -1.0, 1.0]), dim=0)
     up = torch.tensor([0.0, 0.0, 1.0])
-    toward: Tensor = choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg)[0]
-    return toward
+    return choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg).toward
 
 
 def _describe_planes(cloud: Cloud, shown: _Shown, frame: _Frame) -> list[dict[str, Any]]:
@@ -370,7 +377,7 @@ def _describe_planes(cloud: Cloud, shown: _Shown, frame: _Frame) -> list[dict[st
     names = _distinct(cloud, "labels")
     if len(names) == 0:
         return []
-    kept = torch.from_numpy(cloud.finite)
+    kept = shown.finite
     labels = torch.from_numpy(np.ascontiguousarray(cloud.fields["labels"])).long()[kept]
     labels = torch.where(labels < 0, -1, torch.searchsorted(names, labels))
     points = cloud.points[kept]
@@ -499,6 +506,12 @@ def _pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str
             }
         )
     return manifest, _encode(b"".join(planes))
+
+
+@functools.cache
+def _encode_library(library: str) -> str:
+    """Return the library as pages hold it."""
+    return _encode(library.encode())
 
 
 def _encode(content: bytes) -> str:
