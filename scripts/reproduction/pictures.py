@@ -1,6 +1,7 @@
 """Pictures of segmentations side by side, and of what is wrong with them."""
 
 from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -12,8 +13,9 @@ from torch import Tensor
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
 from reproduction.tiles import tile_pictures
-from torchrg.render import color_planes, render_cloud, write_png
+from torchrg.render import color_planes, make_page, render_cloud, write_page, write_png
 from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.structures import Cloud
 
 _GRAY = 190
 """Of clouds without colours."""
@@ -53,6 +55,32 @@ def draw_side_by_side(
     for title, labels in labelings.items():
         paints[title] = color_planes(labels, cloud.points, reference=reference)
     return _tile(folder, name, cloud, paints)
+
+
+def write_pair(folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]) -> str:
+    """Write a page of the last segmentation beside the true faces, or beside the first one.
+
+    Returns:
+        The name of the file; empty where pydeck, which pages need, is not installed.
+    """
+    if find_spec("pydeck") is None:
+        return ""
+    first, *_, last = [*labelings, *labelings]
+    pair = {last: labelings[last]}
+    if cloud.labels is not None:
+        pair["true faces"] = cloud.labels
+    elif first != last:
+        pair[first] = labelings[first]
+    normals = {} if cloud.normals is None else {"normals": cloud.normals.numpy()}
+    clouds = [
+        Cloud(cloud.points.numpy(), {"labels": labels.numpy(), **normals}, source=title)
+        for title, labels in pair.items()
+    ]
+    truth = None if cloud.labels is None else clouds[-1]
+    file = f"figures/{name}.html"
+    page = make_page(clouds[0], beside=clouds[1] if len(clouds) > 1 else None, truth=truth)
+    write_page(folder.place(file), page)
+    return file
 
 
 def draw_outcomes(

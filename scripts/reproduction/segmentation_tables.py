@@ -6,7 +6,7 @@ from reproduction.cells import Record
 from reproduction.clouds import TITLES
 from reproduction.methods import DRAWN, METHODS
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
-from reproduction.pictures import draw_outcomes, draw_side_by_side
+from reproduction.pictures import draw_outcomes, draw_side_by_side, write_pair
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
 from reproduction.segmentations import SAMPLE_SIZE, read_segmented, score
@@ -89,22 +89,20 @@ def draw_figures(run: Run, key: str, number: str, presets: Sequence[str]) -> lis
     """Return the figures of a cloud: methods side by side, and with truth what is wrong."""
     cloud = run.cloud(key).cloud
     labelings = {METHODS[preset]: read_segmented(run, key, preset).labels for preset in presets}
-    file = draw_side_by_side(
-        run.folder, f"{number.lower().replace(' ', '')}_{key}", cloud, labelings
-    )
+    name = f"{number.lower().replace(' ', '')}_{key}"
+    file = draw_side_by_side(run.folder, name, cloud, labelings)
+    page = write_pair(run.folder, name, cloud, labelings)
     words = f"**{number}**, {cloud.origin}. Points of no region are gray."
     if cloud.labels is None:
-        return [figure(file, words)]
-    file2 = draw_outcomes(
-        run.folder, f"{number.lower().replace(' ', '')}_{key}_errors", cloud, labelings
-    )
+        return [figure(file, words, page)]
+    file2 = draw_outcomes(run.folder, f"{name}_errors", cloud, labelings)
     shares = []
     for title, labels in labelings.items():
         counts = outcomes_of(labels, cloud.labels).bincount(minlength=len(OUTCOMES)).double()
         shares.append([title, *(f"{100 * value:.1f} %" for value in counts / counts.sum())])
     meanings = [meaning for _, meaning in OUTCOMES.values()]
     return [
-        figure(file, words),
+        figure(file, words, page),
         figure(file2, f"What became of each point of {cloud.origin}."),
         table(
             "Share of the points of that figure",

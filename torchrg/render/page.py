@@ -10,6 +10,7 @@ page's policy allows only the scripts that torchrg put there, and no connection.
 import base64
 import functools
 import hashlib
+import html
 import json
 import math
 import os
@@ -72,6 +73,11 @@ class Page(NamedTuple):
 
     html: str
     num_points: tuple[int, ...]
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame of its own, as a notebook shows it."""
+        frame = 'width="100%" height="620" style="border: 1px solid #d9dee5"'
+        return f'<iframe {frame} srcdoc="{html.escape(self.html)}"></iframe>'
 
 
 class _Frame(NamedTuple):
@@ -189,8 +195,8 @@ def make_page(
         "kinds": PLANE_KINDS,
         "clouds": scenes,
     }
-    html = _fill_template(description, [_encode_library(library), *blobs], library)
-    return Page(html, tuple(scene["shown"] for scene in scenes))
+    text = _fill_template(description, [_encode_library(library), *blobs], library)
+    return Page(text, tuple(scene["shown"] for scene in scenes))
 
 
 def _check_settings(
@@ -287,7 +293,8 @@ def _choose_points(cloud: Cloud, frame: _Frame, max_points: int) -> _Shown:
 def _distinct(cloud: Cloud, name: str) -> Tensor:
     """Return the labels that occur at finite points, ascending."""
     values = torch.from_numpy(np.ascontiguousarray(cloud.fields[name][cloud.finite])).long()
-    return torch.unique(values[values >= 0])
+    distinct: Tensor = torch.unique(values[values >= 0])
+    return distinct
 
 
 def _describe_cloud(
@@ -526,14 +533,14 @@ def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library
     from markupsafe import Markup
 
     script = (_ASSETS / "page.js").read_text(encoding="utf-8")
-    html: str = template_of("page.html.jinja").render(
+    text: str = template_of("page.html.jinja").render(
         title=description["title"],
         description=Markup(_json_for_html(description)),  # noqa: S704 Escaped there.
         blobs=[Markup(blob) for blob in blobs],  # noqa: S704 Base64.
         script=Markup(script),  # noqa: S704 Our own.
         hashes=[_script_hash(script), _script_hash(library)],
     )
-    return html
+    return text
 
 
 def template_of(name: str) -> Any:  # noqa: ANN401
