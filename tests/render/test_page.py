@@ -271,3 +271,33 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments, mess
 def test_equal_input_gives_equal_bytes(tmp_path):
     write_page(tmp_path / "room.html", make_page(room()))
     assert (tmp_path / "room.html").read_text() == page_of_room().html
+
+
+def test_walls_of_an_open_scan_are_cut_away_from_outside_alone():
+    """A floor, and two walls with a gap between them: nothing closes the cloud."""
+    rng = np.random.default_rng(0)
+    flat = rng.random((3, 900, 2)) * 4
+    zero = np.zeros(900)
+    floor = np.stack([flat[0, :, 0], flat[0, :, 1], zero], axis=1)
+    west = np.stack([zero, flat[1, :, 0], flat[1, :, 1] / 2], axis=1)
+    middle = np.stack([zero + 2, flat[2, :, 0], flat[2, :, 1] / 2], axis=1)
+    cloud = Cloud(np.concatenate([floor, west, middle]), {"labels": np.repeat([0, 1, 2], 900)})
+    what = described(make_page(cloud))["clouds"][0]
+    outward = [
+        [where for bit, where in enumerate(what["surfaces"]) if plane["sides"] >> bit & 1]
+        for plane in what["planes"]
+    ]
+    assert outward[0] in ([], [pytest.approx([0, 0, -1], abs=0.01)])  # Seen from below, if at all.
+    assert outward[1] == [pytest.approx([-1, 0, 0], abs=0.01)]
+    assert outward[2] == []
+
+
+def test_points_are_as_large_as_the_space_around_them():
+    rng = np.random.default_rng(0)
+    dense, sparse = rng.random((4000, 3)), rng.random((4000, 3)) * 2 + 5
+    dense[:, 2] = sparse[:, 2] = 0
+    page = make_page(Cloud(np.concatenate([dense, sparse])))
+    radii = unpacked(page)["radii"][:, 0]
+    is_sparse = places(page)[:, 0] > 3
+    octaves = (np.median(radii[is_sparse]) - np.median(radii[~is_sparse])) / 16
+    assert octaves == pytest.approx(1, abs=0.25)

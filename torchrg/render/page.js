@@ -214,6 +214,7 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
     in vec3 normals;
     in vec4 colors;
     in float covers;
+    in float radii;
     out vec4 vColor;
     void main(void) {
       geometry.worldPosition = places;
@@ -224,7 +225,8 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
       gone = gone || places.z > cut.limits.y || dot(places, cut.ahead.xyz) > cut.ahead.w;
       if (gone) gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
       vec3 sight = cut.eye.xyz - places;
-      float radius = clamp(cut.size.x * cut.size.y / length(sight), cut.size.z, cut.size.w);
+      float space = cut.size.x * exp2((radii * 255.0 - 128.0) / 16.0);
+      float radius = clamp(space * cut.size.y / length(sight), cut.size.z, cut.size.w);
       gl_PointSize = 2.0 * radius * project.devicePixelRatio;
       float facing = dot(normals, sight) < 0.0 ? -1.0 : 1.0;
       float lit = dot(normals, normals) < 0.25 ? 0.6 : 0.5 + 0.5 * facing * dot(normals, cut.light.xyz);
@@ -250,6 +252,7 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
         normals: { size: 3, accessor: "getNormal" },
         colors: { size: 4, type: "unorm8", accessor: "getColor" },
         covers: { size: 1, type: "unorm8", accessor: "getCovers" },
+        radii: { size: 1, type: "unorm8", accessor: "getRadius" },
       });
       const model = new Model(this.context.device, {
         ...this.getShaders(), id: this.props.id, topology: "point-list", isInstanced: false,
@@ -266,8 +269,9 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
     }
   }
   CloudLayer.layerName = "CloudLayer";
-  CloudLayer.defaultProps = Object.fromEntries(["getPosition", "getNormal", "getColor", "getCovers"]
-    .map((name) => [name, { type: "accessor", value: [0, 0, 0, 0] }]));
+  const accessors = ["getPosition", "getNormal", "getColor", "getCovers", "getRadius"];
+  CloudLayer.defaultProps = Object.fromEntries(
+    accessors.map((name) => [name, { type: "accessor", value: [0, 0, 0, 0] }]));
   return CloudLayer;
 }
 
@@ -301,6 +305,7 @@ function layersOf({ PathLayer, LineLayer }) {
             getNormal: { value: cloud.normals, size: 3 },
             getColor: { value: cloud.colors, size: 4, normalized: true },
             getCovers: { value: cloud.mask, size: 1, normalized: true },
+            getRadius: { value: cloud.values.radii, size: 1, normalized: true },
           },
         },
         cut: {

@@ -35,7 +35,6 @@ from torchrg.regions import summarize_planes
 from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
 from torchrg.render.cutaway import (
     LEAST_FACING,
-    OuterSurface,
     View,
     choose_viewpoint,
     find_outer_surfaces,
@@ -58,6 +57,20 @@ _TABLE_NEIGHBORS = 24
 """Neighbours that bridge the strip without labels along an edge."""
 _MAX_SURFACES = 7
 """Outer surfaces that a page can cut away: bits of a byte, the last of which hides planes."""
+_USUAL_RADIUS = 128
+_STEPS_OF_OCTAVE = 16
+_LARGEST_SPACING = 3.0
+"""Radii of points are bytes: steps of their ratio to the usual one, which is bounded both ways."""
+_UPRIGHT = 0.26
+"""Cosine between the normal of a wall and the upward direction: 15 degrees."""
+_BEYOND = 0.02
+"""A point is beyond a wall from this share of the cloud's longest side on."""
+_MOST_BEYOND = 0.03
+"""Share of the points beyond an outer wall: those that a scanner saw through doors and windows."""
+_ALIKE = 0.9
+"""Cosine of the directions of walls that are cut away together."""
+_MOST_WALLS, _WALL_POINTS = 200, 20_000
+"""So many of the largest planes may be outer walls, as so many points of the cloud tell."""
 _ASSETS = Path(__file__).parent
 _LIBRARY = "nbextension/static/index.js"
 """Where pydeck keeps deck.gl, which it writes itself into pages for use offline."""
@@ -309,18 +322,21 @@ def _describe_cloud(
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     channels = list(channels_of(shown.points, shown.fields, true_fields, reference=reference))
-    surfaces, covered, spacing = _outer_surfaces(shown.points)
+    surfaces = _outer_surfaces(shown.points)
     planes = _describe_planes(cloud, shown, frame)
+    directions, covered = surfaces.directions, surfaces.covered
     if planes:
-        sides = _sides_of(shown.fields["labels"], covered, len(planes))
+        labels = shown.fields["labels"]
+        directions, sides = _sides_of_planes(shown, planes, frame, surfaces)
         # What stands against a wall, and the floor along it, is not part of the wall.
-        covered &= torch.cat([sides, sides.new_full((1,), 255)])[shown.fields["labels"]]
+        covered = torch.where(labels < 0, covered, sides[labels])
         for plane, side in zip(planes, sides.tolist(), strict=True):
             plane["sides"] = side
     low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
     steps = ((shown.points - low) * (_STEPS / _PAGE_EXTENT)).round().clamp(0, _STEPS)
     arrays: dict[str, NDArray[Any]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
+    arrays["radii"] = surfaces.radii.numpy()
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
@@ -337,8 +353,8 @@ def _describe_cloud(
         "levels": shown.levels,
         "low": low.tolist(),
         "step": _PAGE_EXTENT / _STEPS,
-        "spacing": spacing,
-        "surfaces": [_rounded(surface.direction) for surface in surfaces],
+        "spacing": surfaces.spacing,
+        "surfaces": [_rounded(direction) for direction in directions],
         "channels": {channel.mode: _describe_channel(channel) for channel in channels},
         "planes": planes,
         "arrays": manifest,
@@ -351,17 +367,41 @@ def _describe_channel(channel: Channel) -> dict[str, Any]:
     return {"legend": channel.legend, "direct": channel.colors is None}
 
 
-def _outer_surfaces(points: Tensor) -> tuple[tuple[OuterSurface, ...], Tensor, float]:
-    """Return walls and ceiling, the bits of those that each point is in, and the usual spacing."""
+class _Surfaces(NamedTuple):
+    """What closes a cloud, and how dense it is.
+
+    Attributes:
+        directions: From the inside toward the outside of each outer surface, shape ``(S, 3)``.
+        covered: Bits of the surfaces that each point is in, shape ``(n,)``, uint8.
+        spacing: The usual distance of a point from its neighbours.
+        radii: That of each point, as a step of a sixteenth of an octave from 128, the usual one.
+    """
+
+    directions: Tensor
+    covered: Tensor
+    spacing: float
+    radii: Tensor
+
+
+def _outer_surfaces(points: Tensor) -> _Surfaces:
+    """Find walls and ceiling, and how far points are from their neighbours."""
     covered = torch.zeros(len(points), dtype=torch.uint8)
+    radii = torch.full((len(points),), _USUAL_RADIUS, dtype=torch.uint8)
     grid = build_grid(points)
     if len(grid.levels) == 0:
-        return (), covered, 0.0
+        return _Surfaces(points.new_zeros(0, 3), covered, 0.0, radii)
     up = torch.tensor([0.0, 0.0, 1.0])
-    surfaces = find_outer_surfaces(surface_cells(grid), up)[:_MAX_SURFACES]
-    for place, surface in enumerate(surfaces):
+    found = find_outer_surfaces(surface_cells(grid), up)[:_MAX_SURFACES]
+    for place, surface in enumerate(found):
         covered[grid.rows] |= surface.covers(grid.points).to(torch.uint8) << place
-    return surfaces, covered, float(local_spacing(grid).median())
+    spacing = local_spacing(grid)
+    usual = float(spacing.median())
+    if usual > 0:
+        octaves = (spacing / usual).clamp(min=1 / _LARGEST_SPACING, max=_LARGEST_SPACING).log2()
+        steps = (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round()
+        radii[grid.rows] = steps.to(torch.uint8)
+    directions = torch.stack([points.new_zeros(3), *(each.direction for each in found)])[1:]
+    return _Surfaces(directions, covered, usual, radii)
 
 
 def _direction_of_view(
@@ -462,16 +502,45 @@ def _planes_to_draw(
     return found
 
 
-def _sides_of(labels: Tensor, covered: Tensor, num_planes: int) -> Tensor:
-    """Return the bits of the outer surfaces that hold most points of each plane, ``(M,)``."""
-    labeled = labels >= 0
-    own, bits = labels[labeled], covered[labeled].long()
-    counts = torch.bincount(own, minlength=num_planes)
-    sides = torch.zeros(num_planes, dtype=torch.uint8)
-    for place in range(_MAX_SURFACES):
-        inside = torch.bincount(own[(bits >> place & 1).bool()], minlength=num_planes)
-        sides |= (2 * inside > counts).to(torch.uint8) << place
-    return sides
+def _sides_of_planes(
+    shown: _Shown, planes: list[dict[str, Any]], frame: _Frame, surfaces: _Surfaces
+) -> tuple[Tensor, Tensor]:
+    """Return the directions of outer surfaces ``(S, 3)``, and the bits of each plane ``(M,)``.
+
+    A plane is in the outer surfaces that hold most of its points. Large upright ones are, too, in
+    that of the direction in which there is next to nothing beyond them: walls of scans that are too
+    open for a closed outer surface. There is a bit for each main direction.
+    """
+    labels = shown.fields["labels"]
+    inside = labels >= 0
+    own, bits = labels[inside], surfaces.covered[inside]
+    counts = torch.bincount(own, minlength=len(planes))
+    sides = torch.zeros(len(planes), dtype=torch.uint8)
+    for place in range(len(surfaces.directions)):
+        covered = torch.bincount(own[(bits >> place & 1).bool()], minlength=len(planes))
+        sides |= (2 * covered > counts).to(torch.uint8) << place
+    directions = list(surfaces.directions)
+    normals = torch.tensor([plane["normal"] for plane in planes]).double()
+    offsets = torch.tensor([plane["offset"] for plane in planes]).double()
+    offsets = (offsets - normals @ frame.origin) / frame.scale
+    normals = (normals @ frame.rotation.T).float()
+    large = counts.argsort(descending=True, stable=True)[:_MOST_WALLS]
+    walls = large[normals[large, 2].abs() < _UPRIGHT]
+    heights = shown.points[:_WALL_POINTS] @ normals[walls].T - offsets[walls].float()
+    margin = _BEYOND * _PAGE_EXTENT
+    beyond = torch.stack([heights > margin, heights < -margin]).float().mean(dim=1)
+    for sign, shares in zip((1, -1), beyond.tolist(), strict=True):
+        for wall, share in zip(walls.tolist(), shares, strict=True):
+            if share > _MOST_BEYOND:
+                continue
+            outward = sign * normals[wall]
+            alike = [place for place, each in enumerate(directions) if each @ outward > _ALIKE]
+            if not alike and len(directions) < _MAX_SURFACES:
+                alike = [len(directions)]
+                directions.append(outward)
+            for place in alike[:1]:
+                sides[wall] |= 1 << place
+    return torch.stack([shown.points.new_zeros(3), *directions])[1:], sides
 
 
 def _rectangles(table: Planes, frame: _Frame, origin: NDArray[np.float64]) -> list[Any]:
