@@ -22,8 +22,8 @@ from torchrg.render.outcomes import OUTCOMES, outcomes_of
 MODES = {
     "plane": ("planes", "labels"),
     "superpoint": ("superpoints", "superpoints"),
-    "color": ("the cloud's own colours", "color"),
-    "normal": ("directions of normals", "normals"),
+    "color": ("own colours", "color"),
+    "normal": ("normals", "normals"),
     "curvature": ("curvature", "curvature"),
     "sharp": ("sharp feature points", "sharp"),
     "error": ("errors of planes", "labels"),
