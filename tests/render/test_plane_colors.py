@@ -166,8 +166,7 @@ def least_difference(*, for_all_eyes, dichromacy):
 
 @pytest.mark.parametrize("dichromacy", [None, *DICHROMACIES])
 def test_planes_that_touch_differ_for_all_eyes(dichromacy):
-    # Two kinds of cones leave a plane of colours: half as much of a difference is clear, still.
-    assert least_difference(for_all_eyes=True, dichromacy=dichromacy) > CLEARLY / 2
+    assert least_difference(for_all_eyes=True, dichromacy=dichromacy) > CLEARLY
 
 
 def test_usual_colors_do_not_differ_for_all_eyes():
