@@ -65,6 +65,8 @@ function preparePoints(cloud, bytes) {
   cloud.colors = new Uint8Array(4 * n).fill(255);
   cloud.mask = arrays.covered.slice();
   cloud.hidden = new Set();
+  cloud.changes = 0; // How often another set of planes was hidden.
+  cloud.lines = {}; // Outlines and normals as they were drawn last.
   cloud.order = cloud.planes.map((_, i) => i).sort((a, b) => cloud.planes[b].count - cloud.planes[a].count);
   cloud.high = [0, 1, 2].map((axis) => {
     let high = -Infinity;
@@ -188,6 +190,7 @@ function paint(cloud) {
 }
 
 function hide(cloud) {
+  cloud.changes += 1;
   const mask = cloud.mask = new Uint8Array(cloud.mask);
   for (let i = 0; i < cloud.shown; i++) {
     const plane = planeOf(cloud, i);
@@ -290,6 +293,12 @@ function layersOf({ PathLayer, LineLayer }) {
     const picked = state.picked?.cloud === c ? state.picked.plane : -1;
     const rings = (chosen) => cloud.planes.flatMap((plane, number) =>
       chosen(plane, number) ? plane.rings.map((ring) => ({ ring: [...ring, ring[0]] })) : []);
+    // deck.gl builds lines anew when their data is another object: only when they may differ.
+    const cuts = [cloud.changes, bits, top, near === 1e9 ? 0 : [near, ...ahead]].join();
+    const side = Math.round(state.camera.rotationOrbit / 45);
+    const outlines = () => remembered(cloud, "outlines", cuts, () => rings(inView));
+    const ofPicked = () => remembered(cloud, "picked", picked, () => rings((_, n) => n === picked));
+    const normals = () => remembered(cloud, "normals", `${cuts} ${side}`, () => normalLines(cloud, isCut));
     const lines = (id, data, color, width) => new PathLayer({
       id: `${id}-${c}`, data, getPath: (row) => row.ring, getColor: color, getWidth: width,
       widthUnits: "pixels", jointRounded: true, capRounded: true,
@@ -313,15 +322,20 @@ function layersOf({ PathLayer, LineLayer }) {
           size: [radius, focalLength(), 0.8, 30], limits: [bits, top, 0, 0],
         },
       }),
-      state.outlines && lines("outlines", rings(inView), [20, 28, 40, 210], 1.5),
-      picked >= 0 && lines("halo", rings((_, n) => n === picked), [255, 255, 255], 6),
-      picked >= 0 && lines("picked", rings((_, n) => n === picked), [0, 0, 0], 2.5),
+      state.outlines && lines("outlines", outlines(), [20, 28, 40, 210], 1.5),
+      picked >= 0 && lines("halo", ofPicked(), [255, 255, 255], 6),
+      picked >= 0 && lines("picked", ofPicked(), [0, 0, 0], 2.5),
       state.normals && new LineLayer({
-        id: `normals-${c}`, data: normalLines(cloud, isCut), getColor: [11, 60, 160, 200], getWidth: 1,
+        id: `normals-${c}`, data: normals(), getColor: [11, 60, 160, 200], getWidth: 1,
         getSourcePosition: (row) => row[0], getTargetPosition: (row) => row[1],
       }),
     ];
   });
+}
+
+function remembered(cloud, name, key, make) {
+  if (cloud.lines[name]?.key !== key) cloud.lines[name] = { key, data: make() };
+  return cloud.lines[name].data;
 }
 
 function normalLines(cloud, isCut) {
