@@ -113,7 +113,12 @@ def test_pages_do_not_depend_on_unit_and_origin(factor):
         cloud.fields,
         source=cloud.source,
     )
-    first, second = described(page_of_room()), described(make_page(moved))
+    page = make_page(moved)
+    middle = moved.coordinates.mean(axis=0)
+    found, given = (torch.from_numpy(where - middle) for where in (places(page), moved.coordinates))
+    assert float(torch.cdist(found, given).amin(dim=1).max()) < 1e-3 * factor
+    assert len(torch.unique((found / factor).round(decimals=3), dim=0)) > 1500
+    first, second = described(page_of_room()), described(page)
     assert second["toward"] == pytest.approx(first["toward"], abs=0.01)
     planes = zip(first["clouds"][0]["planes"], second["clouds"][0]["planes"], strict=True)
     for one, other in planes:
