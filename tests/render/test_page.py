@@ -202,8 +202,18 @@ def test_the_policy_allows_no_network_and_only_our_scripts():
         Cloud(np.eye(3), {"labels": np.array([-1, -1, -1])}),
         Cloud(np.random.default_rng(0).random((40, 3)), {"labels": np.arange(40) * 10**9}),
         Cloud(np.eye(3), {"normals": np.full((3, 3), np.nan), "curvature": np.full(3, np.nan)}),
+        Cloud(np.eye(3), {"labels": np.eye(3), "color": np.eye(3), "sharp": np.array(["a"] * 3)}),
     ],
-    ids=["one point", "all NaN", "Inf", "one place", "no plane", "huge labels", "NaN fields"],
+    ids=[
+        "one-point",
+        "all-NaN",
+        "Inf",
+        "one-place",
+        "no-plane",
+        "huge-labels",
+        "NaN-fields",
+        "other-fields",
+    ],
 )
 def test_odd_clouds_give_a_page(cloud):
     page = make_page(cloud)

@@ -84,7 +84,7 @@ def channels_of(
     if "superpoints" in fields:
         yield _of_regions("superpoint", fields["superpoints"], points, None)
     if "color" in fields:
-        yield Channel("color", fields["color"][:, :3].numpy(), None, [])
+        yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:
         yield _of_normals(fields["normals"])
     if "curvature" in fields:

@@ -16,6 +16,7 @@ import math
 import os
 import zlib
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -171,7 +172,8 @@ def make_page(
     up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
     frame = _frame_of(cloud, up)
-    clouds = [cloud] if beside is None else [cloud, beside]
+    clouds = [_with_usable_fields(each) for each in (cloud, beside) if each is not None]
+    truth = None if truth is None else _with_usable_fields(truth)
     shown = [_choose_points(each, frame, max_points) for each in clouds]
     truths: list[Cloud | None] = [truth]
     references: list[Tensor | None] = [None]
@@ -210,6 +212,30 @@ def make_page(
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)
     return Page(text, tuple(scene["shown"] for scene in scenes))
+
+
+_FIELDS = {
+    "labels": ("iu", ()),
+    "superpoints": ("iu", ()),
+    "color": ("u", (3,)),
+    "normals": ("f", (3,)),
+    "curvature": ("f", ()),
+    "sharp": ("b", ()),
+}
+"""Kinds of numbers and shapes of the fields that can be shown."""
+
+
+def _with_usable_fields(cloud: Cloud) -> Cloud:
+    """Return a cloud with those fields that are what their names say: files may hold others."""
+    fields = {
+        name: values
+        for name, values in cloud.fields.items()
+        if name in _FIELDS
+        and values.dtype.kind in _FIELDS[name][0]
+        and values.shape[1:] == _FIELDS[name][1]
+        and (name != "color" or values.dtype == np.uint8)
+    }
+    return replace(cloud, fields=fields)
 
 
 def _check_settings(
