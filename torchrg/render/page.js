@@ -285,7 +285,9 @@ function layersOf({ PathLayer, LineLayer }) {
     const light = unit(plus(plus(scaled(right, -0.45), scaled(up, 0.7)), scaled(toward, 0.55)));
     const level = Math.max(1, Math.round(state.share * cloud.levels.length));
     const length = cloud.levels[level - 1] ?? 0;
-    const radius = 1.2 * cloud.spacing * 1.15 ** state.size * Math.sqrt(cloud.shown / Math.max(length, 1));
+    // Fewer points are larger, but do not close surfaces: without a GPU it is pixels that take time.
+    const growth = (cloud.shown / Math.max(length, 1)) ** 0.25;
+    const radius = 1.2 * cloud.spacing * 1.15 ** state.size * growth;
     const eye = plus(state.camera.target, scaled(toward, focalLength() / 2 ** state.camera.zoom));
     const isCut = cutOf(cloud);
     const inView = ({ sides, rings }, plane) => !cloud.hidden.has(plane) && !(sides & bits)
