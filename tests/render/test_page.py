@@ -15,7 +15,8 @@ pytest.importorskip("pydeck", reason="needs the extra view")
 from torchrg.cli import main
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.render.channels import decode_directions, encode_directions
-from torchrg.render.page import NUM_STRATA, make_page, write_page
+from torchrg.render.content import NUM_STRATA
+from torchrg.render.page import make_page, write_page
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 

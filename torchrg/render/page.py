@@ -17,7 +17,6 @@ import os
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -30,48 +29,30 @@ from torch.nn import functional
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
-from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import finite_rows, search_knn
-from torchrg.regions import summarize_planes
 from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
+from torchrg.render.content import (
+    PAGE_EXTENT,
+    Frame,
+    Shown,
+    choose_points,
+    describe_planes,
+    frame_of,
+    outer_surfaces,
+    rounded,
+    sides_of_planes,
+)
 from torchrg.render.cutaway import (
     LEAST_FACING,
     View,
     choose_viewpoint,
-    find_outer_surfaces,
 )
-from torchrg.render.grid import build_grid, local_spacing, surface_cells
-from torchrg.structures import PLANE_KINDS, Cloud, Planes
+from torchrg.render.grid import build_grid, surface_cells
+from torchrg.structures import PLANE_KINDS, Cloud
 
 MAX_POINTS = 1_000_000
 """Points of a page by default: what a laptop turns fluently. Of more, a random sample is shown."""
-NUM_STRATA = 8
-"""Random parts of the points, each along a Morton curve. While the page moves on a slow machine it
-draws the first ones; along a curve, positions compress to two thirds."""
-_PAGE_EXTENT = 10.0
-"""The longest side of a cloud on a page: pages do not depend on the unit."""
 _STEPS = 65535
-"""Steps of a position along that side: two bytes a coordinate."""
-_TABLE_POINTS = 200_000
-"""Points that tell outlines and which planes meet: enough for a picture."""
-_TABLE_NEIGHBORS = 24
-"""Neighbours that bridge the strip without labels along an edge."""
-_MAX_SURFACES = 7
-"""Outer surfaces that a page can cut away: bits of a byte, the last of which hides planes."""
-_USUAL_RADIUS = 128
-_STEPS_OF_OCTAVE = 16
-_LARGEST_SPACING = 3.0
-"""Radii of points are bytes: steps of their ratio to the usual one, which is bounded both ways."""
-_UPRIGHT = 0.26
-"""Cosine between the normal of a wall and the upward direction: 15 degrees."""
-_BEYOND = 0.02
-"""A point is beyond a wall from this share of the cloud's longest side on."""
-_MOST_BEYOND = 0.03
-"""Share of the points beyond an outer wall: those that a scanner saw through doors and windows."""
-_ALIKE = 0.9
-"""Cosine of the directions of walls that are cut away together."""
-_MOST_WALLS, _WALL_POINTS = 200, 20_000
-"""So many of the largest planes may be outer walls, as so many points of the cloud tell."""
+"""Steps of a position along the longest side of a cloud: two bytes a coordinate."""
 _ASSETS = Path(__file__).parent
 _LIBRARY = "nbextension/static/index.js"
 """Where pydeck keeps deck.gl, which it writes itself into pages for use offline."""
@@ -92,43 +73,6 @@ class Page(NamedTuple):
         """Return the page in a frame of its own, as a notebook shows it."""
         frame = 'width="100%" height="620" style="border: 1px solid #d9dee5"'
         return f'<iframe {frame} srcdoc="{html.escape(self.html)}"></iframe>'
-
-
-class _Frame(NamedTuple):
-    """Where a page's axes are: z up, the middle of the first cloud in the origin.
-
-    Attributes:
-        origin: In the coordinates of the files, shape ``(3,)``, float64.
-        rotation: Rows are the axes of the page, shape ``(3, 3)``, float64.
-        scale: Length of a unit of the page, in the unit of the cloud.
-    """
-
-    origin: Tensor
-    rotation: Tensor
-    scale: float
-
-    def place(self, points: Tensor, origin: NDArray[np.float64]) -> Tensor:
-        """Return points about an origin in the axes of the page, float32."""
-        moved = points.double() + (torch.from_numpy(origin) - self.origin)
-        return (moved @ self.rotation.T / self.scale).float()
-
-
-class _Shown(NamedTuple):
-    """The points of a cloud that a page shows.
-
-    Attributes:
-        finite: All finite rows of the cloud, in canonical order.
-        rows: Those that are shown, by strata, shape ``(n,)``.
-        levels: Number of points in the first stratum, in the first two, and so on.
-        points: In the axes of the page, shape ``(n, 3)``, float32.
-        fields: Of those points; normals in the axes of the page, labels numbered without gaps.
-    """
-
-    finite: Tensor
-    rows: Tensor
-    levels: list[int]
-    points: Tensor
-    fields: dict[str, Tensor]
 
 
 def make_page(
@@ -171,10 +115,10 @@ def make_page(
     """
     up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
-    frame = _frame_of(cloud, up)
+    frame = frame_of(cloud, up)
     clouds = [_with_usable_fields(each) for each in (cloud, beside) if each is not None]
     truth = None if truth is None else _with_usable_fields(truth)
-    shown = [_choose_points(each, frame, max_points) for each in clouds]
+    shown = [choose_points(each, frame, max_points) for each in clouds]
     truths: list[Cloud | None] = [truth]
     references: list[Tensor | None] = [None]
     if beside is not None:
@@ -199,7 +143,7 @@ def make_page(
         "title": title or " and ".join(scene["name"] for scene in scenes),
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
-        "toward": _rounded(_direction_of_view(shown[0].points, view, frame, azimuth_deg)),
+        "toward": rounded(_direction_of_view(shown[0].points, view, frame, azimuth_deg)),
         "cut": view in LEAST_FACING,
         "leastFacing": LEAST_FACING["above" if view == "above" else "cutaway"],
         "frame": {
@@ -288,56 +232,8 @@ def _read_library() -> str:
     return source.read_text(encoding="utf-8")
 
 
-def _frame_of(cloud: Cloud, up: tuple[float, float, float]) -> _Frame:
-    """Return the axes of a page for its first cloud."""
-    third = functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
-    # With z up, x stays x; else the axis least along the upward one, so that x is never up.
-    start = torch.zeros(3, dtype=torch.float64)
-    start[int(third.abs().argmin())] = 1
-    first = functional.normalize(start - (start @ third) * third, dim=0)
-    rotation = torch.stack([first, torch.linalg.cross(third, first), third])
-    kept = cloud.coordinates[cloud.finite]
-    if len(kept) == 0:
-        return _Frame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
-    low, high = (torch.from_numpy(end(axis=0).astype(np.float64)) for end in (kept.min, kept.max))
-    extent = float((high - low).amax())
-    return _Frame(low + (high - low) / 2, rotation, extent / _PAGE_EXTENT if extent > 0 else 1.0)
-
-
-def _choose_points(cloud: Cloud, frame: _Frame, max_points: int) -> _Shown:
-    """Choose the points to show: the same whatever their order, and in random strata."""
-    finite = finite_rows(cloud.points)
-    mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
-    strata = [part.sort().values for part in mixed.tensor_split(NUM_STRATA)]
-    levels = torch.tensor([len(part) for part in strata]).cumsum(0).tolist()
-    rows = finite[torch.cat(strata)]
-    fields = {
-        name: torch.from_numpy(np.ascontiguousarray(cloud.fields[name][rows.numpy()]))
-        for _, name in MODES.values()
-        if name in cloud.fields
-    }
-    for name in ("normals", "curvature"):
-        if name in fields:
-            fields[name] = fields[name].float().nan_to_num(0, 0, 0)
-    if "normals" in fields:
-        fields["normals"] = fields["normals"] @ frame.rotation.T.float()
-    for name in ("labels", "superpoints"):
-        if name in fields:
-            distinct = _distinct(cloud, name)
-            places = torch.searchsorted(distinct, fields[name].long())
-            fields[name] = torch.where(fields[name] < 0, -1, places)
-    return _Shown(finite, rows, levels, frame.place(cloud.points[rows], cloud.origin), fields)
-
-
-def _distinct(cloud: Cloud, name: str) -> Tensor:
-    """Return the labels that occur at finite points, ascending."""
-    values = torch.from_numpy(np.ascontiguousarray(cloud.fields[name][cloud.finite])).long()
-    distinct: Tensor = torch.unique(values[values >= 0])
-    return distinct
-
-
 def _describe_cloud(
-    cloud: Cloud, shown: _Shown, truth: Cloud | None, reference: Tensor | None, frame: _Frame
+    cloud: Cloud, shown: Shown, truth: Cloud | None, reference: Tensor | None, frame: Frame
 ) -> tuple[dict[str, Any], str]:
     """Return what a page says about a cloud, and the packed arrays of its points."""
     true_fields = {
@@ -348,18 +244,18 @@ def _describe_cloud(
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     channels = list(channels_of(shown.points, shown.fields, true_fields, reference=reference))
-    surfaces = _outer_surfaces(shown.points)
-    planes = _describe_planes(cloud, shown, frame)
+    surfaces = outer_surfaces(shown.points)
+    planes = describe_planes(cloud, shown, frame)
     directions, covered = surfaces.directions, surfaces.covered
     if planes:
         labels = shown.fields["labels"]
-        directions, sides = _sides_of_planes(shown, planes, frame, surfaces)
+        directions, sides = sides_of_planes(shown, planes, frame, surfaces)
         # What stands against a wall, and the floor along it, is not part of the wall.
         covered = torch.where(labels < 0, covered, sides[labels])
         for plane, side in zip(planes, sides.tolist(), strict=True):
             plane["sides"] = side
     low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
-    steps = ((shown.points - low) * (_STEPS / _PAGE_EXTENT)).round().clamp(0, _STEPS)
+    steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
     arrays: dict[str, NDArray[Any]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
     arrays["radii"] = surfaces.radii.numpy()
@@ -378,9 +274,9 @@ def _describe_cloud(
         "shown": len(shown.rows),
         "levels": shown.levels,
         "low": low.tolist(),
-        "step": _PAGE_EXTENT / _STEPS,
+        "step": PAGE_EXTENT / _STEPS,
         "spacing": surfaces.spacing,
-        "surfaces": [_rounded(direction) for direction in directions],
+        "surfaces": [rounded(direction) for direction in directions],
         "channels": {channel.mode: _describe_channel(channel) for channel in channels},
         "planes": planes,
         "arrays": manifest,
@@ -393,45 +289,8 @@ def _describe_channel(channel: Channel) -> dict[str, Any]:
     return {"legend": channel.legend, "direct": channel.colors is None}
 
 
-class _Surfaces(NamedTuple):
-    """What closes a cloud, and how dense it is.
-
-    Attributes:
-        directions: From the inside toward the outside of each outer surface, shape ``(S, 3)``.
-        covered: Bits of the surfaces that each point is in, shape ``(n,)``, uint8.
-        spacing: The usual distance of a point from its neighbours.
-        radii: That of each point, as a step of a sixteenth of an octave from 128, the usual one.
-    """
-
-    directions: Tensor
-    covered: Tensor
-    spacing: float
-    radii: Tensor
-
-
-def _outer_surfaces(points: Tensor) -> _Surfaces:
-    """Find walls and ceiling, and how far points are from their neighbours."""
-    covered = torch.zeros(len(points), dtype=torch.uint8)
-    radii = torch.full((len(points),), _USUAL_RADIUS, dtype=torch.uint8)
-    grid = build_grid(points)
-    if len(grid.levels) == 0:
-        return _Surfaces(points.new_zeros(0, 3), covered, 0.0, radii)
-    up = torch.tensor([0.0, 0.0, 1.0])
-    found = find_outer_surfaces(surface_cells(grid), up)[:_MAX_SURFACES]
-    for place, surface in enumerate(found):
-        covered[grid.rows] |= surface.covers(grid.points).to(torch.uint8) << place
-    spacing = local_spacing(grid)
-    usual = float(spacing.median())
-    if usual > 0:
-        octaves = (spacing / usual).clamp(min=1 / _LARGEST_SPACING, max=_LARGEST_SPACING).log2()
-        steps = (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round()
-        radii[grid.rows] = steps.to(torch.uint8)
-    directions = torch.stack([points.new_zeros(3), *(each.direction for each in found)])[1:]
-    return _Surfaces(directions, covered, usual, radii)
-
-
 def _direction_of_view(
-    points: Tensor, view: View, frame: _Frame, azimuth_deg: float | None
+    points: Tensor, view: View, frame: Frame, azimuth_deg: float | None
 ) -> Tensor:
     """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
     if view == "sensor":
@@ -441,145 +300,6 @@ def _direction_of_view(
         return functional.normalize(torch.tensor([-1.0, -1.0, 1.0]), dim=0)
     up = torch.tensor([0.0, 0.0, 1.0])
     return choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg).toward
-
-
-def _describe_planes(cloud: Cloud, shown: _Shown, frame: _Frame) -> list[dict[str, Any]]:
-    """Return what a page says about each plane, by the number that its points have there."""
-    if "labels" not in shown.fields:
-        return []
-    names = _distinct(cloud, "labels")
-    if len(names) == 0:
-        return []
-    kept = shown.finite
-    labels = torch.from_numpy(np.ascontiguousarray(cloud.fields["labels"])).long()[kept]
-    labels = torch.where(labels < 0, -1, torch.searchsorted(names, labels))
-    points = cloud.points[kept]
-    has_normals = "normals" in cloud.fields
-    normals = torch.zeros_like(points)
-    if has_normals:
-        given = torch.from_numpy(np.ascontiguousarray(cloud.fields["normals"]))[kept]
-        normals = given.to(points.dtype).nan_to_num(0, 0, 0)
-    table = summarize_planes(points, normals, labels, up=frame.rotation[2].tolist())
-    drawn = _planes_to_draw(shown, len(names))
-    offset = table.offset.double() + table.normal.double() @ torch.from_numpy(cloud.origin)
-    kinds = table.kind if table.kind is not None else torch.zeros_like(table.count)
-    rows = zip(
-        names.tolist(),
-        table.count.tolist(),
-        table.area.tolist(),
-        table.rms.tolist(),
-        table.extent.tolist(),
-        table.normal.tolist(),
-        offset.tolist(),
-        kinds.tolist(),
-        (table.curved & has_normals).tolist(),
-        _rectangles(table, frame, cloud.origin),
-        strict=True,
-    )
-    planes = []
-    for number, row in enumerate(rows):
-        name, count, area, rms, extent, normal, height, kind, curved, corners = row
-        rings, met = drawn.get(number, ([], []))
-        planes.append(
-            {
-                "name": name,
-                "count": count,
-                "area": area,
-                "rms": rms,
-                "extent": extent,
-                "normal": normal,
-                "offset": height,
-                "kind": kind,
-                "curved": curved,
-                "rings": rings or [corners],
-                "meets": met,
-            }
-        )
-    return planes
-
-
-def _planes_to_draw(
-    shown: _Shown, num_planes: int
-) -> dict[int, tuple[list[Any], list[tuple[int, float, float]]]]:
-    """Return outlines in the axes of the page, and which planes meet at which angle and length.
-
-    A sample of the points tells both; without shapely there are no outlines.
-    """
-    rows = shown.fields["labels"][:_TABLE_POINTS]
-    points = shown.points[:_TABLE_POINTS]
-    normals = shown.fields.get("normals", torch.zeros_like(points))[:_TABLE_POINTS]
-    numbers, labels = number_labels(rows)
-    neighbors = search_knn(points, min(_TABLE_NEIGHBORS, len(points)))
-    can_trace = find_spec("shapely") is not None
-    table = summarize_planes(points, normals, labels, neighbors=neighbors, outline=can_trace)
-    found: dict[int, tuple[list[Any], list[tuple[int, float, float]]]] = {
-        number: ([], []) for number in range(num_planes)
-    }
-    if table.outline is not None:
-        for number, rings in zip(numbers.tolist(), table.outline, strict=True):
-            found[number][0].extend(_rounded(ring) for ring in rings)
-    if table.adjacency is not None:
-        pairs = numbers[table.adjacency.pairs].tolist()
-        angles = table.adjacency.dihedral_deg.tolist()
-        lengths = table.adjacency.boundary_length.tolist()
-        for (first, second), angle, length in zip(pairs, angles, lengths, strict=True):
-            for own, other in ((first, second), (second, first)):
-                found[own][1].append((other, round(angle, 1), length))
-    return found
-
-
-def _sides_of_planes(
-    shown: _Shown, planes: list[dict[str, Any]], frame: _Frame, surfaces: _Surfaces
-) -> tuple[Tensor, Tensor]:
-    """Return the directions of outer surfaces ``(S, 3)``, and the bits of each plane ``(M,)``.
-
-    A plane is in the outer surfaces that hold most of its points. Large upright ones are, too, in
-    that of the direction in which there is next to nothing beyond them: walls of scans that are too
-    open for a closed outer surface. There is a bit for each main direction.
-    """
-    labels = shown.fields["labels"]
-    inside = labels >= 0
-    own, bits = labels[inside], surfaces.covered[inside]
-    counts = torch.bincount(own, minlength=len(planes))
-    sides = torch.zeros(len(planes), dtype=torch.uint8)
-    for place in range(len(surfaces.directions)):
-        covered = torch.bincount(own[(bits >> place & 1).bool()], minlength=len(planes))
-        sides |= (2 * covered > counts).to(torch.uint8) << place
-    directions = list(surfaces.directions)
-    normals = torch.tensor([plane["normal"] for plane in planes]).double()
-    offsets = torch.tensor([plane["offset"] for plane in planes]).double()
-    offsets = (offsets - normals @ frame.origin) / frame.scale
-    normals = (normals @ frame.rotation.T).float()
-    large = counts.argsort(descending=True, stable=True)[:_MOST_WALLS]
-    walls = large[normals[large, 2].abs() < _UPRIGHT]
-    heights = shown.points[:_WALL_POINTS] @ normals[walls].T - offsets[walls].float()
-    margin = _BEYOND * _PAGE_EXTENT
-    beyond = torch.stack([heights > margin, heights < -margin]).float().mean(dim=1)
-    for sign, shares in zip((1, -1), beyond.tolist(), strict=True):
-        for wall, share in zip(walls.tolist(), shares, strict=True):
-            if share > _MOST_BEYOND:
-                continue
-            outward = sign * normals[wall]
-            alike = [place for place, each in enumerate(directions) if each @ outward > _ALIKE]
-            if not alike and len(directions) < _MAX_SURFACES:
-                alike = [len(directions)]
-                directions.append(outward)
-            for place in alike[:1]:
-                sides[wall] |= 1 << place
-    return torch.stack([shown.points.new_zeros(3), *directions])[1:], sides
-
-
-def _rectangles(table: Planes, frame: _Frame, origin: NDArray[np.float64]) -> list[Any]:
-    """Return the corners of the rectangle around each plane, in the axes of the page."""
-    half = (table.axes * table.extent[:, :, None] / 2).double()
-    signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
-    corners = table.center.double()[:, None] + signs @ half
-    return [_rounded(frame.place(each, origin)) for each in corners]
-
-
-def _rounded(values: Tensor) -> Any:  # noqa: ANN401
-    """Return numbers of a page as JSON needs them: a step is a hundred-thousandth of the cloud."""
-    return np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
 
 
 def _pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]:
