@@ -35,6 +35,8 @@ def test_built_package_runs_in_a_fresh_environment(distributions, tmp_path, suff
         check=True,
         capture_output=True,
     )
+    for asset in ("page.js", "page.html.jinja", "gallery.html.jinja"):
+        assert Path(target, "torchrg", "render", asset).is_file()
     # The dependencies are those of this environment; torchrg itself must come from the package.
     folders = [folder for folder in sys.path if folder.endswith("site-packages")]
     Path(target, "dependencies.pth").write_text("\n".join(folders))

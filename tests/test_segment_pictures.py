@@ -23,7 +23,7 @@ def rooms(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch):
     small = functools.partial(render_cloud, width=80)
-    monkeypatch.setattr("torchrg.cli.segment.render_cloud", small)
+    monkeypatch.setattr("torchrg.render.gallery.render_cloud", small)
 
 
 def segment(*arguments):

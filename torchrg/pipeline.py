@@ -100,6 +100,7 @@ def segment_planes(
         restore_rows(sharp, rows, num_points),
         restore_rows(fit.valid, rows, num_points),
         planes,
+        tensor,
     )
 
 

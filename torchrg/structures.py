@@ -1,8 +1,10 @@
 """What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,6 +187,7 @@ class Segmentation(NamedTuple):
         sharp: Sharp feature points, shape ``(N,)``, bool.
         valid: Points that are finite and have a normal, shape ``(N,)``, bool.
         planes: The plane table, M rows.
+        points: What was segmented, shape ``(N, 3)``, to show it; None where it is not known.
     """
 
     labels: Tensor
@@ -193,6 +196,32 @@ class Segmentation(NamedTuple):
     sharp: Tensor
     valid: Tensor
     planes: Planes
+    points: Tensor | None = None
+
+    def show(self, **settings: Any) -> Any:  # noqa: ANN401
+        """Return the page of the browser, which a notebook shows; needs ``torchrg[view]``.
+
+        Args:
+            settings: Those of :func:`torchrg.render.make_page`.
+
+        Returns:
+            A :class:`torchrg.render.page.Page`; :func:`torchrg.render.write_page` keeps it.
+
+        Raises:
+            ConfigError: If ``points`` is None.
+            MissingDependencyError: If pages cannot be made.
+        """
+        return _notebook().show(self, **settings)
+
+    def _repr_html_(self) -> str:
+        """Return a picture and the table of planes, as a notebook shows them."""
+        text: str = _notebook().as_html(self)
+        return text
+
+
+def _notebook() -> ModuleType:
+    """Import what draws, far above this module, only when something is drawn."""
+    return importlib.import_module("torchrg.render.notebook")
 
 
 class Superpoints(NamedTuple):

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from reproduction.cells import Record
 from reproduction.clouds import EvalCloud
 from torchrg.metrics import contingency_table, match_regions
+from torchrg.render.outcomes import OUTCOMES, outcomes_of
 from torchrg.structures import UNLABELED, Neighbors
 
 LARGE = 1000
@@ -17,9 +17,7 @@ LARGE = 1000
 FOUND = 0.5
 """A face is found if a region has more than this intersection over union with it."""
 
-RIGHT, PART, OTHER, NONE = range(4)
-"""What can become of a point: it is in the region of its face, in a second region of its face, in
-the region of another face, in no region."""
+_RIGHT, _NONE = (list(OUTCOMES).index(name) for name in ("right", "none"))
 
 _CHUNK = 100_000
 """Points whose neighbours are looked up at a time."""
@@ -85,8 +83,8 @@ def score_faces(labels: Tensor, cloud: EvalCloud, at_edges: Tensor) -> Record:
         "f1_large": faces.f1(large),
         "found_large": faces.found(large),
         "found_small": faces.found(~large),
-        "right_at_edges": float((near == RIGHT).double().mean()),
-        "none_at_edges": float((near == NONE).double().mean()),
+        "right_at_edges": float((near == _RIGHT).double().mean()),
+        "none_at_edges": float((near == _NONE).double().mean()),
     }
     if cloud.curved is not None:
         curved = torch.isin(faces.labels, cloud.curved)
@@ -107,29 +105,3 @@ def find_edges(truth: Tensor, neighbors: Neighbors) -> Tensor:
         for some, own in zip(neighbors.indices.split(_CHUNK), truth.split(_CHUNK), strict=True)
     ]
     return torch.cat(crossed) & (truth != UNLABELED)
-
-
-def outcomes_of(labels: Tensor, truth: Tensor) -> Tensor:
-    """Return what became of each point, ``(N,)``: ``RIGHT``, ``PART``, ``OTHER`` or ``NONE``.
-
-    Args:
-        labels: Regions, shape ``(N,)``.
-        truth: Faces, shape ``(N,)``.
-    """
-    table = contingency_table(labels, truth)
-    pairs = match_regions(table)
-    partner = torch.full_like(table.region_labels, UNLABELED - 1)
-    partner[table.regions[pairs]] = table.face_labels[table.faces[pairs]]
-    # Overlaps by region, the largest first; the first of each region is that with its main face.
-    order = np.lexsort((-table.overlaps.numpy(), table.regions.numpy()))
-    regions, first = np.unique(table.regions.numpy()[order], return_index=True)
-    main = torch.full_like(table.region_labels, UNLABELED - 1)
-    main[regions] = table.face_labels[table.faces[order[first]]]
-    outcome = torch.full_like(labels, NONE)
-    labeled = labels != UNLABELED
-    rows = torch.searchsorted(table.region_labels, labels[labeled])
-    faces = truth[labeled]
-    outcome[labeled] = torch.where(
-        partner[rows] == faces, RIGHT, torch.where(main[rows] == faces, PART, OTHER)
-    )
-    return outcome

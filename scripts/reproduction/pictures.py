@@ -1,6 +1,7 @@
 """Pictures of segmentations side by side, and of what is wrong with them."""
 
 from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -11,9 +12,10 @@ from torch import Tensor
 
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
-from reproduction.faces import NONE, OTHER, PART, RIGHT, outcomes_of
 from reproduction.tiles import tile_pictures
-from torchrg.render import color_planes, render_cloud, write_png
+from torchrg.render import color_planes, make_page, render_cloud, write_page, write_png
+from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.structures import Cloud
 
 _GRAY = 190
 """Of the cloud itself."""
@@ -21,14 +23,6 @@ _WIDTH = 1000
 """Of a picture, in pixels."""
 _LONG = 2.2
 """Width over height of a picture that takes the place of two."""
-
-OUTCOMES = {
-    RIGHT: ((214, 224, 214), "in the region of their face"),
-    PART: ((245, 170, 40), "in a second region of their face"),
-    OTHER: ((205, 45, 60), "in the region of another face"),
-    NONE: ((50, 95, 190), "in no region"),
-}
-"""What can become of a point: colour, and what it means."""
 
 
 def draw_side_by_side(
@@ -62,10 +56,38 @@ def draw_side_by_side(
     return _tile(folder, name, cloud, paints)
 
 
+def write_pair(folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]) -> str:
+    """Write a page of the last segmentation beside the true faces, or beside the first one.
+
+    Returns:
+        The name of the file; empty where pydeck, which pages need, is not installed.
+    """
+    if find_spec("pydeck") is None:
+        return ""
+    first, *_, last = [*labelings, *labelings]
+    pair = {last: labelings[last]}
+    if cloud.labels is not None:
+        pair["true faces"] = cloud.labels
+    elif first != last:
+        pair[first] = labelings[first]
+    normals = {} if cloud.normals is None else {"normals": cloud.normals.numpy()}
+    clouds = [
+        Cloud(cloud.points.numpy(), {"labels": labels.numpy(), **normals}, source=title)
+        for title, labels in pair.items()
+    ]
+    truth = None if cloud.labels is None else clouds[-1]
+    file = f"figures/{name}.html"
+    page = make_page(clouds[0], beside=clouds[1] if len(clouds) > 1 else None, truth=truth)
+    write_page(folder.place(file), page)
+    return file
+
+
 def draw_outcomes(
     folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]
 ) -> str:
     """Draw what became of every point of a cloud with truth, in the colours of :data:`OUTCOMES`."""
+    if cloud.labels is None:
+        raise ValueError("draw_outcomes: expected a cloud with truth.")
     colors = torch.tensor([color for color, _ in OUTCOMES.values()], dtype=torch.uint8)
     paints = {
         title: colors[outcomes_of(labels, cloud.labels)] for title, labels in labelings.items()

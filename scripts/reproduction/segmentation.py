@@ -6,10 +6,10 @@ from itertools import chain
 from reproduction.cells import Record
 from reproduction.claims import segmentation_claims
 from reproduction.clouds import HARD, OTHERS, TITLES
-from reproduction.faces import LARGE, outcomes_of
+from reproduction.faces import LARGE
 from reproduction.methods import DRAWN, METHODS, PAPERS, titles
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
-from reproduction.pictures import OUTCOMES, draw_outcomes, draw_side_by_side
+from reproduction.pictures import draw_outcomes, draw_side_by_side, write_pair
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
 from reproduction.segmentations import (
@@ -21,6 +21,7 @@ from reproduction.segmentations import (
     score_sphere,
 )
 from torchrg.metrics import METRICS, adjusted_rand_index, contingency_table
+from torchrg.render.outcomes import OUTCOMES, outcomes_of
 
 FIGURES = {
     "tutorial": "Figure 7",
@@ -161,7 +162,8 @@ def draw_figures(run: Run, key: str, number: str) -> list[Block]:
     labelings = {METHODS[method].title: read_segmented(run, key, method).labels for method in DRAWN}
     name = f"{number.lower().replace(' ', '')}_{key}"
     file = draw_side_by_side(run.folder, name, cloud, labelings)
-    blocks = [figure(file, f"**{number}**, {cloud.origin}. Points of no region are gray.")]
+    page = write_pair(run.folder, name, cloud, labelings)
+    blocks = [figure(file, f"**{number}**, {cloud.origin}. Points of no region are gray.", page)]
     if cloud.labels is None:
         return blocks
     shares = []

@@ -7,7 +7,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions.adjacency import count_contacts
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.colors import rgb_to_lab
+from torchrg.render.colors import DICHROMACIES, palette_of_planes, rgb_to_lab, without_cone
 from torchrg.scenes import make_room
 
 CLEARLY = 20.0  # in Lab; 2.3 is just noticeable
@@ -147,3 +147,35 @@ def test_curvature_scale_ends_where_it_is_told():
 def test_wrong_arguments_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def lab_distance(first, second):
+    return float((rgb_to_lab(first) - rgb_to_lab(second)).norm())
+
+
+def least_difference(*, for_all_eyes, dichromacy):
+    """The least difference of planes that touch: forty in a row, each next to the one before it."""
+    places = torch.rand(3, 1200, generator=torch.Generator().manual_seed(0))
+    labels = torch.arange(40).repeat_interleave(30)
+    points = torch.stack([labels + 0.5 * places[0], places[1], places[2]], dim=1)
+    palette = palette_of_planes(labels, points, for_all_eyes=for_all_eyes)[1].double() / 255
+    if dichromacy is not None:
+        palette = without_cone(palette, DICHROMACIES[dichromacy])
+    return min(lab_distance(palette[i], palette[i + 1]) for i in range(39))
+
+
+@pytest.mark.parametrize("dichromacy", [None, *DICHROMACIES])
+def test_planes_that_touch_differ_for_all_eyes(dichromacy):
+    assert least_difference(for_all_eyes=True, dichromacy=dichromacy) > CLEARLY
+
+
+def test_usual_colors_do_not_differ_for_all_eyes():
+    least = [least_difference(for_all_eyes=False, dichromacy=name) for name in DICHROMACIES]
+    assert min(least) < CLEARLY / 2
+
+
+def test_reds_and_greens_are_one_without_a_cone():
+    """A pair of colours of Ishihara's plates, which deuteranopes confuse."""
+    red, green = torch.tensor([0.80, 0.42, 0.30]), torch.tensor([0.55, 0.55, 0.25])
+    seen = [without_cone(color, DICHROMACIES["deuteranopia"]) for color in (red, green)]
+    assert lab_distance(*seen) < 0.35 * lab_distance(red, green)

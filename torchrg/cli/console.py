@@ -17,6 +17,7 @@ from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS, check_output
 from torchrg.io.files import check_place
+from torchrg.render.page import check_library
 
 USAGE_ERROR = 2
 SOME_FAILED = 3
@@ -181,14 +182,20 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     return results
 
 
-def picture_paths(results: Sequence[Path], picture: Path | None) -> list[Path | None]:
+DRAWINGS = (".png", ".html")
+"""Suffixes of pictures and pages."""
+
+
+def picture_paths(
+    results: Sequence[Path], picture: Path | None, *, suffixes: Sequence[str] = DRAWINGS
+) -> list[Path | None]:
     """Return where the picture of each result goes, by the rules of :func:`output_paths`."""
     if picture is None:
         return [None] * len(results)
-    if len(results) == 1 and not picture.is_dir():
-        check_picture(picture)
+    if len(results) == 1 and not picture.is_dir() and picture.suffix:
+        check_drawing(picture, suffixes=suffixes)
         return [picture]
-    if picture.suffix.lower() == ".png" and not picture.is_dir():
+    if picture.suffix.lower() in suffixes and not picture.is_dir():
         raise FormatError(
             f"{picture}: expected a directory for {len(results)} pictures, got a file name."
         )
@@ -196,8 +203,15 @@ def picture_paths(results: Sequence[Path], picture: Path | None) -> list[Path | 
     return [picture / f"{path.stem}.png" for path in results]
 
 
-def check_picture(path: Path) -> None:
-    """Raise FormatError before long work if a picture has no place, or is no .png file."""
-    if path.suffix.lower() != ".png":
-        raise FormatError(f"{path}: expected a file that ends in .png.")
+def check_drawing(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
+    """Raise before long work if a picture or page has no place, or cannot be made."""
+    if path.suffix.lower() not in suffixes:
+        raise FormatError(f"{path}: expected a file that ends in {' or '.join(suffixes)}.")
     check_place(path)
+    if is_page(path):
+        check_library()
+
+
+def is_page(path: Path) -> bool:
+    """Return whether a drawing is a page."""
+    return path.suffix.lower() == ".html"

@@ -33,7 +33,11 @@ from torchrg.batch.scans import Job, Source
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli import console
 from torchrg.config import DepthConfig
-from torchrg.errors import ConfigError, FormatError
+from torchrg.datasets.pointcept import read_pointcept_scene
+from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.render.gallery import draw_entry, write_index
+from torchrg.render.page import check_library
+from torchrg.structures import Cloud
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,9 @@ class Arguments:
 class CloudArguments(Arguments):
     """What data sets of clouds have beside."""
 
+    pages: Path | None = None
+    """Directory for a picture and a page of each scan that is done, and for index.html, in which
+    the pictures lead to the pages (pip install 'torchrg[view]'). Default: none are made."""
     superpoint: bool = False
     """Write superpoints as superpoint.npy too: a partition of all points, for networks on them."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
@@ -175,6 +182,13 @@ def _check(arguments: Arguments) -> None:
         raise ConfigError(f"expected --limit-memory > 0, in GB, got {arguments.limit_memory}.")
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address together with --engine ray.")
+    if _pages_of(arguments) is not None:
+        check_library()
+
+
+def _pages_of(arguments: Arguments) -> Path | None:
+    """Return the directory for pages, None where none are wanted."""
+    return arguments.pages if isinstance(arguments, CloudArguments) else None
 
 
 def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
@@ -207,7 +221,38 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     with tqdm(total=total, unit="pt", unit_scale=True, smoothing=0, disable=None) as bar:
         shown, engine = _Progress(bar, plan), arguments.engine
         report = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
+    pages = _pages_of(arguments)
+    if pages is not None and not report.interrupted:
+        _draw_pages(plan, report, pages)
     return _finish(report, out)
+
+
+def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
+    """Write picture and page of each scan that is done, and the index of all of them."""
+    done = {scan.name: scan for scan in report.scans if scan.status in ("converted", "kept")}
+    jobs = [job for job in plan.jobs if job.scan.name in done]
+    entries = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"{folder}: cannot be made: {error.strerror or error}.") from error
+    for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
+        name = job.scan.name
+        words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
+        try:
+            cloud = _read_result(job.folder)
+            entries.append(draw_entry(folder, name, cloud, words=words))
+        except TorchrgError as error:
+            console.warn(f"{name}: no page: {error}")
+    print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
+
+
+def _read_result(folder: Path) -> Cloud:
+    """Return a converted scan as a cloud with the fields of a result."""
+    sample = read_pointcept_scene(folder)
+    names = {"plane": "labels", "normal": "normals", "curvature": "curvature", "color": "color"}
+    fields = {names[name]: values.numpy() for name, values in sample.items() if name in names}
+    return Cloud(sample["coord"].numpy(), fields, source=str(folder))
 
 
 class _Progress:

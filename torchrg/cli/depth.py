@@ -58,7 +58,7 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(Arguments, argv, prog="torchrg depth")
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out, suffix=".png")
-    pictures = console.picture_paths(outputs, arguments.picture)
+    pictures = console.picture_paths(outputs, arguments.picture, suffixes=(".png",))
     return console.run_each(_segment_image, arguments, outputs, pictures)
 
 
@@ -81,7 +81,8 @@ def _segment_image(arguments: Arguments, source: Path, target: Path, picture: Pa
             "intrinsics": arguments.intrinsics,
             "depth_scale": arguments.depth_scale,
         }
-        images = {name: part for name, part in seg._asdict().items() if name != "planes"}
+        not_images = ("planes", "points")
+        images = {name: part for name, part in seg._asdict().items() if name not in not_images}
         rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
     if picture is not None:

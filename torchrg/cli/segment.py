@@ -17,7 +17,9 @@ from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
-from torchrg.render import color_planes, render_cloud, write_png
+from torchrg.render import make_page, write_page
+from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
+from torchrg.render.page import check_library
 from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -38,7 +40,11 @@ class Arguments:
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
-    """Picture of the planes to write too, a .png file; for several inputs a directory."""
+    """Picture of the planes to write too, a .png file, or page, a .html file; for several inputs a
+    directory of pictures."""
+    pages: bool = False
+    """Beside each picture in the directory write a page for the browser to turn the cloud in, and
+    index.html, in which the pictures lead to their pages (pip install 'torchrg[view]')."""
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
@@ -66,7 +72,26 @@ def run(argv: list[str]) -> int:
     console.use_threads(arguments.threads)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     pictures = console.picture_paths(outputs, arguments.picture)
-    return console.run_each(_segment_file, arguments, outputs, pictures)
+    if arguments.pages:
+        _check_pages(arguments)
+    code = console.run_each(_segment_file, arguments, outputs, pictures)
+    if arguments.pages and arguments.picture is not None:
+        done = [path for path in pictures if path is not None and _page_of(path).is_file()]
+        entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
+        print(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
+    return code
+
+
+def _check_pages(arguments: Arguments) -> None:
+    """Refuse pages without a directory for them, or without what they need."""
+    if arguments.picture is None or not arguments.picture.is_dir():
+        raise ConfigError("expected --pages together with --picture DIRECTORY.")
+    check_library()
+
+
+def _page_of(picture: Path) -> Path:
+    """Return where the page of a picture is."""
+    return picture.with_suffix(".html")
 
 
 def _refuse_images(argv: list[str]) -> None:
@@ -103,20 +128,24 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
             seg = segment_planes(cloud.points, settings, on_stage=advance)
         else:
             seg = segment_voxels(cloud.points, voxels, settings, on_stage=advance)
-        parts, shown, provenance = None, seg.labels, describe_run(source, settings)
+        parts, provenance = None, describe_run(source, settings)
         if arguments.superpoints:
             advance("superpoints")
             parts = partition_voxels(
                 cloud.points, voxels, seg, arguments.partition, colors=cloud.fields.get("color")
             )
-            shown = parts.labels
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     if voxel is not None:
         provenance["voxel"] = voxel
     write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
-        colors = color_planes(shown, cloud.points)
-        write_png(picture, render_cloud(cloud.points, colors, normals=seg.normals))
+        result = with_results(cloud, seg, parts)
+        if arguments.pages:
+            draw_entry(picture.parent, picture.stem, result)
+        elif console.is_page(picture):
+            write_page(picture, make_page(result))
+        else:
+            draw_planes(picture, result)
     seconds = time.perf_counter() - begin
     num_planes = len(seg.planes.count)
     if num_planes == 0:

@@ -1,14 +1,14 @@
-"""``torchrg view``: a picture of a cloud or of a result."""
+"""``torchrg view``: a picture or a page of a cloud or of a result."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import torch
 import tyro
 from torch import Tensor
 
-from torchrg.cli.console import check_picture, parse
+from torchrg.cli.console import check_drawing, is_page, parse
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud
 from torchrg.render import (
@@ -16,82 +16,117 @@ from torchrg.render import (
     color_normals,
     color_planes,
     color_sharp,
+    make_page,
     render_cloud,
+    write_page,
     write_png,
 )
+from torchrg.render.channels import MODES
+from torchrg.render.page import MAX_POINTS
 from torchrg.structures import Cloud
 
-ColorBy = Literal["plane", "superpoint", "normal", "curvature", "sharp", "color"]
-FIELDS: dict[str, str] = {
-    "plane": "labels",
-    "color": "color",
-    "normal": "normals",
-    "curvature": "curvature",
-    "sharp": "sharp",
-    "superpoint": "superpoints",
-}
-"""What a cloud can be coloured by, the first that it has by default, and the field it needs."""
+ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
+PageColorBy = Literal[ColorBy, "error", "normal-error"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Direction = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Draw a cloud, coloured by its planes if it has labels, and write a PNG file."""
+    """Draw a cloud, coloured by its planes if it has labels.
+
+    As a PNG file, or as a page for the browser: to turn the cloud, point at planes, and compare.
+    """
 
     file: Annotated[Path, tyro.conf.Positional]
     """Cloud or result to read."""
     out: Path
-    """Picture to write, a .png file."""
-    color: ColorBy | None = None
-    """What the colours show. Default: the planes, or the first thing that the file has."""
+    """Picture to write, a .png file, or page, a .html file (pip install 'torchrg[view]'). A page is
+    one file that opens without a network."""
+    color: PageColorBy | None = None
+    """What the colours show, at first on a page, where they can be switched. Default: the planes,
+    or the first thing that the file has. Errors need --truth, and a page."""
     view: Literal["cutaway", "above", "outside", "sensor"] = "cutaway"
     """From outside without ceiling and near walls, from above without ceiling, from outside with
     everything, or from the origin along z as a depth camera sees it."""
-    up: Axis = "z"
-    """Axis that points up."""
+    up: Axis | None = None
+    """Axis that points up. Default: z; -y with --view sensor."""
     azimuth_deg: float | None = None
     """Direction to look from, about the up axis. Default: the one that shows most."""
     width: int = 1600
-    """Width in pixels."""
+    """Width in pixels of a picture."""
+    beside: Path | None = None
+    """Another cloud or result, for the right half of a page; both are turned together."""
+    truth: Path | None = None
+    """Cloud of the same points with true labels or normals, to show errors on a page."""
+    max_points: int = MAX_POINTS
+    """Of more points a page shows a random sample of so many, and says so."""
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, draw the cloud and write the picture."""
     arguments = parse(Arguments, argv, prog="torchrg view")
-    check_picture(arguments.out)
-    cloud = read_cloud(arguments.file)
+    check_drawing(arguments.out)
+    up = None if arguments.up is None else _direction(arguments.up)
+    write = _write_page if is_page(arguments.out) else _write_picture
+    said = write(arguments, read_cloud(arguments.file), up)
+    print(f"{arguments.file} -> {arguments.out} ({said})")
+    return 0
+
+
+def _write_picture(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str:
+    """Write a picture, and return what there is to say about it."""
+    if arguments.beside is not None or arguments.truth is not None:
+        raise ConfigError("expected --beside and --truth with a page, --out PAGE.html.")
     normals = cloud.fields.get("normals")
     picture = render_cloud(
         cloud.points,
         _colors(cloud, arguments.color),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
         view=arguments.view,
-        up=_direction(arguments.up),
+        up=up or (0.0, 0.0, 1.0),
         azimuth_deg=arguments.azimuth_deg,
         width=arguments.width,
     )
     write_png(arguments.out, picture)
-    print(f"{arguments.file} -> {arguments.out} ({picture.shape[1]} x {picture.shape[0]} pixels)")
-    return 0
+    return f"{picture.shape[1]} x {picture.shape[0]} pixels"
 
 
-def _colors(cloud: Cloud, color: ColorBy | None) -> Tensor:
+def _write_page(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str:
+    """Write a page, and return what there is to say about it."""
+    page = make_page(
+        cloud,
+        beside=None if arguments.beside is None else read_cloud(arguments.beside),
+        truth=None if arguments.truth is None else read_cloud(arguments.truth),
+        color=arguments.color,
+        view=arguments.view,
+        up=up,
+        azimuth_deg=arguments.azimuth_deg,
+        max_points=arguments.max_points,
+    )
+    write_page(arguments.out, page)
+    shown = " and ".join(f"{number:,}" for number in page.num_points)
+    return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
+
+
+def _colors(cloud: Cloud, color: PageColorBy | None) -> Tensor:
     """Return the colour of each point.
 
     Raises:
         ConfigError: If the cloud lacks what the colours shall show.
     """
-    present = [name for name, field in FIELDS.items() if field in cloud.fields]
+    present = [name for name in get_args(ColorBy) if MODES[name][1] in cloud.fields]
     if color is None:
-        color = present[0] if present else None  # type: ignore[assignment]
+        color = present[0] if present else None
     elif color not in present:
         raise ConfigError(
-            f"{cloud.source}: expected {FIELDS[color]} for --color {color}, got a file with "
+            f"{cloud.source}: expected {MODES[color][1]} for --color {color}, got a file with "
             f"{', '.join(cloud.fields) or 'points alone'}."
+            + (" Errors are for pages, with --truth." if color.endswith("error") else "")
         )
     if color is None:
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
-    values = torch.from_numpy(cloud.fields[FIELDS[color]])
+    values = torch.from_numpy(cloud.fields[MODES[color][1]])
     if color in ("plane", "superpoint"):
         return color_planes(values, cloud.points)
     if color == "normal":
@@ -101,7 +136,7 @@ def _colors(cloud: Cloud, color: ColorBy | None) -> Tensor:
     return color_sharp(values) if color == "sharp" else values[:, :3]
 
 
-def _direction(axis: Axis) -> tuple[float, float, float]:
+def _direction(axis: Axis) -> Direction:
     """Return an axis as a vector."""
     sign = -1.0 if axis.startswith("-") else 1.0
     x, y, z = (sign * (letter == axis[-1]) for letter in "xyz")

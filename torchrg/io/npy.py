@@ -155,7 +155,7 @@ def _result(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray[Any]]
         return places.numpy(force=True).astype(np.float64) + cloud.origin
 
     per_point = segmentation._asdict()
-    planes = per_point.pop("planes")
+    planes, _ = per_point.pop("planes"), per_point.pop("points")
     table = planes._asdict()
     kind, outline, adjacency = (table.pop(name) for name in ("kind", "outline", "adjacency"))
     arrays = {"points": cloud.coordinates}

@@ -81,14 +81,68 @@ def make_palette() -> tuple[Tensor, int]:
     return _to_bytes(torch.cat(groups)), len(groups[0])
 
 
+DICHROMACIES = {
+    "protanopia": (
+        (0.152286, 1.052583, -0.204868),
+        (0.114503, 0.786281, 0.099216),
+        (-0.003882, -0.048116, 1.051998),
+    ),
+    "deuteranopia": (
+        (0.367322, 0.860646, -0.227968),
+        (0.280085, 0.672501, 0.047413),
+        (-0.011820, 0.042940, 0.968881),
+    ),
+    "tritanopia": (
+        (1.255528, -0.076749, -0.178779),
+        (-0.078411, 0.930809, 0.147602),
+        (0.004733, 0.691367, 0.303900),
+    ),
+}
+"""How linear RGB looks to eyes that lack one kind of cone: rows of the matrices of Machado et al.,
+A physiologically-based model for simulation of color vision deficiency, 2009, severity 1."""
+
+
+def without_cone(colors: Tensor, matrix: tuple[tuple[float, ...], ...]) -> Tensor:
+    """Return sRGB colours in [0, 1], shape ``(*, 3)``, as eyes of a dichromacy see them.
+
+    Example:
+        >>> white = torch.ones(3)
+        >>> bool((without_cone(white, DICHROMACIES["protanopia"]) - white).abs().max() < 1e-4)
+        True
+    """
+    from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+
+    linear = rgb_to_linear_rgb(_as_image(colors))[0, :, :, 0].T
+    seen = linear @ linear.new_tensor(matrix).T
+    changed: Tensor = linear_rgb_to_rgb(_as_image(seen.clamp(0, 1)))[0, :, :, 0].T
+    return changed.reshape(colors.shape)
+
+
+def _sq_differences(colors: Tensor, *, for_all_eyes: bool) -> Tensor:
+    """Return squared Lab distances of all pairs of colours ``(C, C)``.
+
+    For all eyes: the smallest of what those with three kinds of cones see, and those with two.
+    """
+    seen = [colors]
+    if for_all_eyes:
+        seen += [without_cone(colors, matrix) for matrix in DICHROMACIES.values()]
+    labs = torch.stack([rgb_to_lab(each) for each in seen])
+    return (labs[:, :, None] - labs[:, None]).square().sum(dim=-1).amin(dim=0)
+
+
 def choose_colors(
-    sizes: Tensor, pairs: Tensor, weights: Tensor, *, fixed: Tensor | None = None
+    sizes: Tensor,
+    pairs: Tensor,
+    weights: Tensor,
+    *,
+    fixed: Tensor | None = None,
+    for_all_eyes: bool = False,
 ) -> Tensor:
     """Choose a row of the palette for each plane, the largest first, far from those before.
 
     Each chosen colour repels with the inverse square of its distance in Lab: that of a neighbour,
     in ``pairs`` ``(E, 2)``, with its weight, any other with a little. Where ``fixed`` is not
-    negative it is the choice.
+    negative it is the choice. ``for_all_eyes``: what the colour-blind see counts as well.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
@@ -97,8 +151,8 @@ def choose_colors(
     """
     palette, num_calm = make_palette()
     gray = palette.new_full((1, 3), UNLABELED_GRAY)
-    lab = rgb_to_lab(torch.cat([palette, gray]).double() / 255)
-    distances = (lab[:, None] - lab).square().sum(dim=-1)
+    shown = torch.cat([palette, gray]).double() / 255
+    distances = _sq_differences(shown, for_all_eyes=for_all_eyes)
     repulsion = (1 / (distances + _ALIKE)).numpy()[:, :-1]
     share = (sizes / sizes.sum()).numpy()
     strength = np.clip(8 * share, _ELSEWHERE, 1)
@@ -278,22 +332,42 @@ def color_planes(
     check_shapes(caller, labels=(tensor, "*"), points=(cloud, "* 3"), reference=(other, "*"))
     check_floating(caller, points=cloud)
     flat = check_labels(caller, labels=tensor.flatten())[0]
+    same = None if other is None else check_labels(caller, reference=other.flatten())[0]
     cloud = None if cloud is None else cloud.detach().reshape(-1, 3)
-    fixed = None
-    if other is not None:
-        same = check_labels(caller, reference=other.flatten())[0]
-        table = contingency_table(flat, same)
-        pairs = match_regions(table)
-        fixed = torch.full_like(table.region_sizes, -1)
-        fixed[table.regions[pairs]] = _choose(same, cloud)[1][table.faces[pairs]]
-    rows, choices = _choose(flat, cloud, fixed)
-    gray = torch.full((1, 3), UNLABELED_GRAY, dtype=torch.uint8, device=flat.device)
-    colors = torch.cat([make_palette()[0].to(flat.device)[choices], gray])
+    rows, colors = palette_of_planes(flat, cloud, reference=same)
     return colors[rows].view(*tensor.shape, 3)
 
 
+def palette_of_planes(
+    labels: Tensor,
+    points: Tensor | None,
+    *,
+    reference: Tensor | None = None,
+    for_all_eyes: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Return each point's row in a palette ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
+
+    Its rows are the labels that occur, ascending, and gray, to which -1 leads as well. Arguments
+    as for :func:`color_planes`, flat.
+    """
+    fixed = None
+    if reference is not None:
+        table = contingency_table(labels, reference)
+        pairs = match_regions(table)
+        fixed = torch.full_like(table.region_sizes, -1)
+        chosen = _choose(reference, points, for_all_eyes=for_all_eyes)[1]
+        fixed[table.regions[pairs]] = chosen[table.faces[pairs]]
+    rows, choices = _choose(labels, points, fixed, for_all_eyes=for_all_eyes)
+    gray = torch.full((1, 3), UNLABELED_GRAY, dtype=torch.uint8, device=labels.device)
+    return rows, torch.cat([make_palette()[0].to(labels.device)[choices], gray])
+
+
 def _choose(
-    labels: Tensor, points: Tensor | None, fixed: Tensor | None = None
+    labels: Tensor,
+    points: Tensor | None,
+    fixed: Tensor | None = None,
+    *,
+    for_all_eyes: bool,
 ) -> tuple[Tensor, Tensor]:
     """Return each point's row among the labels that occur, and the palette's row of each label."""
     rows = number_labels(labels)[1]
@@ -309,6 +383,7 @@ def _choose(
         torch.cat(pairs).cpu(),
         torch.cat(weights),
         fixed=None if fixed is None else fixed.cpu(),
+        for_all_eyes=for_all_eyes,
     )
     return rows, choices.to(labels.device)
 

@@ -189,7 +189,8 @@ def _hemisphere(count: int) -> Tensor:
 View = Literal["cutaway", "above", "outside", "sensor"]
 
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
-_LEAST_FACING = {"cutaway": 0.1, "above": 0.7}  # least cosine to the viewer of what is cut away
+LEAST_FACING = {"cutaway": 0.1, "above": 0.7}
+"""Least cosine to the viewer of what is cut away."""
 
 
 class Viewpoint(NamedTuple):
@@ -234,22 +235,24 @@ def choose_viewpoint(
     azimuths = _AZIMUTHS_DEG if azimuth_deg is None else (azimuth_deg,)
     if azimuth_deg is None and view == "above":
         azimuths = (-90.0,) if _is_longer(cells.centers, heading, up) else (0.0,)
-    surfaces = []
-    if view in _LEAST_FACING:
-        sides = torch.stack([directions, -directions], dim=1).flatten(0, 1)
-        found = [
-            find_outer_surface(cells, side, is_ceiling=float(side @ up) > 0.9) for side in sides
-        ]
-        surfaces = [surface for surface in found if surface is not None]
+    surfaces = find_outer_surfaces(cells, up) if view in LEAST_FACING else ()
     viewpoints = []
     for azimuth in azimuths:
         toward = _turned(heading, up, azimuth, elevation_deg)
-        cut = tuple(s for s in surfaces if float(s.direction @ toward) > _LEAST_FACING[view])
+        cut = tuple(s for s in surfaces if float(s.direction @ toward) > LEAST_FACING[view])
         picture_up = _turned(heading, up, azimuth + 180, 90 - elevation_deg)
         viewpoints.append(Viewpoint(toward, picture_up, cut))
     if len(viewpoints) == 1:
         return viewpoints[0]
     return max(viewpoints, key=lambda viewpoint: _count_seen(cells, viewpoint))
+
+
+def find_outer_surfaces(cells: Cells, up: Tensor) -> tuple[OuterSurface, ...]:
+    """Find the walls and the ceiling that close a cloud, as far as it is closed."""
+    directions = main_directions(cells)
+    sides = torch.stack([directions, -directions], dim=1).flatten(0, 1)
+    found = (find_outer_surface(cells, side, is_ceiling=float(side @ up) > 0.9) for side in sides)
+    return tuple(surface for surface in found if surface is not None)
 
 
 def _heading(directions: Tensor, up: Tensor) -> Tensor:

@@ -113,7 +113,7 @@ def segment_voxels(
     rows, up, outline = finite_rows(tensor), config.planes.up_direction, config.planes.outline
     planes = summarize_planes(tensor[rows], normals[rows], labels[rows], up=up, outline=outline)
     planes = planes._replace(adjacency=_renumbered(seg.planes.adjacency, place))
-    return Segmentation(labels, normals, curvature, sharp, valid, planes)
+    return Segmentation(labels, normals, curvature, sharp, valid, planes, tensor)
 
 
 def partition_voxels(

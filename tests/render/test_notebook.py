@@ -1,0 +1,54 @@
+"""How a segmentation shows itself in a notebook."""
+
+import re
+
+import pytest
+import torch
+
+import torchrg
+from torchrg.errors import ConfigError
+from torchrg.render import gallery, render_cloud
+
+
+@pytest.fixture(scope="module")
+def seg():
+    points = torchrg.scenes.make_room(num_points=3000, seed=0).points
+    return torchrg.segment_planes(points, torchrg.load_config("classic"))
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch):
+    def small(*arguments, **settings):
+        return render_cloud(*arguments, **settings, width=80)
+
+    monkeypatch.setattr(gallery, "render_cloud", small)
+
+
+def test_a_notebook_shows_a_picture_and_the_largest_planes(seg):
+    text = seg._repr_html_()
+    assert "data:image/png;base64,iVBORw0KGgo" in text
+    assert text.count("<tr>") == 1 + min(12, len(seg.planes.count))
+    assert f"{int(seg.planes.count[0]):,}" in text
+    assert f"{len(seg.planes.count):,} planes" in text
+
+
+def test_without_points_there_is_the_table_alone(seg):
+    text = seg._replace(points=None)._repr_html_()
+    assert "<img" not in text
+    assert "<table>" in text
+    with pytest.raises(ConfigError, match=re.escape("use seg._replace(points=points)")):
+        seg._replace(points=None).show()
+
+
+def test_a_cloud_without_planes_shows_itself():
+    assert "0 planes" in torchrg.segment_planes(torch.full((5, 3), torch.nan))._repr_html_()
+
+
+def test_show_gives_the_page_in_a_frame_of_its_own(seg):
+    pytest.importorskip("pydeck", reason="needs the extra view")
+    page = seg.show(title='a "quoted" <title>')
+    assert page.num_points == (3000,)
+    frame = page._repr_html_()
+    assert frame.startswith("<iframe ")
+    assert frame.count("<") == 2
+    assert frame.count('"') == 2 * len(re.findall(r'[a-z]="', frame))

@@ -1,0 +1,276 @@
+"""Pages in a real Chromium without a screen: what is drawn, picked, hidden, and linked."""
+
+import io
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from torchrg.scenes import make_room
+from torchrg.structures import Cloud
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)"
+)
+api = pytest.importorskip("playwright.sync_api", reason="needs playwright to drive Chromium")
+pytest.importorskip("pydeck", reason="needs the extra view")
+image = pytest.importorskip("PIL.Image", reason="needs pillow to read screenshots")
+
+from torchrg.render.page import make_page, write_page  # noqa: E402
+
+EVIL = "</script><img src=x onerror=alert(2)>"
+SIZE = {"width": 900, "height": 500}
+DEADLINE_SECONDS = 120
+
+
+class Tab:
+    """A page that is open, and all that it said."""
+
+    def __init__(self, browser, path):
+        self.said, self.requests = [], []
+        self.page = browser.new_page(viewport=SIZE)
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("dialog", lambda dialog: self.said.append(dialog.message))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+        self.wait_for(
+            "globalThis.torchrg && (torchrg.page.ready || !message.hidden && "
+            "!message.textContent.startsWith('Unpacking'))"
+        )
+
+    def run(self, script):
+        return self.page.evaluate(script)
+
+    def wait_for(self, condition):
+        """The page's policy forbids playwright's own way of waiting, which needs eval."""
+        end = time.monotonic() + DEADLINE_SECONDS
+        while not self.run(condition):
+            assert time.monotonic() < end, condition
+            time.sleep(0.05)
+
+    def settle(self):
+        self.wait_for(
+            "!torchrg.state.moving && torchrg.state.share === 1 && !torchrg.deck().needsRedraw()"
+        )
+        self.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+    def picture(self):
+        """Return the pixels of the view, without the panel."""
+        self.settle()
+        box = self.run(
+            "(() => { const b = view.getBoundingClientRect(); return [b.width, b.height] })()"
+        )
+        shot = self.page.screenshot(clip={"x": 0, "y": 0, "width": box[0], "height": box[1]})
+        return np.asarray(image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with api.sync_playwright() as driver:
+        # Software GL, so that it runs anywhere; root may not use the sandbox.
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def room():
+    made = make_room(num_points=20_000, noise=0.003, seed=1)
+    labels = np.unique(made.labels.numpy(), return_inverse=True)[1]
+    fields = {"labels": labels, "normals": made.normals.numpy()}
+    return Cloud(made.points.numpy(), fields, source=f"/tmp/{EVIL}.npz")
+
+
+@pytest.fixture(scope="module")
+def tab(browser, room, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "room.html"
+    fields = dict(
+        room.fields, labels=np.where(room.fields["labels"] == 0, -1, room.fields["labels"])
+    )
+    other = Cloud(room.coordinates, fields, source="other.npz")
+    write_page(path, make_page(room, beside=other, title=EVIL))
+    return Tab(browser, path)
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was_opened(request):
+    if "tab" not in request.fixturenames:
+        return
+    request.getfixturevalue("tab").run(
+        """(() => {
+          const wanted = { cut: true, outlines: false, normals: false };
+          for (const [name, on] of Object.entries(wanted))
+            if (document.getElementById(name).checked !== on) document.getElementById(name).click();
+          torchrg.choose(null);
+          torchrg.setMode("plane");
+          showall.click();
+          torchrg.home(torchrg.page.toward);
+        })()"""
+    )
+
+
+def drawn(picture):
+    """Return which pixels are neither white nor gray: those of points in planes."""
+    return picture.max(axis=2) - picture.min(axis=2) > 12
+
+
+def test_nothing_is_fetched_and_nothing_is_complained_about(tab):
+    tab.settle()
+    assert tab.said == []
+    assert len(tab.requests) == 1  # The file itself.
+    assert tab.run("document.querySelectorAll('img').length") == 0
+    assert EVIL in tab.run("document.querySelector('h1').textContent")
+
+
+def test_points_are_drawn_in_both_halves(tab):
+    picture = tab.picture()
+    half = picture.shape[1] // 2
+    for side in (picture[:, :half], picture[:, half:]):
+        assert drawn(side).mean() > 0.1
+        assert (side == 255).all(axis=2).mean() > 0.1
+
+
+def project(tab, points):
+    """Return pixels and distance of points: a pinhole camera by its definition."""
+    camera = tab.run("torchrg.state.camera")
+    height = tab.run("view.clientHeight")
+    turn, tilt = np.radians([camera["rotationOrbit"], camera["rotationX"]])
+    toward = np.array([-np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt), np.sin(tilt)])
+    right = np.array([np.cos(turn), -np.sin(turn), 0])
+    up = np.cross(toward, right)
+    focal = height / 2 / np.tan(np.radians(25))
+    eye = np.array(camera["target"]) + toward * focal / 2 ** camera["zoom"]
+    local = points - eye
+    depth = -local @ toward
+    middle = np.array([tab.run("view.clientWidth") / 4, height / 2])
+    pixels = middle + focal * np.stack([local @ right, -local @ up], axis=1) / depth[:, None]
+    return pixels, depth
+
+
+def test_picking_returns_the_plane_that_is_seen(tab, room):
+    tab.run("cut.click()")
+    tab.settle()
+    points = room.coordinates.astype(np.float64)
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    scale = (points.max(axis=0) - points.min(axis=0)).max() / 10
+    pixels, depth = project(tab, (points - middle) / scale)
+    labels = room.fields["labels"]
+    checked = set()
+    width = tab.run("view.clientWidth") / 2
+    inside = (pixels[:, 0] > 20) & (pixels[:, 0] < width - 20)
+    for row in np.random.default_rng(0).permutation(inside.nonzero()[0]):
+        near = np.abs(pixels - pixels[row]).max(axis=1) < 14
+        front = near & (depth < depth[row] + 0.3)
+        if labels[row] in checked or len(set(labels[front])) > 1:
+            continue
+        found = tab.run(f"torchrg.pick({pixels[row, 0]}, {pixels[row, 1]})")
+        assert (found["cloud"], found["plane"]) == (0, labels[row])
+        assert str(labels[row]) in tab.run("picked.textContent")
+        checked.add(labels[row])
+        if len(checked) == 3:
+            break
+    assert len(checked) == 3
+    assert tab.run("torchrg.pick(3, 3)") is None
+
+
+def test_a_click_picks_and_the_panel_tells(tab, room):
+    tab.settle()
+    tab.page.mouse.click(tab.run("view.clientWidth") / 4, tab.run("view.clientHeight") / 2)
+    number = tab.run("torchrg.state.picked.plane")
+    plane = tab.run(f"torchrg.page.clouds[0].planes[{number}]")
+    text = tab.run("picked.innerText")
+    assert f"{plane['count']:,}" in text
+    assert all(word in text for word in ("equation", "area", "rms", "meets"))
+    assert "°" in text
+
+
+def test_hiding_a_plane_and_cutting_change_the_picture(tab, room):
+    open_room = tab.picture()
+    before = drawn(open_room).sum()
+    tab.run("torchrg.setHidden(0, torchrg.page.clouds[0].order.slice(0, 8), true)")
+    assert drawn(tab.picture()).sum() < 0.9 * before
+    tab.run("showall.click()")
+    assert (tab.picture() == open_room).all()
+    tab.run("cut.click()")
+    assert (tab.picture() != open_room).any(axis=2).mean() > 0.05
+    tab.run("cut.click()")
+    tab.page.locator("#top").fill("70")
+    assert drawn(tab.picture()).sum() < 0.9 * before
+    tab.page.locator("#top").fill("0")
+    tab.page.locator("#near").fill("70")
+    assert drawn(tab.picture()).sum() < 0.9 * before
+    tab.page.locator("#near").fill("0")
+
+
+def test_both_halves_are_turned_together(tab):
+    def cameras():
+        return np.array(tab.run("torchrg.deck().getViewports().map((v) => v.cameraPosition)"))
+
+    tab.settle()
+    before = cameras()
+    x, y = tab.run("view.clientWidth") / 4, tab.run("view.clientHeight") / 2
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x + 80, y + 20, steps=4)
+    tab.page.mouse.up()
+    tab.settle()
+    after = cameras()
+    assert len(after) == 2
+    assert np.abs(after - before).max() > 0.5
+    assert np.abs(after[0] - after[1]).max() < 1e-9
+
+
+def test_keys_turn_zoom_and_go_from_plane_to_plane(tab):
+    tab.page.locator("#view").focus()
+    start = tab.run("torchrg.state.camera")
+    tab.page.keyboard.press("ArrowRight")
+    tab.page.keyboard.press("+")
+    now = tab.run("torchrg.state.camera")
+    assert now["rotationOrbit"] == pytest.approx(start["rotationOrbit"] + 5)
+    assert now["zoom"] > start["zoom"]
+    order = tab.run("torchrg.page.clouds[0].order")
+    for expected in order[:2]:
+        tab.page.keyboard.press("PageDown")
+        assert tab.run("torchrg.state.picked.plane") == expected
+    tab.page.keyboard.press("h")
+    assert tab.run("[...torchrg.page.clouds[0].hidden]") == [order[1]]
+    tab.page.keyboard.press("Escape")
+    assert tab.run("torchrg.state.picked") is None
+
+
+def test_colours_switch_and_outlines_and_normals_appear(tab):
+    planes = tab.picture()
+    tab.page.locator("#mode").select_option("normal")
+    normals = tab.picture()
+    assert (planes != normals).any(axis=2).mean() > 0.1
+    for name in ("outlines", "normals"):
+        tab.run(f"document.getElementById('{name}').click()")
+        with_lines = tab.picture()
+        assert (with_lines != normals).any(axis=2).mean() > 0.002
+        normals = with_lines
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cloud", "words"),
+    [
+        (Cloud(np.full((3, 3), np.nan)), "no finite point"),
+        (Cloud(np.zeros((1, 3))), ""),
+        (Cloud(np.random.default_rng(0).random((500, 3)).astype(np.float32)), ""),
+    ],
+    ids=["all NaN", "one point", "no labels"],
+)
+def test_odd_clouds_open(browser, tmp_path, cloud, words):
+    write_page(tmp_path / "odd.html", make_page(cloud))
+    tab = Tab(browser, tmp_path / "odd.html")
+    assert words in tab.run("message.textContent")
+    if not words:
+        tab.settle()
+        assert (tab.picture() < 250).any()
+        assert "no plane labels" in tab.run("planes.textContent")
+    assert tab.said == []
+    tab.page.close()

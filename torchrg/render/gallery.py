@@ -1,0 +1,88 @@
+"""A picture of each of many scans that leads to its page, and an index of them."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from torchrg.errors import ShapeError
+from torchrg.io.files import atomic_path
+from torchrg.render.colors import color_planes
+from torchrg.render.page import make_page, template_of, write_page
+from torchrg.render.pictures import render_cloud, write_png
+from torchrg.structures import Cloud, Segmentation, Superpoints
+
+INDEX = "index.html"
+"""Name of the index in its folder."""
+
+
+class Entry(NamedTuple):
+    """A scan of an index.
+
+    Attributes:
+        name: Of the scan.
+        picture: A file below the folder of the index, with forward slashes.
+        page: As ``picture``.
+        words: What else there is to say.
+    """
+
+    name: str
+    picture: str
+    page: str
+    words: str = ""
+
+
+def with_results(
+    cloud: Cloud, segmentation: Segmentation, superpoints: Superpoints | None = None
+) -> Cloud:
+    """Return a cloud with what was found about its points as fields.
+
+    Raises:
+        ShapeError: If the segmentation is not of its points.
+    """
+    if len(segmentation.labels) != len(cloud):
+        raise ShapeError(
+            f"with_results: expected a segmentation of {len(cloud):,} points, got "
+            f"{len(segmentation.labels):,}; pass the points that were segmented."
+        )
+    names = ("labels", "normals", "curvature", "sharp")
+    found = {name: getattr(segmentation, name).numpy(force=True) for name in names}
+    parts = {} if superpoints is None else superpoints.by_level()
+    return Cloud(cloud.coordinates, {**cloud.fields, **found, **parts}, source=cloud.source)
+
+
+def draw_planes(path: str | os.PathLike[str], cloud: Cloud) -> None:
+    """Write a picture of the superpoints or, without any, of the planes of a cloud with normals."""
+    shown = "superpoints" if "superpoints" in cloud.fields else "labels"
+    labels, normals = (torch.from_numpy(cloud.fields[name]) for name in (shown, "normals"))
+    colors = color_planes(labels, cloud.points)
+    write_png(path, render_cloud(cloud.points, colors, normals=normals.to(cloud.points.dtype)))
+
+
+def draw_entry(folder: Path, name: str, cloud: Cloud, *, words: str = "") -> Entry:
+    """Write picture and page of a cloud under its name, and return its entry of the index.
+
+    Raises:
+        FormatError: If a file cannot be written.
+        MissingDependencyError: If pages cannot be made.
+    """
+    entry = Entry(name, f"{name}.png", f"{name}.html", words)
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    draw_planes(folder / entry.picture, cloud)
+    write_page(folder / entry.page, make_page(cloud, title=name))
+    return entry
+
+
+def write_index(folder: Path, title: str, entries: Sequence[Entry]) -> Path:
+    """Write the index of the entries of a folder, and return where it is.
+
+    Raises:
+        FormatError: If it cannot be written.
+        MissingDependencyError: If pages cannot be made.
+    """
+    text = template_of("gallery.html.jinja").render(title=title, entries=entries)
+    with atomic_path(folder / INDEX) as beside:
+        beside.write_text(text, encoding="utf-8")
+    return folder / INDEX

@@ -1,0 +1,390 @@
+"""A page for the browser: one file that opens offline, to turn a cloud, point at planes, compare.
+
+:func:`write_page` puts together what ``page.js`` beside this file shows. deck.gl draws and picks;
+its JavaScript comes out of the installed package pydeck, so that the page needs no network. The
+rows of points are packed as byte planes, compressed, and written as base64; names that come from
+files are written as JSON with every character escaped that HTML could take for its own, and the
+page's policy allows only the scripts that torchrg put there, and no connection.
+"""
+
+import base64
+import functools
+import hashlib
+import html
+import json
+import math
+import os
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from torchrg._optional import require
+from torchrg.errors import ConfigError, MissingDependencyError
+from torchrg.io.files import atomic_path
+from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
+from torchrg.render.content import (
+    PAGE_EXTENT,
+    Frame,
+    Shown,
+    choose_points,
+    describe_planes,
+    frame_of,
+    outer_surfaces,
+    rounded,
+    sides_of_planes,
+)
+from torchrg.render.cutaway import (
+    LEAST_FACING,
+    View,
+    choose_viewpoint,
+)
+from torchrg.render.grid import build_grid, surface_cells
+from torchrg.structures import PLANE_KINDS, Cloud
+
+MAX_POINTS = 1_000_000
+"""Points of a page by default: what a laptop turns fluently. Of more, a random sample is shown."""
+_STEPS = 65535
+"""Steps of a position along the longest side of a cloud: two bytes a coordinate."""
+_ASSETS = Path(__file__).parent
+_LIBRARY = "nbextension/static/index.js"
+"""Where pydeck keeps deck.gl, which it writes itself into pages for use offline."""
+
+
+class Page(NamedTuple):
+    """A page, and what it shows.
+
+    Attributes:
+        html: The text of the file.
+        num_points: Points that are shown, of each cloud.
+    """
+
+    html: str
+    num_points: tuple[int, ...]
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame of its own, as a notebook shows it."""
+        frame = 'width="100%" height="620" style="border: 1px solid #d9dee5"'
+        return f'<iframe {frame} srcdoc="{html.escape(self.html)}"></iframe>'
+
+
+def make_page(
+    cloud: Cloud,
+    *,
+    beside: Cloud | None = None,
+    truth: Cloud | None = None,
+    title: str | None = None,
+    color: str | None = None,
+    view: View = "cutaway",
+    up: tuple[float, float, float] | None = None,
+    azimuth_deg: float | None = None,
+    max_points: int = MAX_POINTS,
+) -> Page:
+    """Make a page that shows a cloud, or two of them with one camera.
+
+    What can be seen depends on the fields of the cloud: ``labels`` (planes, with their table),
+    ``superpoints``, ``color``, ``normals``, ``curvature``, ``sharp``. The page holds no time and
+    no path: equal input gives equal bytes.
+
+    Args:
+        cloud: What to show. Points with NaN or Inf are left out, and counted.
+        beside: Another cloud in the same coordinates, for the right half. If it has the same
+            points, planes that are the same in both have the same colour.
+        truth: A cloud of the same points, with the true ``labels`` or ``normals``, to show errors.
+        title: Of the page. Default: the names of the files.
+        color: A key of :data:`torchrg.render.channels.MODES` to begin with. Default: the first
+            that there is.
+        view: From where to look at first, see :func:`torchrg.render.render_cloud`.
+        up: Upward direction. Default: z, for the view of a sensor -y.
+        azimuth_deg: See :func:`torchrg.render.render_cloud`.
+        max_points: Of more points, a random sample of so many is shown, and the page says so.
+
+    Returns:
+        The page.
+
+    Raises:
+        ConfigError: If a setting is not as above, or the cloud lacks what the colours shall show.
+        MissingDependencyError: If pydeck is not installed.
+    """
+    up = _check_settings(cloud, truth, up, view, max_points)
+    library = _read_library()
+    frame = frame_of(cloud, up)
+    clouds = [_with_usable_fields(each) for each in (cloud, beside) if each is not None]
+    truth = None if truth is None else _with_usable_fields(truth)
+    shown = [choose_points(each, frame, max_points) for each in clouds]
+    truths: list[Cloud | None] = [truth]
+    references: list[Tensor | None] = [None]
+    if beside is not None:
+        is_same = np.array_equal(cloud.coordinates, beside.coordinates, equal_nan=True)
+        truths.append(truth if is_same else None)
+        references.append(shown[0].fields.get("labels") if is_same else None)
+    scenes: list[dict[str, Any]] = []
+    blobs: list[str] = []
+    for parts in zip(clouds, shown, truths, references, strict=True):
+        scene, blob = _describe_cloud(*parts, frame)
+        scenes.append(scene)
+        blobs.append(blob)
+    modes = [mode for mode in MODES if any(mode in scene["channels"] for scene in scenes)]
+    if color is not None and color not in modes:
+        needed = f"{MODES[color][1]} for" if color in MODES else f"one of {', '.join(MODES)} as"
+        beyond = " and a truth" if color.endswith("error") else ""
+        raise ConfigError(
+            f"{cloud.source or 'make_page'}: expected {needed} the colour {color!r}{beyond}, got "
+            f"{', '.join(cloud.fields) or 'points alone'}."
+        )
+    description = {
+        "title": title or " and ".join(scene["name"] for scene in scenes),
+        "modes": [(mode, MODES[mode][0]) for mode in modes],
+        "mode": color or (modes[0] if modes else None),
+        "toward": rounded(_direction_of_view(shown[0].points, view, frame, azimuth_deg)),
+        "cut": view in LEAST_FACING,
+        "leastFacing": LEAST_FACING["above" if view == "above" else "cutaway"],
+        "frame": {
+            "origin": frame.origin.tolist(),
+            "rotation": frame.rotation.tolist(),
+            "scale": frame.scale,
+        },
+        "kinds": PLANE_KINDS,
+        "clouds": scenes,
+    }
+    text = _fill_template(description, [_encode_library(library), *blobs], library)
+    return Page(text, tuple(scene["shown"] for scene in scenes))
+
+
+_FIELDS = {
+    "labels": ("iu", ()),
+    "superpoints": ("iu", ()),
+    "color": ("u", (3,)),
+    "normals": ("f", (3,)),
+    "curvature": ("f", ()),
+    "sharp": ("b", ()),
+}
+"""Kinds of numbers and shapes of the fields that can be shown."""
+
+
+def _with_usable_fields(cloud: Cloud) -> Cloud:
+    """Return a cloud with those fields that are what their names say: files may hold others."""
+    fields = {
+        name: values
+        for name, values in cloud.fields.items()
+        if name in _FIELDS
+        and values.dtype.kind in _FIELDS[name][0]
+        and values.shape[1:] == _FIELDS[name][1]
+        and (name != "color" or values.dtype == np.uint8)
+    }
+    return replace(cloud, fields=fields)
+
+
+def _check_settings(
+    cloud: Cloud,
+    truth: Cloud | None,
+    up: tuple[float, float, float] | None,
+    view: View,
+    max_points: int,
+) -> tuple[float, float, float]:
+    """Return the upward direction, or say what is wrong with a setting."""
+    if view not in get_args(View):
+        names = ", ".join(get_args(View))
+        raise ConfigError(f"make_page: expected view to be one of {names}, got {view!r}.")
+    if max_points < 1:
+        raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
+    if up is not None and not any(up):
+        raise ConfigError("make_page: expected up to be a direction, got zeros.")
+    if truth is not None and len(truth) != len(cloud):
+        raise ConfigError(
+            f"{truth.source or 'make_page'}: expected a truth of {len(cloud):,} points, got "
+            f"{len(truth):,}; it has to be of the same points in the same order."
+        )
+    return up or ((0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0))
+
+
+def write_page(path: str | os.PathLike[str], page: Page) -> None:
+    """Write a page; the file appears whole or not at all.
+
+    Raises:
+        FormatError: If the file cannot be written.
+    """
+    with atomic_path(path) as beside:
+        beside.write_text(page.html, encoding="utf-8")
+
+
+def check_library() -> None:
+    """Raise MissingDependencyError before long work if no page can be made."""
+    _read_library()
+
+
+def _read_library() -> str:
+    """Return the JavaScript of deck.gl."""
+    found = require("pydeck", extra="view", purpose="write pages")
+    source = Path(str(found.__file__)).parent / _LIBRARY
+    if not source.is_file():
+        raise MissingDependencyError(
+            f"pydeck with {_LIBRARY} is needed to write pages; install it with: "
+            "pip install --upgrade 'torchrg[view]'"
+        )
+    return source.read_text(encoding="utf-8")
+
+
+def _describe_cloud(
+    cloud: Cloud, shown: Shown, truth: Cloud | None, reference: Tensor | None, frame: Frame
+) -> tuple[dict[str, Any], str]:
+    """Return what a page says about a cloud, and the packed arrays of its points."""
+    true_fields = {
+        name: torch.from_numpy(np.ascontiguousarray(truth.fields[name][shown.rows.numpy()]))
+        for name in ("labels", "normals")
+        if truth is not None and name in truth.fields
+    }
+    if "normals" in true_fields:
+        true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
+    channels = list(channels_of(shown.points, shown.fields, true_fields, reference=reference))
+    surfaces = outer_surfaces(shown.points)
+    planes = describe_planes(cloud, shown, frame)
+    directions, covered = surfaces.directions, surfaces.covered
+    if planes:
+        labels = shown.fields["labels"]
+        directions, sides = sides_of_planes(shown, planes, frame, surfaces)
+        # What stands against a wall, and the floor along it, is not part of the wall.
+        covered = torch.where(labels < 0, covered, sides[labels])
+        for plane, side in zip(planes, sides.tolist(), strict=True):
+            plane["sides"] = side
+    low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
+    steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
+    arrays: dict[str, NDArray[Any]] = {"positions": steps.numpy().astype(np.uint16)}
+    arrays["covered"] = covered.numpy()
+    arrays["radii"] = surfaces.radii.numpy()
+    if "normals" in shown.fields:
+        arrays["normals"] = encode_directions(shown.fields["normals"])
+    for channel in channels:
+        arrays[channel.mode] = channel.values
+        if channel.colors is not None:
+            arrays[f"{channel.mode} colors"] = channel.colors
+    manifest, blob = _pack(arrays)
+    num_finite = int(cloud.finite.sum())
+    scene = {
+        "name": Path(cloud.source).name or "cloud",
+        "count": len(cloud),
+        "finite": num_finite,
+        "shown": len(shown.rows),
+        "levels": shown.levels,
+        "low": low.tolist(),
+        "step": PAGE_EXTENT / _STEPS,
+        "spacing": surfaces.spacing,
+        "surfaces": [rounded(direction) for direction in directions],
+        "channels": {channel.mode: _describe_channel(channel) for channel in channels},
+        "planes": planes,
+        "arrays": manifest,
+    }
+    return scene, blob
+
+
+def _describe_channel(channel: Channel) -> dict[str, Any]:
+    """Return what a page says about a meaning of colours."""
+    return {"legend": channel.legend, "direct": channel.colors is None}
+
+
+def _direction_of_view(
+    points: Tensor, view: View, frame: Frame, azimuth_deg: float | None
+) -> Tensor:
+    """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
+    if view == "sensor":
+        return frame.rotation[:, 2].float().neg()
+    grid = build_grid(points)
+    if len(grid.levels) == 0:
+        return functional.normalize(torch.tensor([-1.0, -1.0, 1.0]), dim=0)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    return choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg).toward
+
+
+def _pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]:
+    """Return name, type and shape of arrays, and all of them as one text.
+
+    Each column is split into its bytes, the low ones first. Of positions, which lie along a curve,
+    it is the differences. Read again by ``unpack`` in ``page.js``.
+    """
+    manifest, planes = [], []
+    for name, array in arrays.items():
+        columns = array.reshape(len(array), math.prod(array.shape[1:])).T
+        is_curve = name == "positions"
+        if is_curve:
+            columns = np.diff(columns, axis=1, prepend=columns.dtype.type(0))
+        width = array.dtype.itemsize
+        as_bytes = np.ascontiguousarray(columns, dtype=array.dtype.newbyteorder("<"))
+        split = as_bytes.view(np.uint8).reshape(len(columns), -1, width).transpose(0, 2, 1)
+        planes.append(np.ascontiguousarray(split).tobytes())
+        manifest.append(
+            {
+                "name": name,
+                "width": width,
+                "rows": len(array),
+                "columns": len(columns),
+                "differences": is_curve,
+            }
+        )
+    return manifest, _encode(b"".join(planes))
+
+
+@functools.cache
+def _encode_library(library: str) -> str:
+    """Return the library as pages hold it."""
+    return _encode(library.encode())
+
+
+def _encode(content: bytes) -> str:
+    """Return bytes compressed, as base64."""
+    # Of zlib's levels 6 is where the time grows faster than the page shrinks.
+    squeezer = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
+    return base64.b64encode(squeezer.compress(content) + squeezer.flush()).decode("ascii")
+
+
+def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library: str) -> str:
+    """Return the text of a page."""
+    from markupsafe import Markup
+
+    script = (_ASSETS / "page.js").read_text(encoding="utf-8")
+    text: str = template_of("page.html.jinja").render(
+        title=description["title"],
+        description=Markup(_json_for_html(description)),  # noqa: S704 Escaped there.
+        blobs=[Markup(blob) for blob in blobs],  # noqa: S704 Base64.
+        script=Markup(script),  # noqa: S704 Our own.
+        hashes=[_script_hash(script), _script_hash(library)],
+    )
+    return text
+
+
+def template_of(name: str) -> Any:  # noqa: ANN401
+    """Return one of the templates beside this file; what is put into it is escaped.
+
+    Raises:
+        MissingDependencyError: If jinja2 is not installed.
+    """
+    jinja2 = require("jinja2", extra="view", purpose="write pages")
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string((_ASSETS / name).read_text(encoding="utf-8"))
+
+
+def _json_for_html(value: object) -> str:
+    r"""Return JSON in which no character means anything to HTML.
+
+    Example:
+        >>> _json_for_html({"name": "</script>&"})
+        '{"name":"\\u003c/script\\u003e\\u0026"}'
+    """
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def _script_hash(script: str) -> str:
+    """Return the hash by which a page's policy allows one script and no other."""
+    digest = hashlib.sha256(script.encode()).digest()
+    return f"sha256-{base64.b64encode(digest).decode('ascii')}"
