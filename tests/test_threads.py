@@ -19,7 +19,7 @@ def count_threads():
     return len(os.listdir("/proc/self/task"))
 
 def work(room, side):
-    for preset in ("classic", "detmm", "paper", "consensus"):
+    for preset in ("classic", "paper", "consensus"):
         torchrg.segment_planes(room.points, torchrg.load_config(preset))
     torchrg.normals.orient_normals(room.points, room.normals)
     depth = torch.tensor(2.0).expand(side, side)
@@ -27,7 +27,7 @@ def work(room, side):
     torchrg.depth.segment_depth(depth, camera)
 
 torch.set_num_threads(1)
-small, large = (torchrg.scenes.make_room(num_points=n, noise=0.003, seed=0) for n in (500, 6_000))
+small, large = (torchrg.scenes.make_room(num_points=n, noise=0.003, seed=0) for n in (500, 4_000))
 work(small, 20)  # Libraries that are loaded bring threads of their own, which sleep.
 torch.set_num_threads(2)
 before = count_threads()
