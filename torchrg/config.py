@@ -90,6 +90,8 @@ class GrowingConfig:
     does not join. None: not tested."""
     min_size: int = 50
     """Smaller regions are not labelled."""
+    cut_bridges: bool = False
+    """Whether regions of several faces that a few doubtful points join are split."""
     max_plane_residual: float | None = None
     """After growth, points farther from the plane of their region than this many times its
     thickness lose their label. None: they keep it."""

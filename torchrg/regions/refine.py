@@ -27,13 +27,13 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
     if not bool((labels >= 0).any()):
         return labels
     if config.max_plane_residual is not None:
-        fit, floor = _fit(cloud, labels, config)
+        fit, floor = fit_regions(cloud, labels, config)
         limit = config.max_plane_residual * torch.maximum(fit.thickness, floor)
         segments = Segments(labels)
         far = fit.residuals.abs() > segments.spread(limit)
         labels = labels.index_fill(0, segments.rows[far], UNLABELED)
     if config.absorb:
-        fit, floor = _fit(cloud, labels, config)
+        fit, floor = fit_regions(cloud, labels, config)
         labels = absorb_points(
             cloud.points,
             cloud.normals,
@@ -44,14 +44,16 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
             max_angle_deg=config.absorb_angle_deg,
         )
     if config.merge_coplanar:
-        fit, floor = _fit(cloud, labels, config)
+        fit, floor = fit_regions(cloud, labels, config)
         labels = merge_coplanar(
             labels, cloud.neighbors, fit, floor, tolerance=config.merge_tolerance
         )
     return labels
 
 
-def _fit(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> tuple[FittedPlanes, Tensor]:
+def fit_regions(
+    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig
+) -> tuple[FittedPlanes, Tensor]:
     """Return the planes of the regions, and the least thickness of each, shape ``(M,)``.
 
     The least is the floor of the coplanarity test: a fraction of the median neighbourhood's radius.
@@ -134,15 +136,17 @@ def merge_coplanar(
     """
     pairs, num_contacts = count_contacts(labels, neighbors)
     pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].any(dim=1)]
-    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
-    moments = _Moments(
-        fit.num_points.double(),
-        fit.center - fit.center[:1],
-        fit.covariance,
-        torch.maximum(own.clamp(min=0).sqrt(), floor),
-    )
+    moments = _moments_of(fit, floor)
     owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
     return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+
+
+def joint_misfits(fit: FittedPlanes, pairs: Tensor) -> Tensor:
+    """Return how far from their joint plane the regions of each pair are, by the thicker's own."""
+    moments = _moments_of(fit, fit.thickness)
+    first, second = moments.at(pairs[:, 0]), moments.at(pairs[:, 1])
+    scale = torch.maximum(first.scale, second.scale)
+    return _misfit(first._replace(scale=scale), second._replace(scale=scale))
 
 
 class _Moments(NamedTuple):
@@ -160,6 +164,16 @@ class _Moments(NamedTuple):
     def at(self, rows: Tensor | slice) -> "_Moments":
         """Return those of some of the regions."""
         return _Moments(*(values[rows] for values in self))
+
+
+def _moments_of(fit: FittedPlanes, floor: Tensor) -> _Moments:
+    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
+    return _Moments(
+        fit.num_points.double(),
+        fit.center - fit.center[:1],
+        fit.covariance,
+        torch.maximum(own.clamp(min=0).sqrt(), floor),
+    )
 
 
 def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
