@@ -102,6 +102,9 @@ class GrowingConfig:
     """They are on it when they are within this many times its thickness."""
     absorb_angle_deg: float = 45.0
     """And when their normal is within this angle of the plane's."""
+    settle_rims: bool = False
+    """Whether points where regions touch then go to the one that explains them best: of two planes
+    within reach by the line in which these meet. Only with ``absorb``."""
     merge_coplanar: bool = False
     """Whether flat regions that touch and lie on one plane then become one."""
     merge_tolerance: float = 1.2

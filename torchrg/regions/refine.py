@@ -1,4 +1,4 @@
-"""What settings may ask for after growth: release, absorption, merging."""
+"""What settings may ask for after growth: release, absorption, rims, merging."""
 
 import heapq
 from typing import NamedTuple
@@ -12,10 +12,15 @@ from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
 from torchrg.regions.criteria import GrowingCloud, neighborhood_radii
 from torchrg.regions.planes import FittedPlanes, fit_planes
+from torchrg.regions.rims import RimPlanes, settle_rims
 from torchrg.structures import UNLABELED, Neighbors
 
 _LEAST_CONTACTS = 3
 """Regions that touch in fewer points are not merged: one may be an outlier's."""
+
+_BENT = 0.5
+"""Reaches. A region thicker than this share of the reach that its points have bends a little, and
+where it ends its plane does not say."""
 
 
 def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
@@ -34,12 +39,13 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
         labels = labels.index_fill(0, segments.rows[far], UNLABELED)
     if config.absorb:
         fit, floor = fit_regions(cloud, labels, config)
+        reach = reach_of_planes(fit, floor, config.absorb_reach)
         labels = absorb_points(
             cloud.points,
             cloud.normals,
             labels,
             cloud.neighbors,
-            (fit.normal, fit.center, reach_of_planes(fit, floor, config.absorb_reach)),
+            (fit.normal, fit.center, reach),
             valid=cloud.valid,
             max_angle_deg=config.absorb_angle_deg,
         )
@@ -48,6 +54,13 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
         labels = merge_coplanar(
             labels, cloud.neighbors, fit, floor, tolerance=config.merge_tolerance
         )
+    if config.settle_rims:
+        labels = torch.unique(labels, return_inverse=True)[1] - int((labels < 0).any())
+        fit, floor = fit_regions(cloud, labels, config)
+        reach = reach_of_planes(fit, floor, config.absorb_reach)
+        thickness = torch.maximum(fit.thickness, floor)
+        reach = torch.where(_is_bent(cloud, labels, thickness, floor), torch.nan, reach)
+        labels = settle_rims(cloud, labels, RimPlanes(fit.normal, fit.center, thickness, reach))
     return labels
 
 
@@ -63,6 +76,15 @@ def fit_regions(
     radii = neighborhood_radii(cloud.points, cloud.neighbors)
     radius = segments.median(segments.take(radii)).double()
     return fit, config.coplanarity_floor * radius
+
+
+def _is_bent(cloud: GrowingCloud, labels: Tensor, thickness: Tensor, floor: Tensor) -> Tensor:
+    """Tell which regions are twice as thick as the neighbourhoods in them: they bend a little."""
+    if cloud.reach is None:
+        return torch.zeros_like(thickness, dtype=torch.bool)
+    segments = Segments(labels)
+    usual = segments.median(segments.take(cloud.reach)).double()
+    return thickness > torch.where(usual.isfinite(), torch.maximum(_BENT * usual, floor), floor)
 
 
 def reach_of_planes(fit: FittedPlanes, floor: Tensor, factor: float) -> Tensor:
