@@ -83,7 +83,7 @@ def test_points_far_from_every_plane_and_invalid_ones_stay_as_they_are():
 def test_a_face_that_goes_on_behind_another_does_not_end_there():
     rng = np.random.default_rng(3)
     points, truth, normals = floor_and_wall(rng, 6000)
-    beyond = points[truth == 0] * [-1, 1, 1]
+    beyond = points[truth == 0][::8] * [-1, 1, 1]
     points = np.concatenate([points, beyond])
     truth = np.concatenate([truth, np.zeros(len(beyond), dtype=int)])
     found = settled(points, truth, normals).numpy()
