@@ -148,7 +148,7 @@ def _layered_deviations(columns: Columns, counted: Tensor, rests: Tensor, whole:
     some: Columns = (columns[0][rows], columns[1][rows], columns[2][rows])
     counted = counted[rows]
     upper = above(rests[rows], 0) * counted
-    for _ in range(constants.NUM_ALTERNATIONS):
+    for _ in range(constants.NUM_REFITS):
         normals, offsets, rest = fit_parallel_planes(some, (upper, counted - upper))
         upper = above(along(some, normals), offsets.mean(dim=0)[:, None]) * counted
     count, num_upper = counted.sum(dim=1), upper.sum(dim=1)
