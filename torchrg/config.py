@@ -103,6 +103,8 @@ class GrowingConfig:
     does not join. None: not tested."""
     min_size: int = 50
     """Smaller regions are not labelled."""
+    cut_bridges: bool = False
+    """Whether regions of several faces that a few doubtful points join are split."""
     max_plane_residual: float | None = None
     """After growth, points farther from the plane of their region than this many times its
     thickness lose their label. None: they keep it."""
@@ -113,6 +115,9 @@ class GrowingConfig:
     """They are on it when they are within this many times its thickness."""
     absorb_angle_deg: float = 45.0
     """And when their normal is within this angle of the plane's."""
+    settle_rims: bool = False
+    """Whether points where regions touch then go to the one that explains them best: of two planes
+    within reach by the line in which these meet. Only with ``absorb``."""
     merge_coplanar: bool = False
     """Whether flat regions that touch and lie on one plane then become one."""
     merge_tolerance: float = 1.2

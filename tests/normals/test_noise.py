@@ -41,3 +41,19 @@ def test_noise_of_points_given_twice_is_that_of_the_points():
     points = make_shape("cube", 3000, 0.004, seed=2).points
     found = float(survey(torch.cat([points, points])).noise.median())
     assert found == pytest.approx(float(survey(points, 25).noise.median()), rel=0.1)
+
+
+@pytest.mark.parametrize("gap", [0.02, 0.04, 0.08])
+def test_noise_of_a_plate_is_not_its_thickness(gap):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2000, 3, generator=generator)
+    points[:, 2] = gap * (points[:, 2] > 0.5) + 0.003 * torch.randn(2000, generator=generator)
+    found = survey(points).noise
+    assert float(found.median()) == pytest.approx(0.003, rel=0.2)
+    assert float(found.quantile(0.95)) < 0.006
+
+
+def test_even_spread_across_a_plane_is_noise():
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(1))
+    points[:, 2] *= 0.1
+    assert float(survey(points).noise.median()) > 0.02

@@ -219,6 +219,23 @@ def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple
     return list(zip(normals.unbind(), offsets.unbind(), strict=True))
 
 
+def fit_parallel_planes(
+    columns: Columns, groups: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit planes of one normal to the neighbours with each of several weights, least squares.
+
+    Returns unit normals ``(n, 3)``, an offset for each group ``(G, n)``, and the mean squared
+    residual of all ``(n,)``.
+    """
+    totals = torch.stack([weights.sum(dim=1) for weights in groups])
+    means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
+    shares = totals / totals.sum(dim=0).clamp(min=1)
+    pooled = (shares[:, :, None, None] * torch.stack(covariances)).sum(dim=0)
+    values, normals = smallest_eigenvector3(pooled)
+    offsets = (normals * torch.stack(means)).sum(dim=-1)
+    return normals, offsets, values[:, 0].clamp(min=0)
+
+
 def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return the weighted mean ``(n, 3)`` and covariance ``(n, 3, 3)`` of each neighbourhood."""
     total = weights.sum(dim=1)

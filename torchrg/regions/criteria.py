@@ -1,6 +1,6 @@
 """Which neighbours may join a region: one criterion a function.
 
-Each tests the edges from a block of points, ``rows``, to their K neighbours, and returns which of
+Each tests the edges from some points, ``rows``, to their K neighbours, and returns which of
 them pass, shape ``(n, K)``, bool. A new criterion is a setting, a function here, and the line of
 :mod:`torchrg.regions.edges` that calls it.
 """
@@ -14,6 +14,9 @@ from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors
+
+Rows = slice | Tensor
+"""A block of points, or the rows of some."""
 
 
 class GrowingCloud(NamedTuple):
@@ -41,7 +44,7 @@ class GrowingCloud(NamedTuple):
     reach: Tensor | None = None
 
 
-def are_valid(cloud: GrowingCloud, rows: slice) -> Tensor:
+def are_valid(cloud: GrowingCloud, rows: Rows) -> Tensor:
     """Tell which edges lead from one valid point to another one that is its neighbour."""
     indices, counted = cloud.neighbors
     own = torch.arange(len(cloud.valid), device=indices.device)[rows, None]
@@ -50,7 +53,7 @@ def are_valid(cloud: GrowingCloud, rows: slice) -> Tensor:
     return passed if counted is None else passed & counted[rows]
 
 
-def within_angle(cloud: GrowingCloud, rows: slice, max_angle_deg: float, *, signed: bool) -> Tensor:
+def within_angle(cloud: GrowingCloud, rows: Rows, max_angle_deg: float, *, signed: bool) -> Tensor:
     """Tell which neighbours' normals are within an angle of the point's, eq. (8)."""
     if max_angle_deg >= 90 and not signed:
         return torch.ones_like(cloud.neighbors.indices[rows], dtype=torch.bool)
@@ -60,7 +63,7 @@ def within_angle(cloud: GrowingCloud, rows: slice, max_angle_deg: float, *, sign
     return sq_chords(own, theirs, signed=signed) <= deg_to_sq_chord(max_angle_deg)
 
 
-def within_distance(cloud: GrowingCloud, rows: slice, values: Tensor, limit: float) -> Tensor:
+def within_distance(cloud: GrowingCloud, rows: Rows, values: Tensor, limit: float) -> Tensor:
     """Tell which neighbours' values ``(N, C)``, places or colours, are within a distance."""
     total = values.new_zeros(())
     for column in values.unbind(dim=1):
@@ -69,7 +72,7 @@ def within_distance(cloud: GrowingCloud, rows: slice, values: Tensor, limit: flo
     return total <= limit**2
 
 
-def on_planes(cloud: GrowingCloud, rows: slice, reach: Tensor) -> Tensor:
+def on_planes(cloud: GrowingCloud, rows: Rows, reach: Tensor) -> Tensor:
     """Tell which neighbours are within reach ``(N,)`` of the point's plane, and it of theirs."""
     own = theirs = cloud.points.new_zeros(())
     columns = zip(cloud.points.unbind(dim=1), cloud.normals.unbind(dim=1), strict=True)
@@ -83,7 +86,7 @@ def on_planes(cloud: GrowingCloud, rows: slice, reach: Tensor) -> Tensor:
 
 def are_coplanar(
     cloud: GrowingCloud,
-    rows: slice,
+    rows: Rows,
     asked: Tensor,
     compared: Tensor | None,
     floor_fraction: float,
@@ -105,7 +108,7 @@ def are_coplanar(
     return result
 
 
-def _of_neighbors(cloud: GrowingCloud, rows: slice, values: Tensor) -> Tensor:
+def _of_neighbors(cloud: GrowingCloud, rows: Rows, values: Tensor) -> Tensor:
     """Return the values ``(N,)`` of the points' neighbours, shape ``(n, K)``."""
     indices = cloud.neighbors.indices[rows]
     return values.index_select(0, indices.reshape(-1)).view(indices.shape)

@@ -1,6 +1,7 @@
 """The graph that regions grow in: edges from points to the neighbours that all criteria accept."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.regions.criteria import (
     GrowingCloud,
+    Rows,
     are_coplanar,
     are_valid,
     neighborhood_radii,
@@ -49,7 +51,7 @@ def find_coded_edges(
     shared = _shared_neighbors(cloud, config)
 
     def find(rows: slice) -> _Edges:
-        joins, connected = _accept_edges(cloud, config, rows, shared)
+        joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
         indices = cloud.neighbors.indices[rows]
         target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
         if config.seed_rule == "increment":
@@ -77,7 +79,7 @@ def find_edges(
     others: dict[int, _Edges] = {}
 
     def find(rows: slice) -> _Edges:
-        joins, _ = _accept_edges(cloud, config, rows, shared)
+        joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
         targets = cloud.neighbors.indices[rows]
         others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
         return _pick(targets, joins & spreads[rows, None])
@@ -88,13 +90,17 @@ def find_edges(
     return edges, EdgeLists(starts, np.concatenate(targets))
 
 
-def _accept_edges(
-    cloud: GrowingCloud, config: GrowingConfig, rows: slice, shared: SharedNeighbors | None
+def accept_edges(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    rows: Rows,
+    connect: Callable[[Tensor], Tensor] | None,
 ) -> tuple[Tensor, Tensor | None]:
-    """Tell which neighbours of a block of points pass all criteria that are on, cheap ones first.
+    """Tell which neighbours of some points pass all criteria that are on, cheap ones first.
 
     Returns whether the neighbour joins the region of the point, shape ``(n, K)``, bool; and whether
-    the two are connected, only settled where it joins, None where connectivity is off.
+    the two are connected, only settled where it joins, None without ``connect``, which tells it of
+    the edges that it is asked for.
     """
     joins = are_valid(cloud, rows)
     joins &= within_angle(cloud, rows, config.max_angle_deg, signed=config.signed_normals)
@@ -106,18 +112,23 @@ def _accept_edges(
         joins &= on_planes(cloud, rows, cloud.reach)
     connected: Tensor | None = None
     if config.coplanarity:
-        if shared is not None and config.coplanarity_scope == "connected":
+        if connect is not None and config.coplanarity_scope == "connected":
             counted = cloud.neighbors.valid
             everyone = torch.ones_like(joins) if counted is None else counted[rows]
-            connected = shared.connected(rows, everyone)
+            connected = connect(everyone)
         asked = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
         joins &= ~asked | are_coplanar(cloud, rows, asked, connected, config.coplanarity_floor)
-    if shared is not None:
+    if connect is not None:
         if connected is None:
-            connected = shared.connected(rows, joins)
+            connected = connect(joins)
         if config.connectivity_scope == "region":
             joins &= connected
     return joins, connected
+
+
+def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], Tensor] | None:
+    """Return the test of connectivity of a block of points."""
+    return None if shared is None else partial(shared.connected, rows)
 
 
 def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeighbors | None:

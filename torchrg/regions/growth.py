@@ -1,6 +1,7 @@
 """Region growing: from points, normals and neighbours to labels."""
 
 from array import array
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import canonical_order
+from torchrg.regions.bridges import cut_bridges
 from torchrg.regions.criteria import GrowingCloud
 from torchrg.regions.edges import (
     EdgeLists,
@@ -99,9 +101,26 @@ def grow_regions(
         cloud = reordered(cloud, order)
     heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
     labels = number_by_size(heads, config.min_size)
+    if config.cut_bridges and bool((labels >= 0).any()):
+
+        def grow(part: GrowingCloud, share: float) -> Tensor:
+            part, strict = _within_share(part, config, share)
+            found = torch.from_numpy(_grow(part, strict, chunk_size)).to(part.points.device)
+            return number_by_size(found, config.min_size)
+
+        parts = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
+        labels = number_by_size(parts, config.min_size)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+
+
+def _within_share(
+    cloud: GrowingCloud, config: GrowingConfig, share: float
+) -> tuple[GrowingCloud, GrowingConfig]:
+    """Return a cloud and settings whose limits of angle and distance are a share of those given."""
+    reach = None if cloud.reach is None else share * cloud.reach
+    return cloud._replace(reach=reach), replace(config, max_angle_deg=share * config.max_angle_deg)
 
 
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:

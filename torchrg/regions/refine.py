@@ -1,4 +1,4 @@
-"""What settings may ask for after growth: release, absorption, merging."""
+"""What settings may ask for after growth: release, absorption, rims, merging."""
 
 import heapq
 from typing import NamedTuple
@@ -12,10 +12,15 @@ from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
 from torchrg.regions.criteria import GrowingCloud, neighborhood_radii
 from torchrg.regions.planes import FittedPlanes, fit_planes
+from torchrg.regions.rims import RimPlanes, settle_rims
 from torchrg.structures import UNLABELED, Neighbors
 
 _LEAST_CONTACTS = 3
 """Regions that touch in fewer points are not merged: one may be an outlier's."""
+
+_BENT = 0.5
+"""Reaches. A region thicker than this share of the reach that its points have bends a little, and
+where it ends its plane does not say."""
 
 
 def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> Tensor:
@@ -27,31 +32,41 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
     if not bool((labels >= 0).any()):
         return labels
     if config.max_plane_residual is not None:
-        fit, floor = _fit(cloud, labels, config)
+        fit, floor = fit_regions(cloud, labels, config)
         limit = config.max_plane_residual * torch.maximum(fit.thickness, floor)
         segments = Segments(labels)
         far = fit.residuals.abs() > segments.spread(limit)
         labels = labels.index_fill(0, segments.rows[far], UNLABELED)
     if config.absorb:
-        fit, floor = _fit(cloud, labels, config)
+        fit, floor = fit_regions(cloud, labels, config)
+        reach = reach_of_planes(fit, floor, config.absorb_reach)
         labels = absorb_points(
             cloud.points,
             cloud.normals,
             labels,
             cloud.neighbors,
-            (fit.normal, fit.center, reach_of_planes(fit, floor, config.absorb_reach)),
+            (fit.normal, fit.center, reach),
             valid=cloud.valid,
             max_angle_deg=config.absorb_angle_deg,
         )
     if config.merge_coplanar:
-        fit, floor = _fit(cloud, labels, config)
+        fit, floor = fit_regions(cloud, labels, config)
         labels = merge_coplanar(
             labels, cloud.neighbors, fit, floor, tolerance=config.merge_tolerance
         )
+    if config.settle_rims:
+        labels = torch.unique(labels, return_inverse=True)[1] - int((labels < 0).any())
+        fit, floor = fit_regions(cloud, labels, config)
+        reach = reach_of_planes(fit, floor, config.absorb_reach)
+        thickness = torch.maximum(fit.thickness, floor)
+        reach = torch.where(_is_bent(cloud, labels, thickness, floor), torch.nan, reach)
+        labels = settle_rims(cloud, labels, RimPlanes(fit.normal, fit.center, thickness, reach))
     return labels
 
 
-def _fit(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> tuple[FittedPlanes, Tensor]:
+def fit_regions(
+    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig
+) -> tuple[FittedPlanes, Tensor]:
     """Return the planes of the regions, and the least thickness of each, shape ``(M,)``.
 
     The least is the floor of the coplanarity test: a fraction of the median neighbourhood's radius.
@@ -61,6 +76,15 @@ def _fit(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> tuple[Fi
     radii = neighborhood_radii(cloud.points, cloud.neighbors)
     radius = segments.median(segments.take(radii)).double()
     return fit, config.coplanarity_floor * radius
+
+
+def _is_bent(cloud: GrowingCloud, labels: Tensor, thickness: Tensor, floor: Tensor) -> Tensor:
+    """Tell which regions are twice as thick as the neighbourhoods in them: they bend a little."""
+    if cloud.reach is None:
+        return torch.zeros_like(thickness, dtype=torch.bool)
+    segments = Segments(labels)
+    usual = segments.median(segments.take(cloud.reach)).double()
+    return thickness > torch.where(usual.isfinite(), torch.maximum(_BENT * usual, floor), floor)
 
 
 def reach_of_planes(fit: FittedPlanes, floor: Tensor, factor: float) -> Tensor:
@@ -134,15 +158,17 @@ def merge_coplanar(
     """
     pairs, num_contacts = count_contacts(labels, neighbors)
     pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].any(dim=1)]
-    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
-    moments = _Moments(
-        fit.num_points.double(),
-        fit.center - fit.center[:1],
-        fit.covariance,
-        torch.maximum(own.clamp(min=0).sqrt(), floor),
-    )
+    moments = _moments_of(fit, floor)
     owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
     return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+
+
+def joint_misfits(fit: FittedPlanes, pairs: Tensor) -> Tensor:
+    """Return how far from their joint plane the regions of each pair are, by the thicker's own."""
+    moments = _moments_of(fit, fit.thickness)
+    first, second = moments.at(pairs[:, 0]), moments.at(pairs[:, 1])
+    scale = torch.maximum(first.scale, second.scale)
+    return _misfit(first._replace(scale=scale), second._replace(scale=scale))
 
 
 class _Moments(NamedTuple):
@@ -160,6 +186,16 @@ class _Moments(NamedTuple):
     def at(self, rows: Tensor | slice) -> "_Moments":
         """Return those of some of the regions."""
         return _Moments(*(values[rows] for values in self))
+
+
+def _moments_of(fit: FittedPlanes, floor: Tensor) -> _Moments:
+    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
+    return _Moments(
+        fit.num_points.double(),
+        fit.center - fit.center[:1],
+        fit.covariance,
+        torch.maximum(own.clamp(min=0).sqrt(), floor),
+    )
 
 
 def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:

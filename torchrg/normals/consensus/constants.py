@@ -37,6 +37,12 @@ COMMON_QUANTILE = 0.15
 MAX_ABOVE_COMMON = 3.0
 """Times. Noise above that common noise is shape. Half: -0.34 deg mean, cube, k = 16 (free to
 x0.909). Double: free."""
+MAX_LAYERED_KURTOSIS = 2.2
+"""Ratio. Of residuals from one plane, up to which two parallel ones are tried: 1 for both faces of
+a plate without noise, 1.8 for even spread, 3 for noise."""
+MAX_LAYERED_SHARE = 0.35
+"""Deviations of one plane. What two parallel planes leave where they are the faces of a plate; they
+leave 0.5 of even spread, 0.6 of noise."""
 MIN_BREADTH = 0.03
 """Ratio of variances. Neighbours narrower than that lie on a line, as scan lines do. Half, double:
 free."""

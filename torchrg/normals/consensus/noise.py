@@ -8,8 +8,11 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks
-from torchrg.linalg import coordinate_resolution, covariance
+from torchrg.linalg import above, coordinate_resolution, covariance
 from torchrg.linalg.moments import (
+    Columns,
+    along,
+    fit_parallel_planes,
     fit_planes,
     residuals,
     split_columns,
@@ -18,6 +21,8 @@ from torchrg.linalg.moments import (
 from torchrg.neighbors import gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.structures import Neighbors, NormalFit
+
+_LAYER_PARAMETERS = 4
 
 
 class Survey(NamedTuple):
@@ -51,7 +56,9 @@ def survey_noise(
     that of all; ``a_m``: measured on noisy planes). A place counts once, however many points are
     there; neighbourhoods almost on one line, as on scan lines, do not count. At corners, where none
     of the three finds a face, the noise is at most 3 times the 15th percentile of that of the
-    neighbours.
+    neighbours. Where points are so few that even the nearest are of both faces of a plate, two
+    parallel planes take the place of the one of all neighbours, if they leave 0.35 of its deviation
+    or less.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -73,18 +80,20 @@ def survey_noise(
         >>> bool((survey.noise.median() - 0.01).abs() < 0.001)
         True
     """
-    offsets, radius, whole = (torch.empty_like(points[:, 0]) for _ in range(3))
+    offsets, radius, whole, layered = (torch.empty_like(points[:, 0]) for _ in range(4))
     small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
 
     def work(block: slice) -> None:
         found = _deviations(points, neighbors, fit, block)
-        for values, part in zip((offsets, radius, whole, *small), found, strict=True):
+        for values, part in zip((offsets, radius, whole, layered, *small), found, strict=True):
             values[block] = part
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
     quantile = constants.NOISE_QUANTILE
     noise = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(whole, neighbors, quantile)
+    found = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(layered, neighbors, quantile)
+    noise = torch.minimum(noise, found)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
         count = neighbors.valid.sum(dim=1)
@@ -119,9 +128,35 @@ def _deviations(
     spread = (rests * rests * counted).sum(dim=1) / (count - 3).clamp_(min=1)
     whole = torch.where(valid & (count > 3), spread.sqrt_(), torch.inf)
     radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
+    layered = _layered_deviations(columns, counted, rests, whole)
     patches, counted = _each_place_once(patches, counted)
     small = [_small_deviations(patches, counted, size) for size in constants.NOISE_COUNTS]
-    return offsets, radius, whole, *small
+    return offsets, radius, whole, layered, *small
+
+
+def _layered_deviations(columns: Columns, counted: Tensor, rests: Tensor, whole: Tensor) -> Tensor:
+    """Return deviations from two parallel planes, as the faces of a plate are; inf without these.
+
+    ``rests`` are the residuals from one plane and ``whole`` their deviation. Those of two planes
+    have low kurtosis, which spares most points the fits.
+    """
+    found = torch.full_like(whole, torch.inf)
+    squares = rests * rests * counted
+    second, fourth = squares.sum(dim=1), squares.square().sum(dim=1)
+    flat = fourth * counted.sum(dim=1) < constants.MAX_LAYERED_KURTOSIS * second * second
+    rows = (flat & whole.isfinite()).nonzero().squeeze(-1)
+    some: Columns = (columns[0][rows], columns[1][rows], columns[2][rows])
+    counted = counted[rows]
+    upper = above(rests[rows], 0) * counted
+    for _ in range(constants.NUM_REFITS):
+        normals, offsets, rest = fit_parallel_planes(some, (upper, counted - upper))
+        upper = above(along(some, normals), offsets.mean(dim=0)[:, None]) * counted
+    count, num_upper = counted.sum(dim=1), upper.sum(dim=1)
+    deviations = (rest * count / (count - _LAYER_PARAMETERS).clamp_(min=1)).sqrt_()
+    layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
+    layered &= deviations <= constants.MAX_LAYERED_SHARE * whole[rows]
+    found[rows] = torch.where(layered, deviations, torch.inf)
+    return found
 
 
 def _each_place_once(patches: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:

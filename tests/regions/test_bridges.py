@@ -1,0 +1,119 @@
+"""Faces joined by a few doubtful points are told apart; smooth surfaces stay whole."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests.regions import growing_clouds
+from torchrg import load_config, segment_planes
+from torchrg.config import GrowingConfig
+from torchrg.metrics import score_labels
+from torchrg.neighbors import search_knn
+from torchrg.regions import grow_regions
+
+PLAIN = GrowingConfig(
+    seed_rule="curvature", connectivity=None, coplanarity=False, min_size=20, max_angle_deg=15.0
+)
+CUTTING = dataclasses.replace(PLAIN, cut_bridges=True)
+
+
+def crease(angle_deg, noise, joint, num_points=4000):
+    """Two faces of 0.5 by 1 metres that meet in an arc of some radius; 1 on the second."""
+    rng = np.random.default_rng(0)
+    along, across = rng.uniform(-0.5, 0.5, num_points), rng.uniform(0, 1, num_points)
+    angle = np.radians(angle_deg)
+    half = joint * angle / 2
+    turn = np.full(num_points, angle) * (along > 0)
+    if joint > 0:
+        turn = np.clip((along + half) / (2 * half), 0, 1) * angle
+    arc = np.stack([joint * np.sin(turn), joint * (1 - np.cos(turn))])
+    rest = np.where(along > 0, np.maximum(along - half, 0), np.minimum(along + half, 0))
+    run = np.stack([rest * np.cos(turn), rest * np.sin(turn)]) + arc
+    bumps = noise * rng.normal(size=num_points)
+    x, z = run + bumps * np.stack([-np.sin(turn), np.cos(turn)])
+    return torch.tensor(np.stack([x, across, z], axis=1)).float(), torch.tensor(along > 0).long()
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "noise", "joint"), [(12, 0.0002, 0.0), (12, 0.003, 0.04), (24, 0.003, 0.0)]
+)
+def test_creases_stay_open(angle_deg, noise, joint):
+    points, truth = crease(angle_deg, noise, joint)
+    found = segment_planes(points).labels
+    score = score_labels(found, truth)
+    assert (score.regions, score.recall_iou80) == (2, 1.0)
+
+
+@pytest.mark.parametrize(("radius", "noise"), [(0.15, 0.003), (0.3, 0.0), (2.0, 0.003)])
+def test_a_column_stays_whole(radius, noise):
+    rng = np.random.default_rng(1)
+    angle, height = rng.uniform(0, min(2 * np.pi, 2 / radius), 4000), rng.uniform(0, 1.5, 4000)
+    away = radius + noise * rng.normal(size=4000)
+    points = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=1)
+    config = load_config("consensus")
+    growing = dataclasses.replace(config.growing, cut_bridges=False)
+    whole = segment_planes(torch.tensor(points), dataclasses.replace(config, growing=growing))
+    found = segment_planes(torch.tensor(points), config)
+    assert torch.equal(found.labels, whole.labels)
+    assert float((found.labels == 0).float().mean()) > 0.95
+
+
+def bridged_sheets(rng):
+    """Two sheets 15 cm apart at the same height of a step, and a ramp of few points between."""
+    low, high, ramp = (rng.uniform(0, 1, (n, 3)) for n in (600, 600, 12))
+    low[:, 2] = high[:, 2] = 0
+    high[:, 2] += 0.15
+    high[:, 0] += 1.1
+    ramp[:, 0] = np.linspace(0.98, 1.12, 12)
+    ramp[:, 1] = 0.5 + 0.002 * ramp[:, 1]
+    ramp[:, 2] = np.linspace(0.0, 0.15, 12)
+    normals = np.tile([0.0, 0.0, 1.0], (1212, 1))
+    tilt = np.radians(np.r_[0:40:6j, 40:0:6j])
+    normals[1200:] = np.stack([-np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=1)
+    truth = torch.arange(1212) // 600
+    return torch.tensor(np.concatenate([low, high, ramp])), torch.tensor(normals), truth
+
+
+def test_a_ramp_of_few_points_does_not_join_two_sheets(rng):
+    points, normals, truth = bridged_sheets(np.random.default_rng(2))
+    curvature = torch.zeros(len(points), dtype=torch.float64)
+    neighbors = search_knn(points, 12)
+    joined = grow_regions(points, normals, curvature, neighbors, PLAIN)
+    assert int(joined.max()) == 0
+    found = grow_regions(points, normals, curvature, neighbors, CUTTING)
+    assert int(found.max()) == 1
+    for face in (0, 1):
+        assert len(found[truth == face].unique()) == 1
+    order = torch.randperm(len(points), generator=rng)
+    again = grow_regions(
+        points[order] * 1e3,
+        normals[order],
+        curvature,
+        search_knn(points[order] * 1e3, 12),
+        CUTTING,
+        chunk_size=100,
+    )
+    assert torch.equal(again, found[order])
+
+
+def test_a_room_without_bridges_is_left_alone():
+    points = growing_clouds.room(np.random.default_rng(3), 900, 0.005)
+    cloud = growing_clouds.prepare(points, 14)
+    config = dataclasses.replace(CUTTING, max_angle_deg=6.0)
+    plain = dataclasses.replace(PLAIN, max_angle_deg=6.0)
+    found, before = (grow_regions(*cloud, settings) for settings in (config, plain))
+    assert int(before.max()) >= 2
+    assert torch.equal(found, before)
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.035, 0.05])
+def test_both_faces_of_a_plate_are_regions_at_any_density(spacing):
+    rng = np.random.default_rng(4)
+    num_points = round(2 * 1.4 * 0.8 / spacing**2)
+    points = rng.uniform(0, 1, (num_points, 3)) * [1.4, 0.8, 1]
+    truth = torch.tensor(points[:, 2] > 0.5).long()
+    points[:, 2] = 0.04 * truth.numpy() + 0.003 * rng.normal(size=num_points)
+    score = score_labels(segment_planes(torch.tensor(points).float()).labels, truth)
+    assert (score.regions, score.recall_iou80) == (2, 1.0)

@@ -1,0 +1,245 @@
+"""Faces that growth joined through a few doubtful points, told apart again."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg._parallel import chunks_of
+from torchrg.config import GrowingConfig
+from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg.moments import Segments
+from torchrg.regions.criteria import GrowingCloud, within_angle
+from torchrg.regions.edges import accept_edges
+from torchrg.regions.planes import fit_planes
+from torchrg.regions.refine import fit_regions, joint_misfits
+from torchrg.structures import UNLABELED, Neighbors
+
+_STRICTER = 0.5
+"""Share of the limits of angle and distance within which the core of a face holds together."""
+
+_LEVEL_ANGLE = 0.3
+_LEAST_LEVEL = 0.7
+"""A core leads on where the share of neighbours within this share of the largest angle is this
+share of what is usual in the region: less where two faces meet in noise, and normals turn from one
+to the other by and by."""
+
+_MOST_OFF_PLANE = 0.1
+"""Share of a region's points off its plane up to which the others are one face."""
+
+_EXACT_REACH = 4.0
+"""Times the least thickness. Distance from a plane within which points of exact faces are on it."""
+
+_LEAST_FLAT = 0.5
+"""Share of a region's points in flat cores from which it is faces: a noisy column breaks into cores
+that are few, and curved."""
+
+_OPEN_SHARE = 0.1
+"""Least share of the edges between two cores that pass the criteria where a surface goes on; where
+a bridge joins them it is a few in a hundred."""
+
+_LEAST_MISFIT = 2.0
+"""Times the thickness. Two cores lie on one plane when they are nearer to it: parts of a face that
+noise has bent are."""
+
+
+class _Suspects(NamedTuple):
+    """Points of regions that do not lie on one plane.
+
+    Attributes:
+        rows: Points that may be of another face, ascending: those off the plane where nearly all
+            are on it, all others.
+        sound: Points on the plane of a region of which nearly all are, with its direction, shape
+            ``(N,)``, bool.
+        on_plane: Regions of which nearly all points are on one plane, shape ``(M,)``, bool.
+    """
+
+    rows: Tensor
+    sound: Tensor
+    on_plane: Tensor
+
+
+class _Edges(NamedTuple):
+    """Edges from some points to neighbours of the same region, and which pass all limits.
+
+    ``rows`` ``(n,)``, ``targets``, ``inside`` and ``passed`` ``(n, K)``.
+    """
+
+    rows: Tensor
+    targets: Tensor
+    inside: Tensor
+    passed: Tensor
+
+
+def cut_bridges(
+    cloud: GrowingCloud,
+    labels: Tensor,
+    config: GrowingConfig,
+    grow: Callable[[GrowingCloud, float], Tensor],
+    *,
+    chunk_size: int,
+) -> Tensor:
+    """Split regions of several faces that only a few points join.
+
+    Of a region that does not lie on one plane, ``min_size`` points or more being off it, the points
+    that may be of another face are grown again, within half the limits and only from where the
+    surface bends no more than is usual in the region. The *cores* that come of it, and the plane if
+    nearly all points are on one, belong together where the surface goes on from one to the next, a
+    tenth of the edges between them passing the whole limits, and where one plane explains both.
+    Regions with cores that do not, and with most of their points in flat cores, are split: doubtful
+    points follow the nearest neighbour that they have an edge to, and never lead.
+
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
+    perhaps with gaps in their numbers. ``grow`` returns the labels of a cloud within a share of the
+    limits.
+    """
+    rows, sound, on_plane = _find_suspects(cloud, labels, config)
+    if len(rows) == 0:
+        return labels
+    cores = torch.full_like(labels, UNLABELED)
+    part, inside = _part_of(cloud, labels, rows)
+    max_angle_deg = _LEVEL_ANGLE * config.max_angle_deg
+    level = _are_level(part, inside, labels[rows], max_angle_deg, chunk_size)
+    cores[rows] = grow(part._replace(valid=part.valid & level), _STRICTER)
+    rows = rows[cores[rows] >= 0]
+    if len(rows) == 0:
+        return labels
+    # The plane of a region is a core, too.
+    others = torch.zeros(int(labels.max()) + 1, dtype=torch.bool, device=labels.device)
+    others[labels[rows]] = True
+    sound &= others[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
+    cores = torch.where(sound, labels + int(cores.max()) + 1, cores)
+    cores = torch.unique(cores, return_inverse=True)[1] - int((cores < 0).any())
+    cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
+
+    pairs = torch.unique(torch.stack([labels, cores])[:, cores >= 0], dim=1)
+    split = torch.bincount(pairs[0], minlength=len(others)) > 1
+    flat = ~fit_planes(Segments(cores), cloud.points, cloud.normals).curved
+    covered = torch.bincount(labels[(cores >= 0) & flat[cores.clamp(min=0)]], minlength=len(others))
+    split &= on_plane | (covered >= _LEAST_FLAT * torch.bincount(labels[labels >= 0]))
+    free = (labels >= 0) & split[labels.clamp(min=0)]
+    waiting = (free & (cores < 0)).nonzero().squeeze(1)
+    cores = _follow(cores, _find_edges(cloud, labels, config, waiting, chunk_size))
+    new = torch.where(cores >= 0, cores + len(others), UNLABELED)
+    return torch.where(free, new, labels)
+
+
+def _find_suspects(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> _Suspects:
+    """Return the doubtful and the sound points of regions with many points off their plane."""
+    fit, floor = fit_regions(cloud, labels, config)
+    segments = Segments(labels)
+    limit = _EXACT_REACH * floor
+    if cloud.reach is not None:
+        usual = segments.median(segments.take(cloud.reach)).double()
+        limit = torch.maximum(torch.where(usual.isfinite(), usual, limit), limit)
+    off = fit.residuals.abs() > segments.spread(limit)
+    num_off = segments.sum(off.double())
+    on_plane = num_off <= _MOST_OFF_PLANE * segments.counts
+    bent = num_off >= config.min_size
+    chosen = (off | ~segments.spread(on_plane)) & segments.spread(bent)
+    rows = segments.rows[chosen].sort().values
+    directions = segments.spread_columns(fit.normal)
+    aligned = sq_chords(segments.take_columns(cloud.normals), directions) <= deg_to_sq_chord(
+        _STRICTER * config.max_angle_deg
+    )
+    sound = torch.zeros_like(labels, dtype=torch.bool)
+    sound[segments.rows] = aligned & ~off & segments.spread(on_plane & bent)
+    return _Suspects(rows, sound, on_plane)
+
+
+def _are_level(
+    part: GrowingCloud, inside: Tensor, regions: Tensor, max_angle_deg: float, chunk_size: int
+) -> Tensor:
+    """Tell at which points the surface bends no more than is usual in their region."""
+    shares = torch.zeros_like(part.curvature, dtype=torch.float64)
+    for some in chunks_of(len(shares), chunk_size):
+        counted = part.neighbors.valid
+        counted = (
+            torch.ones_like(part.neighbors.indices[some], dtype=torch.bool)
+            if counted is None
+            else counted[some]
+        )
+        alike = within_angle(part, some, max_angle_deg, signed=False) & counted
+        shares[some] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
+    regions = torch.unique(regions, return_inverse=True)[1]
+    segments = Segments(regions)
+    usual = segments.median(segments.take(shares))
+    return shares >= _LEAST_LEVEL * usual[regions]
+
+
+def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> tuple[GrowingCloud, Tensor]:
+    """Return some points as a cloud, and which neighbours are in it and of the point's region."""
+    row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
+    row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
+    indices = cloud.neighbors.indices[rows].long()
+    counted = (labels[indices] == labels[rows, None]) & (row_of[indices] >= 0)
+    if cloud.neighbors.valid is not None:
+        counted &= cloud.neighbors.valid[rows]
+    own = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
+    colors, reach = (None if v is None else v[rows] for v in (cloud.colors, cloud.reach))
+    part = GrowingCloud(
+        cloud.points[rows],
+        cloud.normals[rows],
+        cloud.curvature[rows],
+        Neighbors(torch.where(counted, row_of[indices], own), counted),
+        cloud.valid[rows],
+        colors,
+        reach,
+    )
+    return part, counted
+
+
+def _find_edges(
+    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
+) -> _Edges:
+    """Return the edges of some points."""
+    targets = cloud.neighbors.indices[rows].long()
+    inside = labels[targets] == labels[rows, None]
+    if cloud.neighbors.valid is not None:
+        inside &= cloud.neighbors.valid[rows]
+    passed = torch.zeros_like(inside)
+    for some in chunks_of(len(rows), chunk_size):
+        passed[some] = accept_edges(cloud, config, rows[some], None)[0]
+    return _Edges(rows, targets, inside, passed & inside)
+
+
+def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _Edges) -> Tensor:
+    """Return the cores ``(N,)`` with those of one surface as one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    num_cores = int(cores.max()) + 1
+    own, theirs = cores[edges.rows, None].expand_as(edges.targets), cores[edges.targets]
+    between = edges.inside & (theirs >= 0) & (theirs != own)
+    first, second = own[between], theirs[between]
+    keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
+    keys, numbers = torch.unique(keys, return_inverse=True)
+    pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
+    num_edges = torch.bincount(numbers, minlength=len(pairs))
+    num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
+    fit = fit_planes(Segments(cores), cloud.points, cloud.normals)
+    joined = joint_misfits(fit, pairs) < _LEAST_MISFIT
+    joined |= num_open >= _OPEN_SHARE * num_edges
+    ends = pairs[joined].T.cpu().numpy()
+    ones = np.ones(ends.shape[1], dtype=np.int8)
+    graph = coo_array((ones, (ends[0], ends[1])), shape=(num_cores, num_cores))
+    _, owner = connected_components(graph, directed=False)
+    return torch.from_numpy(np.append(owner, UNLABELED)).to(cores)[cores]
+
+
+def _follow(cores: Tensor, edges: _Edges) -> Tensor:
+    """Give points between the cores to that of the nearest neighbour they have an edge to."""
+    cores = cores.clone()
+    waiting = torch.arange(len(edges.rows), device=cores.device)
+    while len(waiting):
+        targets = edges.targets[waiting]
+        known = edges.passed[waiting] & (cores[targets] >= 0)
+        nearest = known.to(torch.uint8).argmax(dim=1, keepdim=True)
+        joined = known.any(dim=1)
+        if not bool(joined.any()):
+            break
+        cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
+        waiting = waiting[~joined]
+    return cores
