@@ -17,6 +17,8 @@ PLAIN = GrowingConfig(
     seed_rule="curvature", connectivity=None, coplanarity=False, min_size=20, max_angle_deg=15.0
 )
 CUTTING = dataclasses.replace(PLAIN, cut_bridges=True)
+WHOLE = load_config("consensus")
+CUT = dataclasses.replace(WHOLE, growing=dataclasses.replace(WHOLE.growing, cut_bridges=True))
 
 
 def crease(angle_deg, noise, joint, num_points=4000):
@@ -41,7 +43,7 @@ def crease(angle_deg, noise, joint, num_points=4000):
 )
 def test_creases_stay_open(angle_deg, noise, joint):
     points, truth = crease(angle_deg, noise, joint)
-    found = segment_planes(points).labels
+    found = segment_planes(points, CUT).labels
     score = score_labels(found, truth)
     assert (score.regions, score.recall_iou80) == (2, 1.0)
 
@@ -52,10 +54,8 @@ def test_a_column_stays_whole(radius, noise):
     angle, height = rng.uniform(0, min(2 * np.pi, 2 / radius), 4000), rng.uniform(0, 1.5, 4000)
     away = radius + noise * rng.normal(size=4000)
     points = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=1)
-    config = load_config("consensus")
-    growing = dataclasses.replace(config.growing, cut_bridges=False)
-    whole = segment_planes(torch.tensor(points), dataclasses.replace(config, growing=growing))
-    found = segment_planes(torch.tensor(points), config)
+    whole = segment_planes(torch.tensor(points), WHOLE)
+    found = segment_planes(torch.tensor(points), CUT)
     assert torch.equal(found.labels, whole.labels)
     assert float((found.labels == 0).float().mean()) > 0.95
 
