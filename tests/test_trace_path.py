@@ -17,5 +17,5 @@ def test_path_of_a_preset_stays_short(preset):
 
 
 def test_readme_shows_the_path():
-    (shown,) = re.findall(r"```text\n(pipeline\.py .*?)\n```", README.read_text(), re.DOTALL)
+    (shown,) = re.findall(r"```text\n(.*? > .*?)\n```", README.read_text(), re.DOTALL)
     assert shown.splitlines() == trace_path.as_paragraph(trace("consensus"))
