@@ -499,32 +499,26 @@ def test_results_are_those_of_clouds_with_truth():
         {"cloud": "tutorial", "method": "paper"},
         {**record, "labels": labels, "faces": faces},
     ]
-    time = {"cloud": "cory", "method": "paper", "points": 9, "total": 2.0}
-    parts = {
-        "segmentation": {"records": {"scores": scores}},
-        "times": {"records": [{**time, "stages": {}}]},
-    }
+    parts = {"segmentation": {"records": {"scores": scores}}}
     report = {"quick": False, "made_with": "", "claims": [], "parts": parts}
     found = readme.take_results(report)
     assert [(record["cloud"], record["f1_large"]) for record in found["scores"]] == [("cory", 2.0)]
-    assert found["times"] == [time]
 
 
 def test_readme_is_updated_between_the_markers_only(tmp_path, monkeypatch):
     from reproduction import readme
 
     numbers = {"ari": 0.5, "f1_large": 90.0, "mean_best_iou": 0.25, "faces": 3}
-    one = {"cloud": "cory", "title": "Cory", "points": 1_097_901, "total": 5.904, **numbers}
+    one = {"cloud": "cory", "title": "Cory", **numbers}
     rows = [{**one, "method": method} for method in METHODS]
-    results = {"quick": False, "made_with": "torchrg", "scores": rows, "times": rows}
+    results = {"quick": False, "made_with": "torchrg", "scores": rows}
     text = f"before\n{readme.BEGIN}\nold\n{readme.END}\nafter\n"
     made = readme.insert(text, results)
     assert made.startswith(f"before\n{readme.BEGIN}\nAdjusted Rand index")
     assert made.endswith(f"\n{readme.END}\nafter\n")
     assert "old" not in made
     assert "| Cory (3 faces) | 0.50 / 90 / 0.25 |" in made
-    assert "| 1,097,901 points | 6 s (4 x) | 6 s (3,196 x) | 6 s (100 x) | 6 s |" in made
     with pytest.raises(ValueError, match="expected a README with"):
         readme.insert("no markers", results)
-    with pytest.raises(ValueError, match=r"got none of .*'segmentation'"):
-        readme.take_results({"parts": {"normals": {}, "times": {}}})
+    with pytest.raises(ValueError, match="expected the part segmentation"):
+        readme.take_results({"parts": {"normals": {}}})

@@ -13,7 +13,6 @@ from reproduction.faces import LARGE
 from reproduction.methods import DRAWN, titles
 from reproduction.rendering import markdown_table
 from reproduction.sections import mark_best, table
-from reproduction.times import ratio
 from torchrg.io import atomic_path
 
 README = Path(__file__).parents[2] / "README.md"
@@ -23,9 +22,6 @@ END = "<!-- end of results -->"
 
 INDICES = {"ari": ".2f", "f1_large": ".0f", "mean_best_iou": ".2f"}
 """What the README shows of a cloud and a method, and how it is printed."""
-
-TIMED = "cory"
-"""The cloud whose times are shown: those of small ones are fixed costs."""
 
 
 def update(report: Record) -> None:
@@ -49,15 +45,14 @@ def insert(readme: str, results: Record) -> str:
 
 
 def take_results(report: Record) -> Record:
-    """Return the numbers of a report that are kept: claims, scores and times.
+    """Return the numbers of a report that are kept: claims and scores.
 
     Raises:
-        ValueError: If a part that it needs is not there.
+        ValueError: If the part that it needs is not there.
     """
     parts = report["parts"]
-    missing = {"segmentation", "times"} - parts.keys()
-    if missing:
-        raise ValueError(f"take_results: expected all parts, got none of {sorted(missing)}.")
+    if "segmentation" not in parts:
+        raise ValueError("take_results: expected the part segmentation, got a report without it.")
     return {
         "quick": report["quick"],
         "made_with": report["made_with"],
@@ -75,15 +70,11 @@ def take_results(report: Record) -> Record:
             for record in parts["segmentation"]["records"]["scores"]
             if "labels" in record
         ],
-        "times": [
-            {name: record[name] for name in ("cloud", "method", "points", "total")}
-            for record in parts["times"]["records"]
-        ],
     }
 
 
 def to_section(results: Record) -> str:
-    """Return the results section: a row for each cloud with truth, and one of times."""
+    """Return the results section: a row for each cloud with truth."""
     rows = []
     for key in dict.fromkeys(record["cloud"] for record in results["scores"]):
         if key not in HARD:
@@ -94,23 +85,13 @@ def to_section(results: Record) -> str:
             ]
             cells = map(" / ".join, zip(*columns, strict=True))
             rows.append([f"{found['paper']['title']} ({found['paper']['faces']} faces)", *cells])
-    times = {r["method"]: r for r in results["times"] if r["cloud"] == TIMED}
-    seconds = [f"{times[method]['total']:.0f} s{_published(times[method])}" for method in DRAWN]
-    rows.append([f"{times['paper']['points']:,} points", *seconds])
     made = "small clouds: `--quick`" if results["quick"] else "full size"
     title = (
         f"Adjusted Rand index / F1 of faces of {LARGE:,} points and more / mean best IoU, of "
-        "clouds with truth (*: made in place of the paper's); last row seconds, and how many times "
-        "faster than published. From `scripts/reproduce_paper.py` "
+        "clouds with truth (*: made in place of the paper's), from `scripts/reproduce_paper.py` "
         f"({made}; {results['made_with']}):"
     )
     return markdown_table(table(title, ["cloud", *titles(dict.fromkeys(DRAWN))], rows))
-
-
-def _published(record: Record) -> str:
-    """Return how many times faster than the paper's code, per point, where it has a time."""
-    times = ratio(record)
-    return "" if times is None else f" ({times:,.0f} x)"
 
 
 def _write(path: Path, text: str) -> None:
