@@ -21,7 +21,7 @@ def coordinates(height, width):
 
 @pytest.mark.parametrize("size", CELL_SIZES)
 def test_windows_are_those_of_a_literal_least_squares_fit(rng, size):
-    height, width = 6 * size + 1, 7 * size - 1
+    height, width = 6 * size + 1, 8 * size - 1
     u, v = coordinates(height, width)
     image = torch.randn(height, width, generator=rng, dtype=torch.float64)
     seen = torch.rand(height, width, generator=rng) < 0.8

@@ -27,8 +27,8 @@ _CURVED = 3.0
 """A region this many times thicker than its noise is no plane,"""
 
 _BENT = 0.03
-"""if it is also thicker than this share of its own extent: a slightly bent face is a face. The share
-of a column is 0.4."""
+"""if it is also thicker than this share of its own extent: a slightly bent face is a face. A column
+has 0.4."""
 
 _NUM_FITS = 2
 """A plain fit and a reweighted one: pixels that grew into a region are near its plane already."""
