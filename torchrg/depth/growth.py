@@ -36,6 +36,14 @@ _NUM_FITS = 2
 _BISQUARE_CUT = 4.685
 """Pixels this many standard deviations from a region's plane have no weight in it."""
 
+_ALIKE = 1.75
+"""Normals of two windows that both hold both pixels may differ by this many times the angle: on a
+column large windows turn by more than the angle from one cell to the next,"""
+
+_SLOPE_NOISE = 1.0
+"""or by as much as makes their slopes differ by this many standard deviations: small windows of a
+narrow face turn by noise alone."""
+
 _MOST_MOVES = 16
 """In pixels: windows hardly reach farther from their middle."""
 
@@ -69,8 +77,9 @@ def grow_pixels(
 
     Two pixels side by side are on one surface if both have a flat window, their normals in space
     ``(H, W, 3)`` are within the angle, and at both pixels their two planes differ by at most
-    ``max_step`` times what a flat window may deviate by: no region crosses a step. Regions are what
-    hangs together by such pairs.
+    ``max_step`` times what a flat window may deviate by: no region crosses a step. Where both
+    windows hold both pixels the angle may be larger: a crease between the pixels would lie within
+    two flat windows. Regions are what hangs together by such pairs.
 
     ``u`` ``(W,)`` and ``v`` ``(H, 1)`` count columns and rows from the optical axis.
 
@@ -109,7 +118,13 @@ def _joins(
     tolerance = pixels.tolerance.flatten()
     limit = config.max_step * torch.maximum(tolerance[here], tolerance[there])
     own, theirs = (normals.view(-1, 3)[at][:, :, None].unbind(dim=1) for at in (here, there))
-    accepted = sq_chords(own, theirs).squeeze(1) <= deg_to_sq_chord(config.max_angle_deg)
+    turned = sq_chords(own, theirs).squeeze(1)
+    accepted = turned <= deg_to_sq_chord(config.max_angle_deg)
+    wider = deg_to_sq_chord(min(_ALIKE * config.max_angle_deg, 90.0))
+    sq_noise = pixels.sq_slope_noise(here) + pixels.sq_slope_noise(there)
+    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
+    alike |= turned <= wider
+    accepted |= alike & pixels.holds(here, there) & pixels.holds(there, here)
     joins[rows, columns] = accepted & (step.abs() <= limit) & (next_step.abs() <= limit)
     return joins
 

@@ -4,7 +4,7 @@ Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Win
 apart, so that the sums over all large ones together cost less than those over the smallest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -72,20 +72,37 @@ class PixelPlanes(NamedTuple):
     """A plane in inverse depth for each pixel: that of a window.
 
     The planes are in columns and rows from the optical axis. ``window`` tells pixels of one window
-    from those of others, ``side`` is its side in pixels. ``valid`` tells which pixels have a plane,
-    ``flat`` whether their window is flat, ``edge`` whether it is but could not lie around the
-    pixel; ``noise`` is the standard deviation of inverse depth, as large windows see it, and
-    ``tolerance`` what a flat window may deviate by. All are of shape ``(H, W)``.
+    from those of others, ``side`` is its side in pixels, and ``middle`` ``(2, H, W)`` row and
+    column of its middle. ``valid`` tells which pixels have a plane, ``flat`` whether their window
+    is flat, ``edge`` whether it is but could not lie around the pixel; ``noise`` is the standard
+    deviation of inverse depth, as large windows see it, and ``tolerance`` what a flat window may
+    deviate by. All others are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes
     window: Tensor
     side: Tensor
+    middle: Tensor
     valid: Tensor
     flat: Tensor
     edge: Tensor
     noise: Tensor
     tolerance: Tensor
+
+    def sq_slope_noise(self, pixels: Tensor) -> Tensor:
+        """Return the variance of the slopes of the windows of some pixels, by row-major place.
+
+        That of least squares over n^2 pixels of variance (n^2 - 1) / 12 along either axis.
+        """
+        side = self.side.flatten()[pixels]
+        return 12 * (self.tolerance.flatten()[pixels] / (side * side)).square()
+
+    def holds(self, pixels: Tensor, others: Tensor) -> Tensor:
+        """Return whether the windows of some pixels hold others, all by row-major place."""
+        width = self.window.shape[1]
+        row, column = (part.flatten()[pixels] for part in self.middle)
+        away = torch.maximum((others // width - row).abs(), (others % width - column).abs())
+        return away <= self.side.flatten()[pixels] / 2
 
 
 class _Tolerances(NamedTuple):
@@ -131,34 +148,57 @@ def fit_pixels(
         [2] M. Kuwahara et al. Processing of RI-angiocardiographic images. Digital Processing of
         Biomedical Images, 1976.
     """
-    windows = fit_windows(inverse, seen, u, v)
-    noises = noise_by_size(windows, noise, dtype)
-    limits = {size: _tolerances(windows[size], noises[size], size, focal) for size in CELL_SIZES}
-    starts, end = {}, 0
-    for size, planes in windows.items():
-        starts[size] = end
-        end += planes.mean.numel()
+    planes = fit_windows(inverse, seen, u, v)
+    noises = noise_by_size(planes, noise, dtype)
+    windows, first = dict[int, _SizedWindows](), 0
+    for size, found in planes.items():
+        limit = _tolerances(found, noises[size], size, focal)
+        windows[size] = _SizedWindows(size, first, found, noises[size], limit)
+        first += found.mean.numel()
     choice = _Choice(inverse, seen, u, v)
     for size in CELL_SIZES:
-        around, limit = windows[size], limits[size]
-        relative = around.deviation / limit.flat
-        if size // 2 in windows:
-            quarters = _deviation_of_quarters(windows[size // 2].deviation, relative.shape)
-            # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
-            usual = quarters * (limit.noise / noises[size // 2].at(around.mean))
-            usual = torch.maximum(usual, _LEAST_QUARTERS * limit.flat)
-            same = around.deviation <= (1 + _SAME_NOISE / (_SIDE * size)) * usual
-            relative = torch.where(same, relative, torch.inf)
-        own = torch.arange(relative.numel(), device=relative.device).view(relative.shape)
-        reach = _OWN_REACH * limit.flat
-        choice.offer(around, size, starts[size], own, relative <= _FLAT, reach)
-        if size == CELL_SIZES[-1]:
-            smooth = around.deviation <= limit.most
-            choice.offer(around, size, starts[size], own, smooth, torch.full_like(reach, torch.inf))
-        least, places = least_in_windows(relative, _REACH)
-        reach = torch.maximum(_OWN_REACH * limit.noise, limit.flat)
-        choice.offer(around, size, starts[size], places, least <= _FLAT, reach, beside=True)
-    return _pixel_planes(choice, seen, windows, limits, noises[CELL_SIZES[0]].at(inverse))
+        _offer_windows(choice, windows[size], windows.get(size // 2))
+    return _pixel_planes(choice, seen, windows.values(), noises[CELL_SIZES[0]].at(inverse))
+
+
+class _SizedWindows(NamedTuple):
+    """The windows of one size; they are numbered through all sizes, these from ``first`` on."""
+
+    size: int
+    first: int
+    planes: WindowPlanes
+    noise: "WindowNoise"
+    limit: _Tolerances
+
+
+def _offer_windows(
+    choice: "_Choice", windows: _SizedWindows, quarters: _SizedWindows | None
+) -> None:
+    """Offer pixels the flat windows of a size; the smallest has no ``quarters``."""
+    limit, deviation = windows.limit, windows.planes.deviation
+    relative = _flatness(windows, quarters)
+    own = torch.arange(relative.numel(), device=relative.device).view(relative.shape)
+    choice.offer(windows, torch.where(relative <= _FLAT, own, -1), _OWN_REACH * limit.flat)
+    if quarters is None:
+        smooth = torch.where(deviation <= limit.most, own, -1)
+        choice.offer(windows, smooth, torch.full_like(deviation, torch.inf))
+    least, places = least_in_windows(relative, _REACH)
+    reach = torch.maximum(_OWN_REACH * limit.noise, limit.flat)
+    choice.offer(windows, torch.where(least <= _FLAT, places, -1), reach, beside=True)
+
+
+def _flatness(windows: _SizedWindows, quarters: _SizedWindows | None) -> Tensor:
+    """Return what windows deviate by in units of the tolerance; inf if their quarters do less."""
+    limit, deviation = windows.limit, windows.planes.deviation
+    relative = deviation / limit.flat
+    if quarters is None:
+        return relative
+    usual = _deviation_of_quarters(quarters.planes.deviation, relative.shape)
+    # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
+    usual = usual * (limit.noise / quarters.noise.at(windows.planes.mean))
+    usual = torch.maximum(usual, _LEAST_QUARTERS * limit.flat)
+    same = deviation <= (1 + _SAME_NOISE / (_SIDE * windows.size)) * usual
+    return torch.where(same, relative, torch.inf)
 
 
 class _Choice:
@@ -176,56 +216,43 @@ class _Choice:
         self.edge = torch.zeros_like(self.flat)
         self._waiting = seen.flatten().nonzero().squeeze(1)
 
-    def offer(
-        self,
-        planes: WindowPlanes,
-        size: int,
-        start: int,
-        places: Tensor,
-        offered: Tensor,
-        reach: Tensor,
-        *,
-        beside: bool = False,
-    ) -> None:
-        """Offer each cell of a size a window, by its row-major place ``(h, w)``, where offered.
+    def take(self, images: Sequence[Tensor]) -> Tensor:
+        """Return the values of the pixels' windows ``(H, W)`` from those of each size."""
+        return torch.cat([part.flatten() for part in images])[self.window].view(self.shape)
 
-        A pixel takes it if it is within reach ``(h, w)`` of the window's plane. The windows of the
-        size are numbered from ``start`` on; ``beside`` tells that they are not around the cell.
+    def offer(
+        self, windows: _SizedWindows, places: Tensor, reach: Tensor, *, beside: bool = False
+    ) -> None:
+        """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
+
+        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; ``beside`` tells
+        that the windows are not around the cells.
         """
-        width = self.shape[1]
-        waiting = self._waiting
-        cells = (waiting // width // size) * offered.shape[1] + waiting % width // size
-        chosen = torch.where(offered, places, -1).flatten()[cells]
+        width, size, waiting = self.shape[1], windows.size, self._waiting
+        cells = (waiting // width // size) * places.shape[1] + waiting % width // size
+        chosen = places.flatten()[cells]
         has = (chosen >= 0).nonzero().squeeze(1)
         pixels, chosen = waiting[has], chosen[has]
-        plane = planes.take(chosen)
+        plane = windows.planes.take(chosen)
         value = plane.u_slope * self._u[pixels] + plane.v_slope * self._v[pixels] + plane.origin
         near = (self._values[pixels] - value).abs() <= reach.flatten()[chosen]
         taken = pixels[near]
-        self.window[taken] = chosen[near] + start
+        self.window[taken] = chosen[near] + windows.first
         self.flat[taken] = True
         self.edge[taken] = beside
         self._waiting = waiting[~self.flat[waiting]]
 
 
 def _pixel_planes(
-    choice: _Choice,
-    seen: Tensor,
-    windows: Mapping[int, WindowPlanes],
-    limits: Mapping[int, _Tolerances],
-    noise: Tensor,
+    choice: _Choice, seen: Tensor, windows: Iterable[_SizedWindows], noise: Tensor
 ) -> PixelPlanes:
     """Return the planes of the windows that pixels chose."""
-    parts = zip(*windows.values(), strict=True)
-    table = WindowPlanes(*(torch.cat([part.flatten() for part in sizes]) for sizes in parts))
-    planes = WindowPlanes(*(part.view(choice.shape) for part in table.take(choice.window)))
-    tolerance, side = (
-        torch.cat([part.flatten() for part in images])[choice.window].view(choice.shape)
-        for images in (
-            [limits[size].flat for size in windows],
-            [torch.full_like(planes.mean, _SIDE * size) for size, planes in windows.items()],
-        )
-    )
+    sizes = list(windows)
+    table = zip(*(part.planes for part in sizes), strict=True)
+    planes = WindowPlanes(*(choice.take(part) for part in table))
+    tolerance = choice.take([part.limit.flat for part in sizes])
+    side = choice.take([torch.full_like(w.planes.mean, _SIDE * w.size) for w in sizes])
+    middles = zip(*(_middles(part) for part in sizes), strict=True)
     flat = choice.flat.view(choice.shape)
     is_smooth = flat & (planes.deviation > _FLAT * tolerance)
     tolerance = torch.where(is_smooth, planes.deviation, torch.maximum(tolerance, noise))
@@ -233,12 +260,23 @@ def _pixel_planes(
         planes,
         choice.window.view(choice.shape),
         side,
+        torch.stack([choice.take(part) for part in middles]),
         flat | (seen & planes.deviation.isfinite()),
         flat,
         choice.edge.view(choice.shape),
         noise,
         tolerance,
     )
+
+
+def _middles(windows: _SizedWindows) -> tuple[Tensor, Tensor]:
+    """Return row and column of the middle pixel of each window, each ``(h, w)``."""
+    mean, size = windows.planes.mean, windows.size
+    row, column = (
+        torch.arange(length, device=mean.device, dtype=mean.dtype) * size + (size - 1) / 2
+        for length in mean.shape
+    )
+    return row[:, None].expand_as(mean), column.expand_as(mean)
 
 
 def _tolerances(
