@@ -111,6 +111,15 @@ def test_columns_and_balls_are_regions_with_and_without_noise(noise, rng):
         assert bool(seg.planes.curved[column])
 
 
+def test_columns_with_the_noise_of_a_sensor_fall_into_few_parts(rng):
+    depth, truth = columns()
+    noise = 0.0012 + 0.0019 * (depth - 0.4) ** 2
+    noisy = depth + noise * torch.randn(depth.shape, generator=rng, dtype=torch.float64)
+    seg = segment_depth(stored(noisy), CAMERA)
+    assert len(seg.planes.count) <= 8
+    assert share_of_one_region(seg.labels, truth == 2) >= 0.7
+
+
 @pytest.mark.parametrize("angle", [12.0, 20.0, 40.0])
 def test_creases_without_noise_stay_open(angle):
     half = math.tan(math.radians(angle / 2))

@@ -97,3 +97,28 @@ def test_windows_beside_a_step_are_flat_and_tell_the_edge():
     assert found.flat.all()
     assert found.edge[0].any()
     assert not found.edge.all()
+
+
+def test_a_window_holds_the_pixels_of_its_square(rng):
+    height, width = 26, 37
+    u, v = coordinates(height, width)
+    image = 1 + 0.05 * torch.randn(height, width, generator=rng, dtype=torch.float64)
+    image += torch.where(u < 3, 0.0, 2.0)
+    seen = torch.ones(height, width, dtype=torch.bool)
+    found = fit_pixels(image, seen, u, v, focal=FOCAL, noise=None, dtype=torch.float32)
+    squares = [
+        (size * (row - 2), size * (row + 3), size * (column - 2), size * (column + 3))
+        for size in sorted(CELL_SIZES)
+        for row in range(-(-height // size))
+        for column in range(-(-width // size))
+    ]
+    pixels, others = torch.randint(height * width, (2, 400), generator=rng)
+    expected = []
+    for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
+        top, bottom, left, right = squares[int(found.window.flatten()[pixel])]
+        row, column = divmod(other, width)
+        expected.append(top <= row < bottom and left <= column < right)
+        assert bottom - top == found.side.flatten()[pixel]
+    assert found.holds(pixels, others).tolist() == expected
+    assert any(expected)
+    assert not all(expected)
