@@ -1,13 +1,18 @@
 """``torchrg depth``: planes of depth images and of organised clouds."""
 
 import json
+import re
+import subprocess
+import sys
 
 import kornia_rs
 import numpy as np
 import pytest
 import torch
 
+from torchrg.batch.scans import Scan
 from torchrg.cli import main
+from torchrg.cli.depth import Frame
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
@@ -91,8 +96,80 @@ def test_several_images_go_into_a_folder(tmp_path, frame):
     assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 0
     names = ["frame.png", "frame_planes.png", "other.png", "other_planes.png"]
     assert sorted(path.name for path in out.iterdir()) == names
-    other.write_text("no image")
-    assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 3
+
+
+@pytest.fixture
+def sequence(tmp_path, depth):
+    """A folder of four frames that differ, the third of them damaged, and a file that is none."""
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    for number in (1, 2, 3, 10):
+        write_png(folder / f"{number}.png", (depth * (1000 + number)).round().int())
+    damaged = (folder / "3.png").read_bytes()
+    (folder / "3.png").write_bytes(damaged[: len(damaged) // 2])
+    (folder / "notes.txt").write_text("a desk")
+    return folder
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_damaged_frame_of_a_sequence_stops_no_other(tmp_path, sequence, capsys):
+    out = tmp_path / "out"
+    assert main(["depth", str(sequence), *CAMERA, "--out", str(out)]) == 3
+    told = capsys.readouterr()
+    damaged, sums = told.err.splitlines()
+    assert damaged.startswith(f"torchrg: {sequence / '3.png'}: ")
+    assert damaged.count("3.png") == 1
+    assert sums == "torchrg: 1 of 4 inputs failed, the others are written."
+    speed = r"[\d.]+ s, [\d.]+ frames a second"
+    assert re.fullmatch(rf"3 of 4 frames, 6 planes, {speed} -> {out}\n", told.out)
+    for number in (1, 2, 10):
+        alone = tmp_path / "alone.png"
+        assert main(["depth", str(sequence / f"{number}.png"), *CAMERA, "--out", str(alone)]) == 0
+        assert contents(out)[f"{number}.png"] == alone.read_bytes()
+    assert len(contents(out)) == 6
+
+
+@pytest.mark.slow
+def test_processes_side_by_side_write_the_same_bytes(tmp_path, sequence):
+    results = []
+    for workers in ("1", "2", "3"):
+        out = tmp_path / workers
+        command = [sys.executable, "-m", "torchrg", "depth", str(sequence), *CAMERA, "--out", out]
+        ended = subprocess.run([*command, "--workers", workers], check=False, capture_output=True)
+        assert ended.returncode == 3
+        assert ended.stderr.count(b"\n") == 2
+        results.append(contents(out))
+    assert len(results[0]) == 6
+    assert results[0] == results[1] == results[2]
+
+
+def test_results_that_would_replace_an_image_are_refused(tmp_path, sequence, frame, capsys):
+    write_png(sequence / "1_planes.png", torch.ones(4, 4).int())
+    before = contents(sequence)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for inputs, out, message in (
+        (sequence, sequence, "expected a place of its own for each result"),
+        (sequence, tmp_path / "out", "1_planes.png: expected a place of its own"),
+        (frame, frame, "frame.png: expected a place of its own"),
+        (empty, tmp_path / "out", "expected images (.png .npy .pcd) in the folder, got none"),
+    ):
+        assert main(["depth", str(inputs), *CAMERA, "--out", str(out)]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert contents(sequence) == before
+
+
+def test_what_a_killed_process_was_writing_goes_and_nothing_else(tmp_path):
+    for name in (".1.0123abcd.png", ".1_planes.0123abcd.png", ".2.0123abcd.png", "1.png"):
+        (tmp_path / name).touch()
+    scan = Scan("1", (tmp_path / "1.npy",), 0)
+    Frame(scan, tmp_path / "1.png", tmp_path / "1_planes.png", None).remove_leftovers()
+    assert sorted(contents(tmp_path)) == [".2.0123abcd.png", "1.png"]
 
 
 def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
@@ -107,6 +184,7 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
         ([str(frame), "--intrinsics", "1,2,3", *CAMERA[2:], *out], "four numbers without blanks"),
         ([str(frame), str(frame), *CAMERA, *out], "expected a directory for 2 inputs"),
         ([str(frame), *CAMERA[:4], "--threads", "0", *out], "expected --threads >= 1, got 0"),
+        ([str(frame), *CAMERA, "--workers", "0", *out], "expected --workers >= 1, got 0"),
         ([str(tmp_path / "list.pcd"), *out], "expected an organised cloud"),
         ([str(tmp_path / "turned.pcd"), *out], "expected points of a pinhole camera"),
     ):

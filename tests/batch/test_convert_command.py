@@ -10,7 +10,8 @@ import pytest
 from tqdm import tqdm
 
 from torchrg.batch.convert import ScanReport
-from torchrg.batch.run import DirectoryLock, make_plan
+from torchrg.batch.report import BatchReport, format_report
+from torchrg.batch.run import DirectoryLock
 from torchrg.cli import main
 from torchrg.cli.convert import _Progress
 from torchrg.config import load_config
@@ -153,11 +154,10 @@ def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, capsys, mo
     assert "MB of free disk for 2 scans" in capsys.readouterr().err
 
 
-def test_progress_is_scans_points_a_second_and_time_left(faults, tmp_path):
-    jobs = faults.make_jobs(tmp_path, {"900_a": "plain", "100_b": "plain"})
+def test_progress_is_scans_points_a_second_and_time_left():
     shown = io.StringIO()
     with tqdm(total=1000, unit="pt", file=shown, ncols=80) as bar:
-        progress = _Progress(bar, make_plan(jobs))
+        progress = _Progress(bar, {"900_a": 900, "100_b": 100}, unit="scan")
         progress(None)
         progress(ScanReport("900_a", "failed"))
         bar.refresh()
@@ -172,3 +172,18 @@ def test_help_lists_the_kinds(capsys):
         main(["convert", "--help"])
     assert stop.value.code == 0
     assert "s3dis" in capsys.readouterr().out
+
+
+def test_depth_frames_are_counted_by_the_second():
+    shown = io.StringIO()
+    with tqdm(total=2, unit="frame", file=shown, ncols=80) as bar:
+        progress = _Progress(bar, {"a": 1, "b": 1}, unit="frame")
+        progress(ScanReport("a", "converted"))
+        bar.refresh()
+    assert "1/2 frames:  50%" in shown.getvalue()
+    assert "frame/s]" in shown.getvalue()
+    scans = (ScanReport("a", "converted", num_points=640), ScanReport("b", "failed"))
+    report = BatchReport(scans, started=0.0, seconds=4.0, engine="local", workers=1)
+    assert "640 points in 4.0 s: 160 points, 0.25 frames a second" in format_report(
+        report, unit="frame"
+    )

@@ -3,12 +3,17 @@
 import torch
 
 from torchrg.depth.growth import move_to_creases
-from torchrg.depth.normals import moved
 from torchrg.linalg.moments import Segments
 from torchrg.regions.planes import fit_planes
 from torchrg.structures import Neighbors
 
 STEPS = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+
+
+def moved(image, step, *, fill):
+    """Return for each pixel the value of the one a step away."""
+    wide = torch.nn.functional.pad(image, (6, 6, 6, 6), value=fill)
+    return wide[6 + step[0] :, 6 + step[1] :][: image.shape[0], : image.shape[1]]
 
 
 def around(height, width):

@@ -1,15 +1,17 @@
 """Planes through windows of an image, and the noise they tell."""
 
+import pytest
 import torch
 
 from torchrg.depth.normals import (
-    RADII,
+    CELL_SIZES,
     fit_pixels,
     fit_windows,
     least_in_windows,
-    moved,
-    noise_by_radius,
+    noise_by_size,
 )
+
+FOCAL = (525.0, 525.0)
 
 
 def coordinates(height, width):
@@ -17,16 +19,20 @@ def coordinates(height, width):
     return u, torch.arange(height).double()[:, None] - height / 2
 
 
-def test_windows_are_those_of_a_literal_least_squares_fit(rng):
-    u, v = coordinates(11, 13)
-    image = torch.randn(11, 13, generator=rng, dtype=torch.float64)
-    seen = torch.rand(11, 13, generator=rng) < 0.8
-    planes = fit_windows(torch.where(seen, image, 1e6), seen, u, v, 2)
-    for row, column in ((5, 6), (1, 1), (10, 12), (4, 0)):
-        rows, columns = slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3)
+@pytest.mark.parametrize("size", CELL_SIZES)
+def test_windows_are_those_of_a_literal_least_squares_fit(rng, size):
+    height, width = 6 * size + 1, 8 * size - 1
+    u, v = coordinates(height, width)
+    image = torch.randn(height, width, generator=rng, dtype=torch.float64)
+    seen = torch.rand(height, width, generator=rng) < 0.8
+    planes = fit_windows(torch.where(seen, image, 1e6), seen, u, v)[size]
+    assert planes.mean.shape == (-(-height // size), -(-width // size))
+    for row, column in ((3, 3), (1, 1), (5, 5), (4, 0)):
+        rows = slice(max(row - 2, 0) * size, (row + 3) * size)
+        columns = slice(max(column - 2, 0) * size, (column + 3) * size)
         inside = torch.zeros_like(seen)
         inside[rows, columns] = seen[rows, columns]
-        if int(inside.sum()) < 10:
+        if int(inside.sum()) < 0.4 * (5 * size) ** 2:
             assert planes.deviation[row, column].isinf()
             continue
         x, y = u.expand_as(image)[inside], v.expand_as(image)[inside]
@@ -34,17 +40,20 @@ def test_windows_are_those_of_a_literal_least_squares_fit(rng):
         solution = torch.linalg.lstsq(matrix, image[inside][:, None]).solution[:, 0]
         rest = image[inside] - matrix @ solution
         found = torch.stack([part[row, column] for part in planes])
-        expected = [*solution, (rest.square().sum() / (len(x) - 3)).sqrt()]
-        torch.testing.assert_close(found, torch.stack(expected), rtol=1e-9, atol=1e-11)
+        deviation = (rest.square().sum() / (len(x) - 3)).sqrt()
+        expected = torch.stack([*solution, deviation, image[inside].mean()])
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
 
 
 def test_windows_without_enough_pixels_or_along_a_line_have_no_plane():
     u, v = coordinates(9, 9)
     image, line = torch.ones(9, 9).double(), torch.zeros(9, 9, dtype=torch.bool)
     line[4] = True
-    assert fit_windows(image, line, u, v, 2).deviation.isinf().all()
+    for planes in fit_windows(image, line, u, v).values():
+        assert planes.deviation.isinf().all()
     thin = torch.ones(1, 9, dtype=torch.bool)
-    assert fit_windows(image[:1], thin, u, v[:1], 2).deviation.isinf().all()
+    for planes in fit_windows(image[:1], thin, u, v[:1]).values():
+        assert planes.deviation.isinf().all()
 
 
 def test_least_in_windows_is_that_of_a_literal_search(rng):
@@ -57,12 +66,6 @@ def test_least_in_windows_is_that_of_a_literal_search(rng):
     assert torch.equal(image.flatten()[places], values)
 
 
-def test_moved_looks_at_the_pixel_a_step_away():
-    image = torch.arange(12).view(3, 4)
-    assert moved(image, (1, -1), fill=-1).tolist() == [[-1, 4, 5, 6], [-1, 8, 9, 10], [-1] * 4]
-    assert moved(image, (4, -5), fill=7).eq(7).all()
-
-
 def test_noise_of_depth_is_found_whatever_its_growth(rng):
     u, v = coordinates(240, 320)
     inverse = 0.25 + (u + 160) * 0.004 + 0 * v
@@ -70,29 +73,52 @@ def test_noise_of_depth_is_found_whatever_its_growth(rng):
     for constant, growth in ((0.004, 0.0), (0.0, 0.002), (0.003, 0.0015)):
         level = growth + constant * inverse**2
         noisy = inverse + level * torch.randn(240, 320, generator=rng, dtype=torch.float64)
-        windows = {radius: fit_windows(noisy, seen, u, v, radius) for radius in RADII}
-        noise = noise_by_radius(windows, noisy, seen, None, torch.float32)
-        for radius in RADII:
-            ratio = (noise[radius] / level)[16:-16, 16:-16]
-            assert float(ratio.min()) > 0.7, (constant, growth, radius)
-            assert float(ratio.max()) < 1.3, (constant, growth, radius)
+        noise = noise_by_size(fit_windows(noisy, seen, u, v), None, torch.float32)
+        for size in CELL_SIZES:
+            ratio = (noise[size].at(inverse) / level)[16:-16, 16:-16]
+            assert float(ratio.min()) > 0.7, (constant, growth, size)
+            assert float(ratio.max()) < 1.3, (constant, growth, size)
 
 
 def test_noise_that_is_given_is_taken(rng):
     u, v = coordinates(20, 20)
     inverse = 0.5 + torch.rand(20, 20, generator=rng, dtype=torch.float64)
     seen = torch.ones_like(inverse, dtype=torch.bool)
-    windows = {radius: fit_windows(inverse, seen, u, v, radius) for radius in (2, 4)}
-    noise = noise_by_radius(windows, inverse, seen, (0.01, 0.02), torch.float32)
-    torch.testing.assert_close(noise[2], 0.02 + 0.01 * inverse**2)
-    assert torch.equal(noise[2], noise[4])
+    noise = noise_by_size(fit_windows(inverse, seen, u, v), (0.01, 0.02), torch.float32)
+    torch.testing.assert_close(noise[2].at(inverse), 0.02 + 0.01 * inverse**2)
+    assert noise[2] == noise[8]
 
 
 def test_windows_beside_a_step_are_flat_and_tell_the_edge():
     u, v = coordinates(30, 40)
     inverse = torch.where(u < 0, 0.5, 0.4).double().expand(30, 40)
     seen = torch.ones(30, 40, dtype=torch.bool)
-    found = fit_pixels(inverse, seen, u, v, noise=None, dtype=torch.float32)
+    found = fit_pixels(inverse, seen, u, v, focal=FOCAL, noise=None, dtype=torch.float32)
     assert found.flat.all()
     assert found.edge[0].any()
     assert not found.edge.all()
+
+
+def test_a_window_holds_the_pixels_of_its_square(rng):
+    height, width = 26, 37
+    u, v = coordinates(height, width)
+    image = 1 + 0.05 * torch.randn(height, width, generator=rng, dtype=torch.float64)
+    image += torch.where(u < 3, 0.0, 2.0)
+    seen = torch.ones(height, width, dtype=torch.bool)
+    found = fit_pixels(image, seen, u, v, focal=FOCAL, noise=None, dtype=torch.float32)
+    squares = [
+        (size * (row - 2), size * (row + 3), size * (column - 2), size * (column + 3))
+        for size in sorted(CELL_SIZES)
+        for row in range(-(-height // size))
+        for column in range(-(-width // size))
+    ]
+    pixels, others = torch.randint(height * width, (2, 400), generator=rng)
+    expected = []
+    for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
+        top, bottom, left, right = squares[int(found.window.flatten()[pixel])]
+        row, column = divmod(other, width)
+        expected.append(top <= row < bottom and left <= column < right)
+        assert bottom - top == found.side.flatten()[pixel]
+    assert found.holds(pixels, others).tolist() == expected
+    assert any(expected)
+    assert not all(expected)

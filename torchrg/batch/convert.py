@@ -6,12 +6,13 @@ import os
 import platform
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.batch.records import RECORD, describe_job, read_record, write_record
-from torchrg.batch.scans import Job
+from torchrg.batch.scans import Converted, Job
 from torchrg.errors import TorchrgError
 from torchrg.io.files import remove_leftovers
 
@@ -59,26 +60,40 @@ def convert_scan(job: Job) -> ScanReport:
     The record of an earlier run is removed first, and the new one written last: whoever finds a
     record finds complete files.
     """
-    clock = _StageClock()
-    outcome: dict[str, Any]
-    reset_peak_memory()
-    try:
-        clock.begin("hash")
+
+    def convert(begin: Callable[[str], None]) -> Converted:
+        begin("hash")
         description = describe_job(job)
         job.folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(job.folder)
         earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)
-        converted = job.source.convert(job.scan, job.folder, clock.begin)
-        clock.begin("record")
+        converted = job.source.convert(job.scan, job.folder, begin)
+        begin("record")
         for name in earlier["outputs"].keys() - set(converted.files):
             (job.folder / name).unlink(missing_ok=True)
         write_record(job, description, converted)
-        outcome = {"status": "converted", **converted._asdict()}
-        del outcome["files"]
-    except Exception as error:  # noqa: BLE001 One scan must never end the others.
+        return converted
+
+    report = report_on(job.scan.name, convert)
+    if report.status == "failed":
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
+    return report
+
+
+def report_on(name: str, convert: Callable[[Callable[[str], None]], Converted]) -> ScanReport:
+    """Convert a scan of some name; what goes wrong with it is in the report and never raised.
+
+    ``convert`` is called with a function that it calls with the name of each stage that begins.
+    """
+    clock = _StageClock()
+    outcome: dict[str, Any]
+    reset_peak_memory()
+    try:
+        outcome = {"status": "converted", **convert(clock.begin)._asdict()}
+        del outcome["files"]
+    except Exception as error:  # noqa: BLE001 One scan must never end the others.
         is_foreseen = isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)
         outcome = {
             "status": "failed",
@@ -88,7 +103,7 @@ def convert_scan(job: Job) -> ScanReport:
         }
     clock.begin("done")
     return ScanReport(
-        job.scan.name,
+        name,
         seconds=clock.seconds,
         peak_memory=peak_memory(),
         host=f"{platform.node()} ({os.getpid()})",

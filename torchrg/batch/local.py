@@ -7,15 +7,17 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
+from pathlib import Path
 from threading import Thread
+from typing import Any
 
 from torchrg.batch.convert import ScanReport, convert_scan
 from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.run import DirectoryLock
-from torchrg.batch.scans import Job
-from torchrg.io.files import remove_leftovers
+from torchrg.batch.scans import Task
 
-Work = Callable[[Job], ScanReport]
+Work = Callable[[Any], ScanReport]
+"""What is done with a task."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
 )
@@ -24,7 +26,7 @@ BEAT_SECONDS = 0.5
 
 
 def run_local(
-    jobs: Sequence[Job],
+    jobs: Sequence[Task],
     *,
     workers: int,
     memory_limit: int,
@@ -35,7 +37,8 @@ def run_local(
 
     A scan starts when a worker is free and the estimates of all that run stay within the limit; one
     that is larger than the limit runs alone. When a worker dies, its scan waits until all others
-    are done and is tried once more, alone. Workers end with this process, however it ends.
+    are done and is tried once more, alone. Workers end with this process, however it ends. While
+    scans are converted, the system is asked to read the files of the next ones.
 
     Args:
         jobs: The scans.
@@ -50,11 +53,11 @@ def run_local(
         shown. Closing the iterator stops the workers.
     """
     waiting = sorted(jobs, key=lambda job: -job.scan.num_points)
-    lost: list[Job] = []
+    lost: list[Task] = []
     idle: list[_Worker] = []
     busy: dict[Connection, _Worker] = {}
 
-    def start(job: Job, *, attempt: int) -> None:
+    def start(job: Task, *, attempt: int) -> None:
         worker = idle.pop() if idle else _Worker(work, lock)
         busy[worker.pipe] = worker
         worker.begin(job, attempt=attempt)
@@ -68,6 +71,8 @@ def run_local(
                     break
                 waiting.remove(job)
                 start(job, attempt=1)
+                for following in waiting[workers - 1 : workers]:
+                    read_ahead(following.scan.inputs)
             if not busy:
                 start(lost.pop(0), attempt=2)
             ready = connection.wait(busy, timeout=BEAT_SECONDS)
@@ -88,7 +93,7 @@ def run_local(
             worker.stop()
 
 
-def _next_that_fits(waiting: Sequence[Job], running: Sequence[Job], limit: int) -> Job | None:
+def _next_that_fits(waiting: Sequence[Task], running: Sequence[Task], limit: int) -> Task | None:
     """Return the first scan for which there is memory; any if nothing runs."""
     if not running:
         return next(iter(waiting), None)
@@ -96,10 +101,20 @@ def _next_that_fits(waiting: Sequence[Job], running: Sequence[Job], limit: int) 
     return next((job for job in waiting if memory_of_scan(job.scan.num_points) <= free), None)
 
 
+def read_ahead(files: Sequence[Path]) -> None:
+    """Ask the system, where it can, to have files in memory soon; it reads them on the side."""
+    if not hasattr(os, "posix_fadvise"):
+        return
+    for file in files:
+        # One that cannot be read fails where it is needed.
+        with contextlib.suppress(OSError), file.open("rb") as stream:
+            os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_WILLNEED)
+
+
 class _Worker:
     """A process that converts one scan after another, and the pipe to it."""
 
-    job: Job
+    job: Task
     attempt: int
 
     def __init__(self, work: Work, lock: DirectoryLock | None) -> None:
@@ -110,7 +125,7 @@ class _Worker:
             self.process.start()
         theirs.close()
 
-    def begin(self, job: Job, *, attempt: int) -> None:
+    def begin(self, job: Task, *, attempt: int) -> None:
         """Hand over a scan."""
         self.job, self.attempt = job, attempt
         # A worker that is dead already is noticed when its answer is collected.
@@ -145,8 +160,8 @@ class _Worker:
             self.process.kill()
             self.process.join()
         self.pipe.close()
-        if hasattr(self, "job") and self.job.folder.is_dir():
-            remove_leftovers(self.job.folder)
+        if hasattr(self, "job"):
+            self.job.remove_leftovers()
 
 
 def _serve(pipe: Connection, work: Work, lock: DirectoryLock | None) -> None:

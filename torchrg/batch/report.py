@@ -98,10 +98,11 @@ def kept_report(job: Job) -> ScanReport:
     )
 
 
-def format_report(report: BatchReport) -> str:
+def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     """Return a report as text: a row for each scan, notes below, then the sums.
 
-    With more than :data:`MOST_ROWS` scans, only failures have a row.
+    With more than :data:`MOST_ROWS` scans, only failures have a row. ``unit`` is what a scan is
+    called where its number in a second counts.
     """
     stages = list(report.stage_seconds)
     shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
@@ -128,8 +129,14 @@ def format_report(report: BatchReport) -> str:
         )
         if scan.status != "failed"
     ]
-    rate = report.num_points / report.seconds if report.seconds else 0.0
-    speed = f"{report.num_points:,} points in {report.seconds:,.1f} s: {rate:,.0f} points a second"
+    points, scans = (
+        number / report.seconds if report.seconds else 0.0
+        for number in (report.num_points, len(totals))
+    )
+    speed = (
+        f"{report.num_points:,} points in {report.seconds:,.1f} s: {points:,.0f} points, "
+        f"{scans:,.2f} {unit}s a second"
+    )
     return "\n".join([format_table(head, rows), *notes, speed])
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchrg.datasets import describe_planes
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
+from torchrg.io.files import remove_leftovers
 from torchrg.structures import Cloud, Segmentation
 
 
@@ -97,6 +98,22 @@ class Job:
     def folder(self) -> Path:
         """Where the results of the scan go."""
         return self.out / self.scan.name
+
+    def remove_leftovers(self) -> None:
+        """Remove what a process that was killed left half-written."""
+        if self.folder.is_dir():
+            remove_leftovers(self.folder)
+
+
+class Task(Protocol):
+    """What an engine hands to a process: a scan, and what to remove if that process is killed."""
+
+    @property
+    def scan(self) -> Scan:
+        """The scan."""
+
+    def remove_leftovers(self) -> None:
+        """Remove what a process that was killed left half-written."""
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:

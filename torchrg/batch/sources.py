@@ -239,7 +239,7 @@ class RGBDSource:
             self.root, self.layout, intrinsics=matrix, depth_scale=self.depth_scale
         )
         return [
-            Scan(frame.name, (frame.depth, *frame.sources), _num_pixels(frame.depth), _plain(frame))
+            Scan(frame.name, (frame.depth, *frame.sources), num_pixels(frame.depth), _plain(frame))
             for frame in data.frames
         ]
 
@@ -265,7 +265,7 @@ class RGBDSource:
         return Converted(num_points, num_planes, tuple(files), warnings=notes)
 
 
-def _num_pixels(path: Path) -> int:
+def num_pixels(path: Path) -> int:
     """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage."""
     if path.suffix.lower() != ".png":
         return path.stat().st_size // 2

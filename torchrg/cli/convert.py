@@ -1,14 +1,12 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
-import os
-import signal
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, ClassVar, Literal, NoReturn
 
 import tyro
 from tqdm import tqdm
@@ -64,6 +62,8 @@ class Arguments:
     """Convert what is done already, too."""
     dry_run: bool = False
     """Say what would be done and why, and write nothing."""
+    unit: ClassVar[str] = "scan"
+    """What one of them is called."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the data set, both paths absolute."""
@@ -122,6 +122,7 @@ class RGBDArguments(Arguments):
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
+    unit: ClassVar[str] = "frame"
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
@@ -170,7 +171,7 @@ def run(argv: list[str]) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FormatError(f"{out}: cannot be made: {error.strerror or error}.") from error
-    with DirectoryLock(out) as lock, _terminate_as_interrupt():
+    with DirectoryLock(out) as lock, console.terminate_as_interrupt():
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
 
 
@@ -194,7 +195,9 @@ def _pages_of(arguments: Arguments) -> Path | None:
 def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
     """Find out what is to be done, with a progress bar where files are many."""
     with tqdm(total=len(jobs), desc="looking", unit="scan", leave=False, disable=None) as bar:
-        return make_plan(jobs, force=arguments.force, threads=_num_cores(), on_scan=bar.update)
+        return make_plan(
+            jobs, force=arguments.force, threads=console.num_cores(), on_scan=bar.update
+        )
 
 
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
@@ -210,21 +213,23 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
                 f"{limit / 1e9:.1f} GB; it runs alone."
             )
     if arguments.engine == "local":
-        workers = min(workers or _num_cores(), max(len(jobs), 1))
+        workers = min(workers or console.num_cores(), max(len(jobs), 1))
         reports: Reports = run_local(jobs, workers=workers, memory_limit=limit, lock=lock)
     else:
         from torchrg.batch.ray_tasks import run_ray
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
-    total = sum(job.scan.num_points for job in jobs)
+    by_frames = arguments.unit == "frame"
+    sizes = {job.scan.name: 1 if by_frames else job.scan.num_points for job in jobs}
+    unit, total = "frame" if by_frames else "pt", sum(sizes.values())
     # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
-    with tqdm(total=total, unit="pt", unit_scale=True, smoothing=0, disable=None) as bar:
-        shown, engine = _Progress(bar, plan), arguments.engine
+    with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
+        shown, engine = _Progress(bar, sizes, unit=arguments.unit), arguments.engine
         report = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
-    return _finish(report, out)
+    return _finish(report, out, unit=arguments.unit)
 
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
@@ -256,11 +261,10 @@ def _read_result(folder: Path) -> Cloud:
 
 
 class _Progress:
-    """A progress bar that moves by points and counts scans."""
+    """A progress bar that counts scans and moves by points, or by frames where those are scans."""
 
-    def __init__(self, bar: "tqdm[NoReturn]", plan: Plan) -> None:
-        self.bar = bar
-        self.sizes = {job.scan.name: job.scan.num_points for job in plan.to_convert}
+    def __init__(self, bar: "tqdm[NoReturn]", sizes: Mapping[str, int], *, unit: str) -> None:
+        self.bar, self.sizes, self.unit = bar, sizes, unit
         self.num_done = self.num_failed = 0
 
     def __call__(self, report: ScanReport | None) -> None:
@@ -270,12 +274,12 @@ class _Progress:
             self.num_failed += report.status == "failed"
             self.bar.update(self.sizes[report.name])
         failed = f", {self.num_failed} failed" if self.num_failed else ""
-        self.bar.set_description_str(f"{self.num_done}/{len(self.sizes)} scans{failed}")
+        self.bar.set_description_str(f"{self.num_done}/{len(self.sizes)} {self.unit}s{failed}")
 
 
-def _finish(report: BatchReport, out: Path) -> int:
+def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     """Write and print the report, and return the exit code."""
-    print(format_report(report))
+    print(format_report(report, unit=unit))
     for scan in report.with_status("failed"):
         console.fail(f"{scan.name}: {scan.reason}")
     num_done = len(report.with_status("converted")) + len(report.with_status("kept"))
@@ -300,11 +304,6 @@ def _finish(report: BatchReport, out: Path) -> int:
     return 0
 
 
-def _num_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextmanager
 def _warnings_as_lines() -> Iterator[None]:
     """Print warnings as single lines."""
@@ -313,13 +312,3 @@ def _warnings_as_lines() -> Iterator[None]:
         yield
     for warning in caught:
         console.warn(str(warning.message))
-
-
-@contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send, end the command as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -2,19 +2,20 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.config import DepthConfig, GrowingConfig
-from torchrg.depth.normals import PixelPlanes, moved
-from torchrg.linalg import unsigned_angle_deg
+from torchrg.config import DepthConfig
+from torchrg.depth.normals import PixelPlanes
+from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
-from torchrg.regions import grow_regions
 from torchrg.regions.adjacency import contact_neighbors
 from torchrg.regions.growth import number_by_size
-from torchrg.regions.planes import FittedPlanes, fit_planes
-from torchrg.regions.refine import absorb_points, merge_coplanar, reach_of_planes
-from torchrg.structures import Neighbors
+from torchrg.regions.planes import FittedPlanes
+from torchrg.regions.refine import merge_coplanar, reach_of_planes
+from torchrg.robust.scale import MAD_FACTOR
+from torchrg.structures import UNLABELED, Neighbors
 
 _AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Steps in rows and columns to the pixels around one, the nearest first."""
@@ -23,10 +24,28 @@ _NUM_PASSES = 2
 """Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
 
 _CURVED = 3.0
-"""A region this many times thicker than its noise is no plane."""
+"""A region this many times thicker than its noise is no plane,"""
+
+_BENT = 0.03
+"""if it is also thicker than this share of its own extent: a slightly bent face is a face. A column
+has 0.4."""
+
+_NUM_FITS = 2
+"""A plain fit and a reweighted one: pixels that grew into a region are near its plane already."""
+
+_BISQUARE_CUT = 4.685
+"""Pixels this many standard deviations from a region's plane have no weight in it."""
+
+_ALIKE = 1.75
+"""Normals of two windows that both hold both pixels may differ by this many times the angle: on a
+column large windows turn by more than the angle from one cell to the next,"""
+
+_SLOPE_NOISE = 1.0
+"""or by as much as makes their slopes differ by this many standard deviations: small windows of a
+narrow face turn by noise alone."""
 
 _MOST_MOVES = 16
-"""In pixels: no window reaches farther from its middle."""
+"""In pixels: windows hardly reach farther from their middle."""
 
 _STRAIGHT = 0.85
 """Cosine of the largest angle between a step straight away from a crease and one that counts."""
@@ -36,13 +55,12 @@ class InverseCloud(NamedTuple):
     """A depth image as a cloud where planes stay planes and noise is the same near and far.
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
-    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are of float64,
-    ``normals`` those of the pixels' planes in this cloud, ``noise`` ``(H * W,)`` is the standard
-    deviation of the last coordinate, and ``seen`` are the pixels with depth.
+    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are of float64, in
+    columns; ``noise`` ``(H * W,)`` is the standard deviation of the last coordinate, and ``seen``
+    ``(H, W)`` are the pixels with depth.
     """
 
     points: Tensor
-    normals: Tensor
     noise: Tensor
     seen: Tensor
 
@@ -57,79 +75,93 @@ def grow_pixels(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Grow regions over a depth image, and give border pixels and parts of one face to them.
 
-    Two pixels side by side are neighbours if both have a flat window, their normals in space
+    Two pixels side by side are on one surface if both have a flat window, their normals in space
     ``(H, W, 3)`` are within the angle, and at both pixels their two planes differ by at most
-    ``max_step`` times the noise: no neighbourhood crosses a step. :func:`torchrg.grow_regions`
-    grows along them, from the pixels with the flattest large windows.
+    ``max_step`` times what a flat window may deviate by: no region crosses a step. Where both
+    windows hold both pixels the angle may be larger: a crease between the pixels would lie within
+    two flat windows. Regions are what hangs together by such pairs.
 
     ``u`` ``(W,)`` and ``v`` ``(H, 1)`` count columns and rows from the optical axis.
 
     Returns:
         Labels ``(H * W,)``, 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; unit normals
         of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
-        thicker than noise can make it, ``(M,)``, bool.
+        thicker than noise and a slight bend can make it, ``(M,)``, bool.
     """
-    joined = [_joins(pixels, normals, u, v, step, config) for step in _AROUND]
-    size = pixels.radius.clamp(min=1).double()
-    roughness = (pixels.planes.deviation / pixels.noise) / (size * size)
-    labels = grow_regions(
-        cloud.points,
-        cloud.normals,
-        torch.where(pixels.flat, roughness, 0.0).flatten(),
-        _neighbors(joined),
-        GrowingConfig(
-            max_angle_deg=90.0,
-            curvature_quantile=1.0,
-            seed_rule="curvature",
-            connectivity=None,
-            coplanarity=False,
-            min_size=config.min_size,
-        ),
-        valid=pixels.flat.flatten(),
-        canonical=True,
-    )
+    down, right = (_joins(pixels, normals, u, v, axis, config) for axis in (0, 1))
+    labels = number_by_size(_connected(pixels.flat, down, right), config.min_size)
     if not bool((labels >= 0).any()):
         return labels, normals.new_empty(0, 3), pixels.flat.new_empty(0)
-    image = cloud.seen.view(pixels.flat.shape)
-    touching = _neighbors([image & moved(image, step, fill=False) for step in _AROUND])
-    labels, fit = _refine(cloud, labels, touching, config)
+    labels, fit = _refine(cloud, labels, config)
     distance = (fit.normal * fit.center).sum(dim=1)
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
-    away = torch.where(fit.normal[:, 2:] < 0, -away, away)
     return labels, -away / away.norm(dim=1, keepdim=True), fit.curved
 
 
 def _joins(
-    pixels: PixelPlanes,
-    normals: Tensor,
-    u: Tensor,
-    v: Tensor,
-    step: tuple[int, int],
-    config: DepthConfig,
+    pixels: PixelPlanes, normals: Tensor, u: Tensor, v: Tensor, axis: int, config: DepthConfig
 ) -> Tensor:
-    """Return whether each pixel and the one a step away are on one surface, shape ``(H, W)``."""
-    theirs = type(pixels.planes)(*(moved(part, step, fill=0.0) for part in pixels.planes))
-    down, right = step
-    limit = config.max_step * pixels.noise
-    here = (pixels.planes.at(u, v) - theirs.at(u, v)).abs() <= limit
-    there_u, there_v = u + right, v + down
-    there = (pixels.planes.at(there_u, there_v) - theirs.at(there_u, there_v)).abs() <= limit
-    angle = unsigned_angle_deg(normals, moved(normals, step, fill=0.0))
-    both = pixels.flat & moved(pixels.flat, step, fill=False)
-    return both & here & there & (angle <= config.max_angle_deg)
+    """Return whether pixels and the next ones along an axis are on one surface, one place less.
+
+    Pixels of one window are: only the pairs of two windows are looked at.
+    """
+    width, length = pixels.flat.shape[1], pixels.flat.shape[axis] - 1
+    joins = pixels.flat.narrow(axis, 0, length) & pixels.flat.narrow(axis, 1, length)
+    one_window = pixels.window.narrow(axis, 0, length) == pixels.window.narrow(axis, 1, length)
+    rows, columns = (joins & ~one_window).nonzero().unbind(dim=1)
+    here = rows * width + columns
+    there = here + (width if axis == 0 else 1)
+    first, second = pixels.planes.take(here), pixels.planes.take(there)
+    u_slope, v_slope = first.u_slope - second.u_slope, first.v_slope - second.v_slope
+    step = u_slope * u[columns] + v_slope * v.flatten()[rows] + first.origin - second.origin
+    next_step = step + (v_slope if axis == 0 else u_slope)
+    tolerance = pixels.tolerance.flatten()
+    limit = config.max_step * torch.maximum(tolerance[here], tolerance[there])
+    own, theirs = (normals.view(-1, 3)[at][:, :, None].unbind(dim=1) for at in (here, there))
+    turned = sq_chords(own, theirs).squeeze(1)
+    accepted = turned <= deg_to_sq_chord(config.max_angle_deg)
+    wider = deg_to_sq_chord(min(_ALIKE * config.max_angle_deg, 90.0))
+    sq_noise = pixels.sq_slope_noise(here) + pixels.sq_slope_noise(there)
+    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
+    alike |= turned <= wider
+    accepted |= alike & pixels.holds(here, there) & pixels.holds(there, here)
+    joins[rows, columns] = accepted & (step.abs() <= limit) & (next_step.abs() <= limit)
+    return joins
 
 
-def _neighbors(joined: list[Tensor]) -> Neighbors:
-    """Return the pixels around each pixel, itself first, from which of them count, ``(H, W)``."""
-    first = joined[0]
-    rows = torch.arange(first.numel(), dtype=torch.int32, device=first.device).view(first.shape)
-    indices = torch.stack([rows, *(moved(rows, step, fill=0) for step in _AROUND)], dim=-1)
-    counted = torch.stack([torch.ones_like(first), *joined], dim=-1)
-    return Neighbors(indices.view(-1, 9), counted.view(-1, 9))
+def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
+    """Return the parts of an image that hang together ``(H * W,)``, -1 where it is not flat.
+
+    From which pixels join the next one, ``(H - 1, W)`` and ``(H, W - 1)``. On a grid with a place
+    for each pixel and each pair they are the connected components of scipy.
+    """
+    from scipy.ndimage import label
+
+    height, width = flat.shape
+    grid = np.zeros((2 * height - 1, 2 * width - 1), dtype=bool)
+    grid[::2, ::2], grid[1::2, ::2], grid[::2, 1::2] = (
+        part.cpu().numpy() for part in (flat, down, right)
+    )
+    parts = label(grid)[0][::2, ::2].astype(np.int64)
+    return torch.from_numpy(parts.ravel() - 1).to(flat.device)
+
+
+def _pixels_around(seen: Tensor) -> Neighbors:
+    """Return the pixels around each pixel, itself first; those with depth around such count."""
+    height, width = seen.shape
+    rows = torch.arange(height * width, device=seen.device).view(height, width)
+    wide = torch.nn.functional.pad(seen, (1, 1, 1, 1))
+    indices = torch.empty(height, width, 9, dtype=torch.int64, device=seen.device)
+    counted = torch.empty_like(indices, dtype=torch.bool)
+    for column, (down, right) in enumerate([(0, 0), *_AROUND]):
+        indices[..., column] = rows + (down * width + right)
+        counted[..., column] = wide[1 + down :, 1 + right :][:height, :width] & seen
+    last = max(height * width - 1, 0)
+    return Neighbors(indices.clamp_(0, last).view(-1, 9), counted.view(-1, 9))
 
 
 def _refine(
-    cloud: InverseCloud, labels: Tensor, touching: Neighbors, config: DepthConfig
+    cloud: InverseCloud, labels: Tensor, config: DepthConfig
 ) -> tuple[Tensor, FittedPlanes]:
     """Settle borders and parts of the regions of a depth image.
 
@@ -137,22 +169,14 @@ def _refine(
     regions that touch and lie on one plane are merged. Then borders between regions move to the
     lines where their planes meet.
 
-    At least one pixel has a label; ``touching`` are the pixels with depth around each pixel, itself
-    first. Returns labels by descending size, and the planes of the regions in the cloud; curved are
-    those thicker than noise can make them.
+    At least one pixel has a label. Returns labels by descending size, and the planes of the regions
+    in the cloud; curved are those thicker than noise and a slight bend can make them.
     """
+    touching = _pixels_around(cloud.seen)
     for _ in range(_NUM_PASSES):
         fit, noise = _fit(cloud, labels)
-        labels = absorb_points(
-            cloud.points,
-            cloud.normals,
-            labels,
-            touching,
-            (fit.normal, fit.center, reach_of_planes(fit, noise, config.absorb_reach)),
-            valid=cloud.seen,
-            max_angle_deg=90.0,
-        )
-        fit, noise = _fit(cloud, labels)
+        reach = reach_of_planes(fit, noise, config.absorb_reach)
+        labels = absorb_pixels(cloud, labels, touching, fit, reach)
         merged = merge_coplanar(labels, touching, fit, noise, tolerance=config.merge_tolerance)
         labels = number_by_size(merged, config.min_size)
     fit, noise = _fit(cloud, labels)
@@ -165,9 +189,91 @@ def _refine(
 def _fit(cloud: InverseCloud, labels: Tensor) -> tuple[FittedPlanes, Tensor]:
     """Return the planes of the regions, and the noise of each, shape ``(M,)``."""
     segments = Segments(labels)
-    fit = fit_planes(segments, cloud.points, cloud.normals)
-    noise = segments.median(segments.take(cloud.noise))
-    return fit._replace(curved=fit.thickness > _CURVED * noise), noise
+    noise = segments.mean(segments.take(cloud.noise))
+    return fit_regions(segments, cloud.points, noise), noise
+
+
+def fit_regions(segments: Segments, points: Tensor, noise: Tensor) -> FittedPlanes:
+    """Fit planes to regions by least squares along the last coordinate, which alone has noise.
+
+    A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.planes.fit_planes` has;
+    the thickness, along the normals, is never taken for less than the ``noise`` ``(M,)`` there.
+    Curved is what is thicker than noise and a slight bend can make it.
+    """
+    columns = segments.take_columns(points)
+    x, y, w = columns
+    weights = torch.ones_like(w)
+    for last in range(_NUM_FITS):
+        total = segments.sum(weights)
+        center = torch.stack([segments.sum(column * weights) for column in columns], dim=1)
+        center = center / total[:, None]
+        about_zero = second_moments(columns, weights, segments.sum, total)
+        covariance = about_zero - center[:, :, None] * center[:, None, :]
+        inverse = torch.linalg.pinv(covariance[:, :2, :2], hermitian=True)
+        slopes = (inverse @ covariance[:, :2, 2:]).squeeze(2)
+        offset = center[:, 2] - (slopes * center[:, :2]).sum(dim=1)
+        a, b, c = segments.spread_columns(torch.cat([slopes, offset[:, None]], dim=1))
+        residuals = w - a * x - b * y - c
+        thickness = MAD_FACTOR * segments.median(residuals.abs())
+        if last == _NUM_FITS - 1:
+            break
+        ratio = residuals / segments.spread(_BISQUARE_CUT * torch.maximum(thickness, noise))
+        weights = (1 - ratio * ratio).clamp(min=0).square()
+    normal = torch.cat([-slopes, torch.ones_like(slopes[:, :1])], dim=1)
+    length = normal.norm(dim=1, keepdim=True)
+    # In the distance d of a plane from the camera, w is 1 / d of the cosine along a ray.
+    nearness = torch.cat([slopes, offset[:, None]], dim=1).norm(dim=1)
+    extent = torch.linalg.eigvalsh(covariance[:, :2, :2])[:, 0].clamp(min=0).sqrt()
+    return FittedPlanes(
+        normal / length,
+        center,
+        normal / length,
+        covariance,
+        thickness / length.squeeze(1),
+        residuals,
+        segments.counts,
+        thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
+    )
+
+
+def absorb_pixels(
+    cloud: InverseCloud, labels: Tensor, touching: Neighbors, fit: FittedPlanes, reach: Tensor
+) -> Tensor:
+    """Give pixels without a region to regions they touch, until none can be given.
+
+    This is :func:`torchrg.regions.refine.absorb_points` without an angle, where whoever is beside a
+    pixel has it beside itself: after the first time, only pixels beside those that joined are
+    looked at. ``reach`` ``(M,)`` is that of the planes, NaN where a region takes none.
+    """
+    around, counted = contact_neighbors(touching)
+    labels, offset = labels.clone(), (fit.normal * fit.center).sum(dim=1)
+    free = (labels == UNLABELED) & cloud.seen.flatten()
+    rows = free.nonzero().squeeze(1)
+    while len(rows):
+        near = torch.where(counted[rows], labels[around[rows]], UNLABELED)
+        touches = (near >= 0).any(dim=1)
+        rows, near = rows[touches], near[touches]
+        region = near.clamp(min=0)
+        away = (cloud.points[rows][:, None] * fit.normal[region]).sum(dim=2) - offset[region]
+        away = torch.where((near >= 0) & (away.abs() <= reach[region]), away.abs(), torch.inf)
+        least = away.amin(dim=1, keepdim=True)
+        joined = least.squeeze(1).isfinite()
+        choice = torch.where(away == least, near, len(offset)).amin(dim=1)
+        rows = rows[joined]
+        labels[rows] = choice[joined]
+        free[rows] = False
+        rows = torch.unique(around[rows])
+        rows = rows[free[rows]]
+    return labels
+
+
+def _at_borders(labels: Tensor, around: Tensor, counted: Tensor) -> Tensor:
+    """Return the rows of pixels with a region that have another beside them."""
+    other = torch.zeros_like(labels, dtype=torch.bool)
+    for column in range(around.shape[1]):
+        near = labels[around[:, column]]
+        other |= (near >= 0) & (near != labels) & counted[:, column]
+    return (other & (labels >= 0)).nonzero().squeeze(1)
 
 
 def move_to_creases(
@@ -190,7 +296,7 @@ def move_to_creases(
     around, counted = contact_neighbors(touching)
     rays = torch.cat([points[:, :2], torch.ones_like(points[:, :1])], dim=1)
     labels = labels.clone()
-    rows = (labels >= 0).nonzero().squeeze(1)
+    rows = _at_borders(labels, around, counted)
     for _ in range(_MOST_MOVES):
         near = labels[around[rows]]
         other = counted[rows] & (near >= 0) & (near != labels[rows][:, None])

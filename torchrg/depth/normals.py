@@ -1,9 +1,10 @@
 """The plane at each pixel of a depth image: square windows, their noise, the largest flat one.
 
-Planes through all windows of a size are fitted at once, from running sums.
+Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows stand a cell
+apart, so that the sums over all large ones together cost less than those over the smallest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,16 +12,26 @@ from torch import Tensor
 
 from torchrg.linalg import machine_epsilon
 
-RADII = (16, 8, 4, 2)
-"""Radii of the windows, the largest first."""
+CELL_SIZES = (8, 4, 2, 1)
+"""Widths of the cells in pixels, the largest first."""
+_REACH = 2
+"""A window reaches over so many cells around its middle one."""
+_SIDE = 2 * _REACH + 1
+"""Cells along a side of a window."""
 _FLAT = 1.35
-"""A flat window deviates from its plane by at most this many times the noise."""
+"""A flat window deviates from its plane by at most this many times the tolerance."""
 _OWN_REACH = 3.5
 """A pixel is on the plane of a window within this many times the noise."""
 _SAME_NOISE = 2.0
 """A flat window deviates by at most this over its side in pixels more than its quarters do."""
 _LEAST_QUARTERS = 0.7
-"""Quarters count as if they deviated by this many times the noise at least."""
+"""Quarters count as if they deviated by this many times the tolerance at least."""
+_BEND = 0.005
+"""A flat window may bend by this share of half its side, however little noise there is."""
+_MOST_BEND = 0.03
+"""A smallest window by this, where none is flat: twice as much would hide creases of 20 degrees."""
+_STEEPEST = 4.0
+"""Surfaces seen at a cosine below the inverse of this may not bend: there a step looks like one."""
 _LEAST_SHARE = 0.4
 """A window with fewer of its pixels seen has no plane."""
 _LEAST_SPREAD = 0.2
@@ -39,44 +50,70 @@ _LEAST_ROUNDING = 1e-7
 
 
 class WindowPlanes(NamedTuple):
-    """Planes ``value = u_slope * u + v_slope * v + origin`` of the windows around all pixels.
+    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows.
 
     ``deviation`` is the standard deviation of a window's pixels from its plane, infinite where
-    there is none. All are of shape ``(H, W)``.
+    there is none, ``mean`` their mean value. All are of one shape, ``(h, w)`` for the windows
+    around the cells of an image.
     """
 
     u_slope: Tensor
     v_slope: Tensor
     origin: Tensor
     deviation: Tensor
+    mean: Tensor
 
-    def at(self, u: Tensor, v: Tensor) -> Tensor:
-        """Return the values of the planes at coordinates that broadcast to ``(H, W)``."""
-        return self.u_slope * u + self.v_slope * v + self.origin
-
-    def take(self, pixels: Tensor) -> "WindowPlanes":
-        """Return for each pixel the plane of another one, given by its row-major place."""
-        return WindowPlanes(*(part.flatten()[pixels] for part in self))
-
-    def where(self, chosen: Tensor, other: "WindowPlanes") -> "WindowPlanes":
-        """Return these planes where chosen, else those of another image."""
-        return WindowPlanes(*(torch.where(chosen, a, b) for a, b in zip(self, other, strict=True)))
+    def take(self, places: Tensor) -> "WindowPlanes":
+        """Return those at some row-major places."""
+        return WindowPlanes(*(part.flatten()[places] for part in self))
 
 
 class PixelPlanes(NamedTuple):
-    """A plane in inverse depth for each pixel.
+    """A plane in inverse depth for each pixel: that of a window.
 
-    The planes are in columns and rows from the optical axis. ``radius`` is that of the window each
-    comes from, 0 where there is none; ``flat`` tells whether that window is flat, ``edge`` whether
-    it is but could not lie around the pixel; ``noise`` is the standard deviation of inverse depth,
-    as large windows see it. All are of shape ``(H, W)``.
+    The planes are in columns and rows from the optical axis. ``window`` tells pixels of one window
+    from those of others, ``side`` is its side in pixels, and ``middle`` ``(2, H, W)`` row and
+    column of its middle. ``valid`` tells which pixels have a plane, ``flat`` whether their window
+    is flat, ``edge`` whether it is but could not lie around the pixel; ``noise`` is the standard
+    deviation of inverse depth, as large windows see it, and ``tolerance`` what a flat window may
+    deviate by. All others are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes
-    radius: Tensor
+    window: Tensor
+    side: Tensor
+    middle: Tensor
+    valid: Tensor
     flat: Tensor
     edge: Tensor
     noise: Tensor
+    tolerance: Tensor
+
+    def sq_slope_noise(self, pixels: Tensor) -> Tensor:
+        """Return the variance of the slopes of the windows of some pixels, by row-major place.
+
+        That of least squares over n^2 pixels of variance (n^2 - 1) / 12 along either axis.
+        """
+        side = self.side.flatten()[pixels]
+        return 12 * (self.tolerance.flatten()[pixels] / (side * side)).square()
+
+    def holds(self, pixels: Tensor, others: Tensor) -> Tensor:
+        """Return whether the windows of some pixels hold others, all by row-major place."""
+        width = self.window.shape[1]
+        row, column = (part.flatten()[pixels] for part in self.middle)
+        away = torch.maximum((others // width - row).abs(), (others % width - column).abs())
+        return away <= self.side.flatten()[pixels] / 2
+
+
+class _Tolerances(NamedTuple):
+    """What windows of one size may deviate by, each of shape ``(h, w)``.
+
+    By noise alone, by noise or a slight bend, and by the strongest bend.
+    """
+
+    noise: Tensor
+    flat: Tensor
+    most: Tensor
 
 
 def fit_pixels(
@@ -85,6 +122,7 @@ def fit_pixels(
     u: Tensor,
     v: Tensor,
     *,
+    focal: tuple[float, float],
     noise: tuple[float, float] | None,
     dtype: torch.dtype,
 ) -> PixelPlanes:
@@ -93,15 +131,16 @@ def fit_pixels(
     In inverse depth ``w = 1 / z`` a plane of space is a plane over the image [1],
     ``w = (n_x x + n_y y + n_z) / d`` with the ray ``(x, y, 1)``, and the noise of a triangulating
     sensor is the same everywhere, so that plain least squares is right. A window is flat when it
-    deviates from its plane by hardly more than the noise, and than its four quarters do from planes
-    of their own; one across a step or an edge is not. For each radius, the largest first, a pixel
-    takes the window around itself if that is flat; else the flattest window that holds it [2]; in
-    both cases only if the pixel itself is on the plane. Pixels in no flat window take the smallest
-    around them.
+    deviates from its plane by hardly more than the noise, or than a slight bend, and than its four
+    quarters do from planes of their own; one across a step or an edge is not. For each size, the
+    largest first, a pixel takes the window around its cell if that is flat; else the flattest
+    window that holds it [2]; in both cases only if the pixel itself is on the plane. Where none is
+    flat but the smallest is smooth, as on a column without noise, it takes that. Pixels in no flat
+    window have the smallest around them.
 
     ``inverse`` ``(H, W)``, float64, is anything finite where not ``seen``; columns ``u`` ``(W,)``
-    and rows ``v`` ``(H, 1)`` count from the optical axis; ``noise`` is that of
-    :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
+    and rows ``v`` ``(H, 1)`` count from the optical axis; ``focal`` are the focal lengths along
+    both, ``noise`` is that of :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
 
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban
@@ -109,63 +148,226 @@ def fit_pixels(
         [2] M. Kuwahara et al. Processing of RI-angiocardiographic images. Digital Processing of
         Biomedical Images, 1976.
     """
-    windows = {radius: fit_windows(inverse, seen, u, v, radius) for radius in RADII}
-    levels = noise_by_radius(windows, inverse, seen, noise, dtype)
-    smallest = windows[RADII[-1]]
-    chosen, flat = smallest, torch.zeros_like(seen)
-    edge, radius = torch.zeros_like(seen), torch.zeros_like(seen, dtype=torch.int64)
-    radius[seen & smallest.deviation.isfinite()] = RADII[-1]
-    for size in RADII:
-        around, level = windows[size], levels[size]
-        relative = torch.where(seen, around.deviation / level, torch.inf)
-        if size // 2 in windows:
-            quarters = _deviation_of_quarters(windows[size // 2].deviation, size // 2)
-            # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
-            usual = torch.maximum(quarters * (level / levels[size // 2]), _LEAST_QUARTERS * level)
-            same = around.deviation <= (1 + _SAME_NOISE / (2 * size + 1)) * usual
-            relative = torch.where(same, relative, torch.inf)
-        least, places = least_in_windows(relative, size)
-        for planes, ratio, beside in (
-            (around, relative, False),
-            (around.take(places), least, True),
-        ):
-            near = (inverse - planes.at(u, v)).abs() <= _OWN_REACH * level
-            new = seen & ~flat & near & (ratio <= _FLAT)
-            chosen = planes.where(new, chosen)
-            radius[new] = size
-            edge |= new & beside
-            flat |= new
-    return PixelPlanes(chosen, radius, flat, edge, levels[RADII[0]])
+    planes = fit_windows(inverse, seen, u, v)
+    noises = noise_by_size(planes, noise, dtype)
+    windows, first = dict[int, _SizedWindows](), 0
+    for size, found in planes.items():
+        limit = _tolerances(found, noises[size], size, focal)
+        windows[size] = _SizedWindows(size, first, found, noises[size], limit)
+        first += found.mean.numel()
+    choice = _Choice(inverse, seen, u, v)
+    for size in CELL_SIZES:
+        _offer_windows(choice, windows[size], windows.get(size // 2))
+    return _pixel_planes(choice, seen, windows.values(), noises[CELL_SIZES[0]].at(inverse))
 
 
-def _deviation_of_quarters(deviation: Tensor, reach: int) -> Tensor:
-    """Return the root mean square deviation of the four windows around a place; inf without any."""
-    squares, count = torch.zeros_like(deviation), torch.zeros_like(deviation)
-    for step in ((-reach, -reach), (-reach, reach), (reach, -reach), (reach, reach)):
-        part = moved(deviation, step, fill=torch.inf)
-        squares += torch.where(part.isfinite(), part * part, 0.0)
-        count += part.isfinite()
+class _SizedWindows(NamedTuple):
+    """The windows of one size; they are numbered through all sizes, these from ``first`` on."""
+
+    size: int
+    first: int
+    planes: WindowPlanes
+    noise: "WindowNoise"
+    limit: _Tolerances
+
+
+def _offer_windows(
+    choice: "_Choice", windows: _SizedWindows, quarters: _SizedWindows | None
+) -> None:
+    """Offer pixels the flat windows of a size; the smallest has no ``quarters``."""
+    limit, deviation = windows.limit, windows.planes.deviation
+    relative = _flatness(windows, quarters)
+    own = torch.arange(relative.numel(), device=relative.device).view(relative.shape)
+    choice.offer(windows, torch.where(relative <= _FLAT, own, -1), _OWN_REACH * limit.flat)
+    if quarters is None:
+        smooth = torch.where(deviation <= limit.most, own, -1)
+        choice.offer(windows, smooth, torch.full_like(deviation, torch.inf))
+    least, places = least_in_windows(relative, _REACH)
+    reach = torch.maximum(_OWN_REACH * limit.noise, limit.flat)
+    choice.offer(windows, torch.where(least <= _FLAT, places, -1), reach, beside=True)
+
+
+def _flatness(windows: _SizedWindows, quarters: _SizedWindows | None) -> Tensor:
+    """Return what windows deviate by in units of the tolerance; inf if their quarters do less."""
+    limit, deviation = windows.limit, windows.planes.deviation
+    relative = deviation / limit.flat
+    if quarters is None:
+        return relative
+    usual = _deviation_of_quarters(quarters.planes.deviation, relative.shape)
+    # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
+    usual = usual * (limit.noise / quarters.noise.at(windows.planes.mean))
+    usual = torch.maximum(usual, _LEAST_QUARTERS * limit.flat)
+    same = deviation <= (1 + _SAME_NOISE / (_SIDE * windows.size)) * usual
+    return torch.where(same, relative, torch.inf)
+
+
+class _Choice:
+    """The window that each pixel of an image takes, numbered through all windows of all sizes.
+
+    Pixels that have none are offered one after the other, and keep the first that they are on.
+    """
+
+    def __init__(self, inverse: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> None:
+        self.shape = inverse.shape
+        self._values = inverse.flatten()
+        self._u, self._v = (place.expand_as(inverse).flatten() for place in (u, v))
+        self.window = torch.arange(inverse.numel(), device=inverse.device)
+        self.flat = torch.zeros_like(self.window, dtype=torch.bool)
+        self.edge = torch.zeros_like(self.flat)
+        self._waiting = seen.flatten().nonzero().squeeze(1)
+
+    def take(self, images: Sequence[Tensor]) -> Tensor:
+        """Return the values of the pixels' windows ``(H, W)`` from those of each size."""
+        return torch.cat([part.flatten() for part in images])[self.window].view(self.shape)
+
+    def offer(
+        self, windows: _SizedWindows, places: Tensor, reach: Tensor, *, beside: bool = False
+    ) -> None:
+        """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
+
+        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; ``beside`` tells
+        that the windows are not around the cells.
+        """
+        width, size, waiting = self.shape[1], windows.size, self._waiting
+        cells = (waiting // width // size) * places.shape[1] + waiting % width // size
+        chosen = places.flatten()[cells]
+        has = (chosen >= 0).nonzero().squeeze(1)
+        pixels, chosen = waiting[has], chosen[has]
+        plane = windows.planes.take(chosen)
+        value = plane.u_slope * self._u[pixels] + plane.v_slope * self._v[pixels] + plane.origin
+        near = (self._values[pixels] - value).abs() <= reach.flatten()[chosen]
+        taken = pixels[near]
+        self.window[taken] = chosen[near] + windows.first
+        self.flat[taken] = True
+        self.edge[taken] = beside
+        self._waiting = waiting[~self.flat[waiting]]
+
+
+def _pixel_planes(
+    choice: _Choice, seen: Tensor, windows: Iterable[_SizedWindows], noise: Tensor
+) -> PixelPlanes:
+    """Return the planes of the windows that pixels chose."""
+    sizes = list(windows)
+    table = zip(*(part.planes for part in sizes), strict=True)
+    planes = WindowPlanes(*(choice.take(part) for part in table))
+    tolerance = choice.take([part.limit.flat for part in sizes])
+    side = choice.take([torch.full_like(w.planes.mean, _SIDE * w.size) for w in sizes])
+    middles = zip(*(_middles(part) for part in sizes), strict=True)
+    flat = choice.flat.view(choice.shape)
+    is_smooth = flat & (planes.deviation > _FLAT * tolerance)
+    tolerance = torch.where(is_smooth, planes.deviation, torch.maximum(tolerance, noise))
+    return PixelPlanes(
+        planes,
+        choice.window.view(choice.shape),
+        side,
+        torch.stack([choice.take(part) for part in middles]),
+        flat | (seen & planes.deviation.isfinite()),
+        flat,
+        choice.edge.view(choice.shape),
+        noise,
+        tolerance,
+    )
+
+
+def _middles(windows: _SizedWindows) -> tuple[Tensor, Tensor]:
+    """Return row and column of the middle pixel of each window, each ``(h, w)``."""
+    mean, size = windows.planes.mean, windows.size
+    row, column = (
+        torch.arange(length, device=mean.device, dtype=mean.dtype) * size + (size - 1) / 2
+        for length in mean.shape
+    )
+    return row[:, None].expand_as(mean), column.expand_as(mean)
+
+
+def _tolerances(
+    planes: WindowPlanes, noise: "WindowNoise", size: int, focal: tuple[float, float]
+) -> _Tolerances:
+    """Return what windows of a size may deviate by.
+
+    A bend is a share of half a window's side on the surface. On a plane at a distance d from the
+    camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
+    depth is one of ``d z e`` from the plane.
+    """
+    (fx, fy), level = focal, noise.at(planes.mean)
+    sq_nearness = (
+        (planes.u_slope * fx).square() + (planes.v_slope * fy).square() + planes.origin.square()
+    )
+    is_steep = sq_nearness > (_STEEPEST * planes.mean).square()
+    half = _SIDE * size / 2 / max(abs(fx), abs(fy))
+    bend = half * torch.where(is_steep, 0.0, sq_nearness) / planes.mean
+    bend = torch.where(planes.mean > 0, bend, 0.0)
+    return _Tolerances(level, torch.maximum(level, _BEND * bend), _MOST_BEND * bend)
+
+
+def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
+    """Return the root mean square deviation of the quarters of windows ``(h, w)``; inf without any.
+
+    They are windows of half the size: the four at the corners of a window cover it exactly.
+    """
+    height, width = shape
+    corner = _SIDE
+    padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)
+    padded[_REACH : _REACH + deviation.shape[0], _REACH : _REACH + deviation.shape[1]] = deviation
+    squares, count = deviation.new_zeros(shape), deviation.new_zeros(shape)
+    for row in (0, corner):
+        for column in (0, corner):
+            part = padded[row : row + 2 * height : 2, column : column + 2 * width : 2]
+            found = part.isfinite()
+            squares += torch.where(found, part * part, 0.0)
+            count += found
     return torch.where(count > 0, squares / count, torch.inf).sqrt()
 
 
-def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor, radius: int) -> WindowPlanes:
-    """Fit a plane by least squares to each window of ``2 radius + 1`` pixels square.
+def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int, WindowPlanes]:
+    """Fit a plane by least squares to the window around each cell, for each size of cells.
 
     The image ``(H, W)``, float64, holds anything finite where not seen; its columns are at ``u``
-    ``(W,)``, its rows at ``v`` ``(H, 1)``. A window with too few pixels seen, or whose pixels lie
-    nearly on a line, has no plane.
+    ``(W,)``, its rows at ``v`` ``(H, 1)``. Cells begin at the first pixel, and windows are cut off
+    at the borders of the image. One with too few pixels seen, or whose pixels lie nearly on a line,
+    has no plane. Sizes ascend.
     """
     ones = seen.to(values.dtype)
     w = torch.where(seen, values, 0.0)
     mu, mv = ones * u, ones * v
-    terms = [ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w]
-    count, *sums = _window_sums(torch.stack(terms), radius)
-    mean_u, mean_v, mean_w, uu, uv, vv, uw, vw, ww = (part / count.clamp(min=1) for part in sums)
+    sums = torch.stack([ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w])
+    windows: dict[int, WindowPlanes] = {}
+    for size in sorted(CELL_SIZES):
+        if windows:
+            sums = _sums_of_wider_cells(sums)
+        windows[size] = _fit_planes(_window_sums(sums), _SIDE * size)
+    return windows
+
+
+def _sums_of_wider_cells(sums: Tensor) -> Tensor:
+    """Return the sums over cells of twice the width, ``(C, ceil(h / 2), ceil(w / 2))``."""
+    height, width = sums.shape[1:]
+    if height % 2 or width % 2:
+        sums = torch.nn.functional.pad(sums, (0, width % 2, 0, height % 2))
+    rows = sums[:, 0::2] + sums[:, 1::2]
+    return rows[..., 0::2] + rows[..., 1::2]
+
+
+def _window_sums(cells: Tensor) -> Tensor:
+    """Return the sums over the cells of windows ``(C, h, w)``, from sums over each cell."""
+    for axis in (1, 2):
+        length, total = cells.shape[axis], cells.clone()
+        for step in range(1, min(_REACH, length - 1) + 1):
+            total.narrow(axis, step, length - step).add_(cells.narrow(axis, 0, length - step))
+            total.narrow(axis, 0, length - step).add_(cells.narrow(axis, step, length - step))
+        cells = total
+    return cells
+
+
+def _fit_planes(sums: Tensor, side: int) -> WindowPlanes:
+    """Return the planes of windows with so many pixels along a side, from sums of moments."""
+    count, *moments = sums
+    share = 1 / count.clamp(min=1)
+    mean_u, mean_v, mean_w, uu, uv, vv, uw, vw, ww = (part * share for part in moments)
     uu, uv, vv = uu - mean_u * mean_u, uv - mean_u * mean_v, vv - mean_v * mean_v
     uw, vw, ww = uw - mean_u * mean_w, vw - mean_v * mean_w, ww - mean_w * mean_w
     spread = uu * vv - uv * uv
-    full = radius * (radius + 1) / 3
-    found = (count >= _LEAST_SHARE * (2 * radius + 1) ** 2) & (spread > _LEAST_SPREAD * full**2)
+    full = (side * side - 1) / 12
+    found = (count >= _LEAST_SHARE * side**2) & (spread > _LEAST_SPREAD * full**2)
     spread = torch.where(found, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
     variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
@@ -174,55 +376,43 @@ def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor, radius: int)
         v_slope,
         mean_w - u_slope * mean_u - v_slope * mean_v,
         torch.where(found, variance.sqrt(), torch.inf),
+        mean_w,
     )
 
 
-def _window_sums(images: Tensor, radius: int) -> Tensor:
-    """Return the sums over the windows around all pixels, cut off at the borders, ``(C, H, W)``.
-
-    They are differences of running sums, whose cost does not depend on the radius.
-    """
-    for axis in (1, 2):
-        length = images.shape[axis]
-        running = images.cumsum(dim=axis)
-        running = torch.cat([torch.zeros_like(running.narrow(axis, 0, 1)), running], dim=axis)
-        place = torch.arange(length, device=images.device)
-        last = (place + radius + 1).clamp(max=length)
-        first = (place - radius).clamp(min=0)
-        images = running.index_select(axis, last) - running.index_select(axis, first)
-    return images
-
-
-def least_in_windows(image: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Return the least value in the window around each pixel, and its row-major place."""
+def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Return the least value within reach of each cell along both axes, and its row-major place."""
     best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
     for axis in (1, 0):
         size, pad = [1, 1], [0, 0]
-        size[axis], pad[axis] = 2 * radius + 1, radius
+        size[axis], pad[axis] = 2 * reach + 1, reach
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
         place = place[chosen.flatten()]
     return -best[0, 0], place.view(image.shape)
 
 
-def moved(image: Tensor, step: tuple[int, int], *, fill: float) -> Tensor:
-    """Return for each pixel the value of the one a step away, ``fill`` outside, ``(H, W, *)``."""
-    result = torch.full_like(image, fill)
-    target, source = [], []
-    for length, way in zip(image.shape, step, strict=False):
-        target.append(slice(max(0, -way), max(0, length - max(0, way))))
-        source.append(slice(max(0, way), max(0, length - max(0, -way))))
-    result[tuple(target)] = image[tuple(source)]
-    return result
+class WindowNoise(NamedTuple):
+    """Noise of inverse depth ``w`` as windows of a size see it: ``factor (growth + constant w^2)``.
+
+    It is never less than ``rounding`` times the inverse depth.
+    """
+
+    factor: float
+    constant: float
+    growth: float
+    rounding: float
+
+    def at(self, inverse: Tensor) -> Tensor:
+        """Return the noise at inverse depths."""
+        least = self.rounding * inverse
+        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
+        return torch.maximum(self.factor * usual, least)
 
 
-def noise_by_radius(
-    windows: Mapping[int, WindowPlanes],
-    inverse: Tensor,
-    seen: Tensor,
-    given: tuple[float, float] | None,
-    dtype: torch.dtype,
-) -> dict[int, Tensor]:
-    r"""Return the noise of inverse depth at each pixel ``(H, W)``, for windows of each size.
+def noise_by_size(
+    windows: Mapping[int, WindowPlanes], given: tuple[float, float] | None, dtype: torch.dtype
+) -> dict[int, WindowNoise]:
+    r"""Return the noise of inverse depth as windows of each size see it.
 
     A standard deviation of ``a + b z^2`` in depth is one of ``b + a w^2`` in inverse depth
     ``w = 1 / z``. Where ``a`` and ``b`` are not given, they are fitted to what windows deviate from
@@ -231,23 +421,21 @@ def noise_by_radius(
     noise has a factor for each size. It is never less than the rounding of ``dtype``, that of the
     depth.
     """
-    rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING) * inverse
-    square = inverse * inverse
+    rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING)
     if given is not None:
         constant, growth = given
-        known = torch.maximum(growth + constant * square, rounding)
-        return dict.fromkeys(windows, known)
-    middle = sorted(windows)[len(windows) // 2 - 1]
-    constant, growth = _fit_noise(windows[middle].deviation, square, seen, rounding)
-    shape = torch.maximum(growth + constant * square, rounding)
-    noise, factor = {}, 0.0
-    for radius in sorted(windows):
-        deviation = torch.maximum(windows[radius].deviation, rounding)
-        ratios = (deviation / shape)[seen & deviation.isfinite()]
-        found = float(_low_quantile(ratios)) if len(ratios) else factor
-        factor = found if factor == 0 else min(max(found, factor), _MOST_GROWTH * factor)
-        noise[radius] = torch.maximum(factor * shape, rounding)
-    return noise
+        return dict.fromkeys(windows, WindowNoise(1.0, constant, growth, rounding))
+    middle = windows[sorted(windows)[len(windows) // 2 - 1]]
+    shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
+    noises, factor = {}, 0.0
+    for size in sorted(windows):
+        found = windows[size].deviation.isfinite()
+        deviation, mean = windows[size].deviation[found], windows[size].mean[found]
+        ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
+        usual = float(_low_quantile(ratios)) if len(ratios) else factor
+        factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
+        noises[size] = shape._replace(factor=factor)
+    return noises
 
 
 def _low_quantile(values: Tensor) -> Tensor:
@@ -255,20 +443,16 @@ def _low_quantile(values: Tensor) -> Tensor:
     return values.kthvalue(1 + int(_FLAT_QUANTILE * (len(values) - 1))).values
 
 
-def _fit_noise(
-    deviation: Tensor, square: Tensor, seen: Tensor, rounding: Tensor
-) -> tuple[float, float]:
+def _fit_noise(windows: WindowPlanes, rounding: float) -> tuple[float, float]:
     """Fit ``b + a w^2``, both not negative, to the deviations of flat windows; return a and b."""
-    used = seen & deviation.isfinite()
-    squares, order = square[used].sort()
-    deviations, least = deviation[used][order], rounding[used][order]
+    used = windows.deviation.isfinite()
+    mean, order = windows.mean[used].sort()
+    deviation = torch.maximum(windows.deviation[used][order], rounding * mean)
     bins = [part for part in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(part)]
     if not bins:
         return 0.0, 0.0
-    x = torch.stack([squares[part].mean() for part in bins])
-    q = torch.stack(
-        [torch.maximum(_low_quantile(deviations[part]), least[part[0]]) for part in bins]
-    )
+    x = torch.stack([mean[part].square().mean() for part in bins])
+    q = torch.stack([_low_quantile(deviation[part]) for part in bins])
     # Relative errors: a class whose windows are all cluttered counts little.
     p, e = x / q, 1 / q
     spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2

@@ -8,7 +8,7 @@ from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
 from torchrg.depth.camera import depth_to_points, has_depth
 from torchrg.depth.growth import InverseCloud, grow_pixels
-from torchrg.depth.normals import PixelPlanes, fit_pixels
+from torchrg.depth.normals import PixelPlanes, WindowPlanes, fit_pixels
 from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 
@@ -75,10 +75,10 @@ def segment_depth(
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double()[:, None] - cy
     x, y = (u / fx).expand_as(inverse), (v / fy).expand_as(inverse)
-    pixels = fit_pixels(inverse, seen, u, v, noise=config.noise, dtype=depth.dtype)
-    normals, distance = _normals(pixels, focal)
-    valid = seen & (pixels.radius > 0)
-    cloud = _inverse_cloud(inverse, seen, pixels, x, y, focal)
+    pixels = fit_pixels(inverse, seen, u, v, focal=focal, noise=config.noise, dtype=depth.dtype)
+    normals, distance = _normals(pixels.planes, focal)
+    valid = pixels.valid
+    cloud = _inverse_cloud(inverse, seen, pixels, x, y)
     labels, plane_normals, curved = grow_pixels(cloud, pixels, normals, u, v, config)
     curvature = torch.where(valid, _curvature(pixels, inverse, distance, x, y, focal), 0.0)
     normals = torch.where(valid[..., None], normals, 0.0).view(-1, 3)
@@ -94,20 +94,20 @@ def segment_depth(
         points = points @ pose[:3, :3].T + pose[:3, 3]
         normals = normals @ pose[:3, :3].T
     rows = seen.flatten().nonzero().squeeze(1)
-    planes = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
+    table = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),
         curvature.to(depth.dtype),
         pixels.edge,
         valid,
-        planes._replace(curved=curved),
+        table._replace(curved=curved),
     )
 
 
-def _normals(pixels: PixelPlanes, focal: tuple[float, float]) -> tuple[Tensor, Tensor]:
+def _normals(planes: WindowPlanes, focal: tuple[float, float]) -> tuple[Tensor, Tensor]:
     """Return unit normals towards the camera ``(H, W, 3)``, and the planes' distance from it."""
-    planes, (fx, fy) = pixels.planes, focal
+    fx, fy = focal
     away = torch.stack([planes.u_slope * fx, planes.v_slope * fy, planes.origin], dim=-1)
     length = away.norm(dim=-1)
     length = torch.where(length > 0, length, 1.0)
@@ -115,22 +115,12 @@ def _normals(pixels: PixelPlanes, focal: tuple[float, float]) -> tuple[Tensor, T
 
 
 def _inverse_cloud(
-    inverse: Tensor,
-    seen: Tensor,
-    pixels: PixelPlanes,
-    x: Tensor,
-    y: Tensor,
-    focal: tuple[float, float],
+    inverse: Tensor, seen: Tensor, pixels: PixelPlanes, x: Tensor, y: Tensor
 ) -> InverseCloud:
     """Return the image as the cloud that regions grow in, from the rays ``(x, y, 1)``."""
     unit = inverse[seen].median() if bool(seen.any()) else inverse.new_ones(())
-    points = torch.stack([x, y, inverse / unit], dim=-1)
-    fx, fy = focal
-    slopes = [pixels.planes.u_slope * (fx / unit), pixels.planes.v_slope * (fy / unit)]
-    normals = torch.stack([*slopes, -torch.ones_like(inverse)], dim=-1)
-    normals = (normals / normals.norm(dim=-1, keepdim=True)).view(-1, 3)
-    noise = (pixels.noise / unit).flatten()
-    return InverseCloud(points.view(-1, 3), normals, noise, seen.flatten())
+    columns = torch.stack([x.flatten(), y.flatten(), inverse.flatten() / unit])
+    return InverseCloud(columns.T, (pixels.noise / unit).flatten(), seen)
 
 
 def _curvature(
@@ -146,15 +136,15 @@ def _curvature(
     A deviation e of inverse depth is one of ``distance * z * e`` from the plane; a step of a column
     is one of ``(x_step - x_slope * z * ray) z`` along it.
     """
-    z = 1 / torch.where(inverse > 0, inverse, 1.0)
-    across = distance * z * torch.where(pixels.radius > 0, pixels.planes.deviation, 0.0)
-    ray = torch.stack([x, y, torch.ones_like(z)], dim=-1)
-    spread = pixels.radius.double() * (pixels.radius + 1) / 3
+    z, planes = 1 / torch.where(inverse > 0, inverse, 1.0), pixels.planes
+    across = distance * z * torch.where(pixels.valid, planes.deviation, 0.0)
+    spread = (pixels.side * pixels.side - 1) / 12
+    ray = x * x + y * y + 1
     along = torch.zeros_like(z)
-    slopes = (pixels.planes.u_slope, pixels.planes.v_slope)
-    for axis, (slope, length) in enumerate(zip(slopes, focal, strict=True)):
-        step = -(slope * z)[..., None] * ray
-        step[..., axis] += 1 / length
-        along += spread * z * z * (step * step).sum(dim=-1)
-    total = across * across + along
-    return (across * across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
+    for slope, length, place in ((planes.u_slope, focal[0], x), (planes.v_slope, focal[1], y)):
+        step = slope * z
+        along += step * step * ray - 2 / length * step * place + 1 / length**2
+    along *= spread * z * z
+    across *= across
+    total = across + along
+    return (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)

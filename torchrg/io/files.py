@@ -72,10 +72,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-def remove_leftovers(folder: Path) -> None:
+def remove_leftovers(folder: Path, *, of: str | None = None) -> None:
     """Remove what :func:`atomic_path` left in a folder when its process was killed.
 
-    Nothing else may be writing there. Folders in it are left alone.
+    Nothing else may be writing there, or not to the file ``of`` a name, where only its leftovers
+    are to go. Folders in it are left alone.
 
     Example:
         >>> import tempfile
@@ -87,8 +88,9 @@ def remove_leftovers(folder: Path) -> None:
         ['a.txt']
     """
     for path in folder.iterdir():
-        if _BESIDE.fullmatch(path.name):
-            path.unlink()
+        is_of = of is None or path.name.startswith(f".{Path(of).stem}.")
+        if is_of and _BESIDE.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def check_place(path: str | os.PathLike[str]) -> None:
