@@ -37,6 +37,7 @@ from torchrg.scenes import RoomLayout, Scene, build_room, make_room
 from torchrg.structures import UNLABELED
 from torchrg.transforms import partition_voxels, segment_voxels
 
+COLORS = {"torchrg": "C0", "torchrg, voxels first": "C2", "cut pursuit": "C1"}
 VOXEL = 0.03
 """Side of voxels, metres."""
 STRENGTHS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 7.0, 12.0, 20.0, 35.0)
@@ -191,10 +192,14 @@ def plot(results: dict[str, dict[str, list[dict[str, Any]]]], path: Path) -> Non
                 for run, rows in runs.items():
                     ordered = sorted(rows, key=lambda row: row["count"])
                     values = [row[name] for row in ordered]
-                    axis.semilogx([row["count"] for row in ordered], values, "o-", label=run)
+                    counts = [row["count"] for row in ordered]
+                    axis.semilogx(counts, values, "o-", label=run, color=COLORS[run])
         for axis, name in zip(axes[:, 0], SHOWN, strict=True):
             axis.set_ylabel(name.replace("_", " "))
-        axes[0, 0].legend()
+        handles = {line.get_label(): line for axis in axes[0] for line in axis.get_lines()}
+        figure.legend(
+            handles=list(handles.values()), loc="outside lower center", ncols=len(handles)
+        )
         figure.savefig(path)
         plt.close(figure)
 
