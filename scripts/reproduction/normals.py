@@ -78,7 +78,7 @@ _NOISES = (0.125, 0.25, 0.6, 1.2, 2.4)
 FULL = (
     Grid(35_000, PAPERS, _NOISES[:2], (0, 1, 2), tuple(VARIANTS)),
     Grid(35_000, PAPERS, _NOISES[2:], (0,), tuple(VARIANTS)),
-    Grid(35_000, _OTHERS, _NOISES[:2], (0,), tuple(VARIANTS)),
+    Grid(35_000, _OTHERS, _NOISES[1:2], (0,), tuple(VARIANTS)),
 )
 QUICK = (
     Grid(4000, PAPERS, (0.125, 0.25, 1.2), (0,), tuple(VARIANTS)),

@@ -166,7 +166,8 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
         >>> encode_directions(torch.tensor([[0.0, 0, 1], [1, 0, 0]])).tolist()
         [[127, 127], [254, 127]]
     """
-    size = directions.abs().sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    size = directions.abs().sum(dim=1, keepdim=True)
+    size = torch.where(size > 0, size, 1.0)
     x, y, z = (directions / size).unbind(dim=1)
     ones = torch.ones_like(x)
     folded_x = torch.where(z < 0, (1 - y.abs()) * torch.copysign(ones, x), x)
