@@ -61,7 +61,7 @@ def test_box_faces_are_found(preset):
     seg = segment_planes(points, load_config(preset))
     scores = score_labels(seg.labels, torch.from_numpy(face))
     assert scores.recall_iou50 == 1.0
-    assert len(seg.planes.count) == (7 if preset == "paper" else 6)
+    assert len(seg.planes.count) == 6
     axis, offset = seg.planes.normal[:6].abs().argmax(dim=1), seg.planes.offset[:6].round().long()
     assert torch.stack([axis, offset]).unique(dim=1).shape[1] == 6
 
