@@ -43,27 +43,26 @@ class EdgeLists(NamedTuple):
 
 def find_coded_edges(
     cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
-) -> EdgeLists:
+) -> tuple[EdgeLists, EdgeLists | None]:
     """Return all edges with targets as ``2 * row + (whether the target becomes a seed)``.
 
-    ``limit`` is that of the curvature, a scalar. Chunks of every size give the same edges.
+    With late promotion these are only the edges that do make a seed; those that merely claim their
+    target come as the second, uncoded. ``limit`` is that of the curvature, a scalar. Chunks of
+    every size give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
 
-    def find(rows: slice) -> _Edges:
+    def find(rows: slice) -> tuple[_Edges, _Edges]:
         joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
+        seeds = _become_seeds(cloud, config, rows, limit, connected)
         indices = cloud.neighbors.indices[rows]
-        target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
-        if config.seed_rule == "increment":
-            becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
-        else:
-            becomes_seed = target <= limit
-        if connected is not None and config.connectivity_scope == "seed":
-            becomes_seed &= connected
-        codes = (indices.to(torch.int32) * 2).add_(becomes_seed.to(torch.int32))
-        return _pick(codes, joins)
+        codes = (indices.to(torch.int32) * 2).add_(seeds)
+        if not config.promotes_late:
+            return _pick(codes, joins), _NO_EDGES
+        return _pick(codes, joins & seeds), _pick(indices, joins & ~seeds)
 
-    return _pack(find, cloud, spare=0, chunk_size=chunk_size)
+    edges, claims = _pack(find, cloud, spare=0, chunk_size=chunk_size)
+    return edges, claims if config.promotes_late else None
 
 
 def find_edges(
@@ -76,18 +75,33 @@ def find_edges(
     """
     shared = _shared_neighbors(cloud, config)
     spreads = cloud.curvature <= limit
-    others: dict[int, _Edges] = {}
 
-    def find(rows: slice) -> _Edges:
+    def find(rows: slice) -> tuple[_Edges, _Edges]:
         joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
         targets = cloud.neighbors.indices[rows]
-        others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
-        return _pick(targets, joins & spreads[rows, None])
+        others = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
+        return _pick(targets, joins & spreads[rows, None]), others
 
-    edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
-    targets, counts = zip(*(others[start] for start in sorted(others)), strict=True)
-    starts = np.concatenate([[0], *counts]).cumsum()
-    return edges, EdgeLists(starts, np.concatenate(targets))
+    return _pack(find, cloud, spare=spare, chunk_size=chunk_size)
+
+
+def _become_seeds(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    rows: slice,
+    limit: Tensor,
+    connected: Tensor | None,
+) -> Tensor:
+    """Tell which neighbours of some points become seeds by the edge from the point, ``(n, K)``."""
+    indices = cloud.neighbors.indices[rows]
+    target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
+    if config.seed_rule == "increment":
+        becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
+    else:
+        becomes_seed = target <= limit
+    if connected is not None and config.connectivity_scope == "seed":
+        becomes_seed &= connected
+    return becomes_seed
 
 
 def accept_edges(
@@ -146,6 +160,9 @@ class _Edges(NamedTuple):
     counts: NDArray[np.signedinteger]
 
 
+_NO_EDGES = _Edges(np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32))
+
+
 def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
     """Return the accepted ones of targets ``(n, K)``."""
     chosen = targets.reshape(-1).index_select(0, places_of(accepted)).to(torch.int32)
@@ -153,24 +170,36 @@ def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
 
 
 def _pack(
-    find: Callable[[slice], _Edges], cloud: GrowingCloud, *, spare: int, chunk_size: int
-) -> EdgeLists:
-    """Collect the edges of successive chunks, found by as many threads as torch uses."""
+    find: Callable[[slice], tuple[_Edges, _Edges]],
+    cloud: GrowingCloud,
+    *,
+    spare: int,
+    chunk_size: int,
+) -> tuple[EdgeLists, EdgeLists]:
+    """Collect two kinds of edges of successive chunks, found by as many threads as torch uses.
+
+    The first kind has the spare room behind it, and the second is taken to be few.
+    """
     num_points, k = cloud.neighbors.indices.shape
     # As long as it can get: memory that is not used is not touched.
     targets = np.empty(num_points * k + spare, dtype=np.int32)
     starts: NDArray[np.signedinteger]
     starts = np.zeros(num_points + 1, dtype=np.int32 if len(targets) < 2**31 else np.int64)
+    others = []
     chunks = chunks_of(num_points, chunk_size)
     at_once = _CHUNKS_A_THREAD * allowed_threads()
     used = 0
     for first in range(0, len(chunks), at_once):
         group = chunks[first : first + at_once]
-        for rows, edges in zip(group, map_tasks(find, group, cloud.points.device), strict=True):
+        found = map_tasks(find, group, cloud.points.device)
+        for rows, (edges, other) in zip(group, found, strict=True):
             targets[used : used + len(edges.targets)] = edges.targets
             starts[rows.start + 1 : rows.stop + 1] = used + np.cumsum(edges.counts)
             used += len(edges.targets)
-    return EdgeLists(starts, targets)
+            others.append(other)
+    counts = np.concatenate([np.zeros(1, starts.dtype), *(other.counts for other in others)])
+    other_targets = np.concatenate([other.targets for other in others])
+    return EdgeLists(starts, targets), EdgeLists(counts.cumsum(dtype=starts.dtype), other_targets)
 
 
 def checked_cloud(

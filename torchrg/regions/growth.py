@@ -26,6 +26,9 @@ from torchrg.structures import UNLABELED, Neighbors
 _LONG_QUEUE = 32
 """From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
 
+_CLAIMING_SEEDS = 2**16
+"""Seeds whose claims are gathered at a time; with 50 neighbours some 40 MB."""
+
 
 @sequential_operations()
 def grow_regions(
@@ -149,9 +152,8 @@ def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArra
     order = order[valid[order]]
     limit = _curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
     if not config.is_order_free:
-        edges = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        late = config.promotes_late
-        return _grow_first_in_first_out(edges, order, valid, promotes_late=late)
+        edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
+        return _grow_first_in_first_out(edges, order, valid, claims)
     seeds = order[curvature[order] <= limit.cpu().numpy()]
     edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
     heads = _first_to_reach(edges, seeds, len(valid))
@@ -210,87 +212,80 @@ def _grow_first_in_first_out(
     edges: EdgeLists,
     order: NDArray[np.int32],
     valid: NDArray[np.bool_],
-    *,
-    promotes_late: bool = False,
+    claims: EdgeLists | None = None,
 ) -> NDArray[np.int32]:
     """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
 
     A point belongs to the first seed in the queue that has an edge to it. Whether it becomes a seed
-    itself is a property of that edge: targets are ``2 * row + (whether it does)``. With late
-    promotion it becomes one by the first edge of its region that says so; the region is then the
-    same in whatever order its seeds are taken.
+    itself is a property of that edge: targets are ``2 * row + (whether it does)``.
+
+    With late promotion any edge of its region may make a point a seed, whichever claimed it. Then
+    the order of the queue does not matter: all edges given make seeds, and what the seeds of a
+    region only ``claim`` joins when they all are known; the targets of these are rows.
 
     Long queues are taken a level at a time: all edges of the waiting seeds in their order. This is
     the order of the queue, exactly.
 
     Returns the head of each point's region, -1 where not valid.
     """
-    codes = edges.targets
     starts = memoryview(edges.starts.data)
-    # Points that an edge may still claim or, once they are claimed, make a seed of their region.
-    pending = bytearray(valid.tobytes())
+    free = bytearray(valid.tobytes())
     heads = array("i", bytes(4 * len(valid)))
-    pending_view = np.frombuffer(pending, dtype=np.bool_)
+    free_view = np.frombuffer(free, dtype=np.bool_)
     heads_view = np.frombuffer(heads, dtype=np.int32)
     heads_view[:] = -1
     slots = np.empty(len(valid), dtype=np.int32)
-    shared = (pending_view, heads_view, slots, promotes_late)
     for head in order.tolist():
-        if heads[head] >= 0:
+        if not free[head]:
             continue
-        pending[head] = False
+        free[head] = False
         heads[head] = head
-        queue = [head]
+        seeds = array("i", [head])
         done = 0
-        while done < len(queue):
-            if len(queue) - done >= _LONG_QUEUE:
-                level = np.array(queue[done:], dtype=np.int32)
-                while len(level) >= _LONG_QUEUE:
-                    level = _claim_level(edges, level, head, *shared)
-                queue, done = level.tolist(), 0
+        while done < len(seeds):
+            if len(seeds) - done >= _LONG_QUEUE:
+                codes = _edges_of(edges, np.frombuffer(seeds[done:], dtype=np.int32))
+                codes = _first_of_each(codes[free_view[codes >> 1]], slots)
+                done = len(seeds)
+                targets = codes >> 1
+                free_view[targets] = False
+                heads_view[targets] = head
+                seeds.frombytes(targets[(codes & 1).astype(bool)].tobytes())
                 continue
-            seed = queue[done]
+            seed = seeds[done]
             done += 1
-            for code in codes[starts[seed] : starts[seed + 1]].tolist():
+            for code in edges.targets[starts[seed] : starts[seed + 1]].tolist():
                 target = code >> 1
-                if pending[target] and heads[target] in (-1, head):
+                if free[target]:
+                    free[target] = False
                     heads[target] = head
                     if code & 1:
-                        queue.append(target)
-                    pending[target] = promotes_late and not code & 1
+                        seeds.append(target)
+        if claims is not None:
+            for first in range(0, len(seeds), _CLAIMING_SEEDS):
+                some = np.frombuffer(seeds[first : first + _CLAIMING_SEEDS], dtype=np.int32)
+                targets = _edges_of(claims, some)
+                targets = targets[free_view[targets]]
+                free_view[targets] = False
+                heads_view[targets] = head
     return heads_view
 
 
-def _claim_level(
-    edges: EdgeLists,
-    level: NDArray[np.int32],
-    head: int,
-    pending: NDArray[np.bool_],
-    heads: NDArray[np.int32],
-    slots: NDArray[np.int32],
-    promotes_late: bool,
-) -> NDArray[np.int32]:
-    """Let a level of seeds claim points, and return the seeds among them in queue order."""
-    starts = edges.starts[level]
-    counts = edges.starts[level + 1] - starts
-    ends = np.cumsum(counts)
+def _edges_of(edges: EdgeLists, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the targets of some points' edges, one point after the other."""
+    starts = edges.starts[rows]
+    counts = edges.starts[rows + 1] - starts
+    ends = np.cumsum(counts, dtype=starts.dtype)
     places = np.repeat(starts - ends + counts, counts)
     places += np.arange(len(places), dtype=places.dtype)
-    codes = edges.targets[places]
-    codes = codes[pending[codes >> 1]]
+    return edges.targets[places]
+
+
+def _first_of_each(codes: NDArray[np.int32], slots: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the first of the codes of each target; ``slots`` has room for every point."""
     targets = codes >> 1
-    if promotes_late:
-        owners = heads[targets]
-        mine = (owners < 0) | (owners == head)
-        heads[targets[mine]] = head
-        makes_seed = mine & (codes & 1).astype(bool)
-        codes, targets = codes[makes_seed], targets[makes_seed]
     numbers = np.arange(len(targets), dtype=np.int32)
     # Of several writes to one place the last one stays: in reverse, the first edge to a point.
     slots[targets[::-1]] = numbers[::-1]
-    first = slots[targets] == numbers
-    codes, targets = codes[first], targets[first]
-    pending[targets] = False
-    heads[targets] = head
-    seeds: NDArray[np.int32] = targets[(codes & 1).astype(bool)]
-    return seeds
+    firsts: NDArray[np.int32] = codes[slots[targets] == numbers]
+    return firsts
