@@ -82,9 +82,10 @@ def _search_level(
     points: NDArray[np.float64], k: int, size: float, rows: NDArray[np.int64], store: Store
 ) -> NDArray[np.int64]:
     """Answer for the rows that cells of one size can answer for, and return the others."""
-    if (np.ptp(points, axis=0) / size + 4).prod() > _MAX_KEY:
+    columns = np.ascontiguousarray(points.T)
+    if (np.ptp(columns, axis=1) / size + 4).prod() > _MAX_KEY:
         return rows
-    grid = _make_grid(points, size, rows)
+    grid = _make_grid(columns, size, rows)
     settled = np.zeros(len(points), dtype=bool)
 
     def work(cells: NDArray[np.int64]) -> None:
@@ -122,18 +123,19 @@ class _CellGrid(NamedTuple):
     size: float
 
 
-def _make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64]) -> _CellGrid:
-    """Sort a cloud by cells, and list those around each cell that holds an asked row."""
-    low, high = points.min(axis=0), points.max(axis=0)
+def _make_grid(columns: NDArray[np.float64], size: float, rows: NDArray[np.int64]) -> _CellGrid:
+    """Sort a cloud ``(3, N)`` by cells, and list those around each cell that holds an asked row."""
+    num_points = columns.shape[1]
+    low, high = columns.min(axis=1), columns.max(axis=1)
     far = low + _FAR * (high - low).max()
-    cell = np.floor((points - low) / size).astype(np.int64) + 1
-    _, width, height = (int(count) + 2 for count in cell.max(axis=0))
-    keys = (cell[:, 0] * width + cell[:, 1]) * height + cell[:, 2]
+    cell = np.floor((columns - low[:, None]) / size).astype(np.int64) + 1
+    _, width, height = (int(count) + 2 for count in cell.max(axis=1))
+    keys = (cell[0] * width + cell[1]) * height + cell[2]
     order = np.argsort(keys)
     keys = keys[order]
     first = _run_starts(keys)
-    cell_keys, ends = keys[first], np.append(first, len(points))
-    is_asked = np.zeros(len(points), dtype=bool)
+    cell_keys, ends = keys[first], np.append(first, num_points)
+    is_asked = np.zeros(num_points, dtype=bool)
     is_asked[rows] = True
     asked = np.flatnonzero(is_asked[order])
     first_asked = _run_starts(keys[asked])
@@ -143,12 +145,12 @@ def _make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64]
     starts = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around - 1))]
     stops = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around + 2))]
     return _CellGrid(
-        columns=[np.append(points[order, axis], far[axis]) for axis in range(3)],
+        columns=[np.append(column[order], end) for column, end in zip(columns, far, strict=True)],
         rows=np.append(order, -1).astype(np.int32),
         asked=asked,
         first_asked=first_asked,
         num_asked=np.diff(first_asked, append=len(asked)),
-        centers=(low + (cell[order[own]] - 0.5) * size).T.copy(),
+        centers=low[:, None] + (cell[:, order[own]] - 0.5) * size,
         starts=starts,
         lengths=stops - starts,
         size=size,

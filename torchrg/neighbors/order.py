@@ -51,7 +51,8 @@ def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
     if len(coordinates) == 0:
         return torch.zeros(0, dtype=torch.int64, device=tensor.device)
     codes = _morton_codes(coordinates)
-    order = np.argsort(codes, kind="stable")
+    # torch sorts whole numbers four times as fast as numpy does.
+    order = torch.from_numpy(codes).argsort(stable=True).numpy()
     codes = codes[order]
     same = codes[1:] == codes[:-1]
     if same.any():
@@ -88,13 +89,14 @@ def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0
 
 def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return the Morton code of each point in the cube about the cloud."""
-    low = coordinates.min(axis=0).astype(np.float64)
-    extent = float((coordinates.max(axis=0) - low).max())
+    columns = np.ascontiguousarray(coordinates.T)
+    low = columns.min(axis=1).astype(np.float64)
+    extent = float((columns.max(axis=1) - low).max())
     codes = torch.zeros(len(coordinates), dtype=torch.int64)
     if extent == 0:
         return codes.numpy()
-    for axis in range(3):
-        relative = (coordinates[:, axis] - low[axis]) / extent
+    for axis, column in enumerate(columns):
+        relative = (column - low[axis]) / extent
         steps = (relative * (2**_MORTON_BITS - 1)).astype(np.int64)
         codes |= spread_bits(torch.from_numpy(steps)) << axis
     return codes.numpy()

@@ -1,5 +1,6 @@
 """One point of each voxel, and the way back to every point."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,11 +10,13 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.neighbors.order import finite_rows
 from torchrg.structures import UNLABELED
 
 _MOST_VOXELS = 2**53
 """Along one axis: float64 counts no further."""
+
+_MOST_KEYS = 2**62
+"""Of whole numbers of 64 bits, positive ones; the square of the number of points is below it."""
 
 
 class Voxels(NamedTuple):
@@ -57,28 +60,57 @@ def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
     if not 0 < size < float("inf"):
         raise ConfigError(f"sample_voxels: expected size > 0, got {size!r}.")
     inverse = torch.full((len(tensor),), UNLABELED, device=tensor.device)
-    # In canonical order ties are broken by the coordinates.
-    order = finite_rows(tensor.detach())
-    if len(order) == 0:
-        return Voxels(order, inverse)
-    scaled = (tensor.detach()[order].double() - tensor[order].double().amin(dim=0)) / size
-    if float(scaled.max()) >= _MOST_VOXELS:
+    finite = tensor.isfinite().all(dim=-1).nonzero().squeeze(-1)
+    if len(finite) == 0:
+        return Voxels(finite, inverse)
+    columns = [column[finite].double() for column in tensor.detach().unbind(dim=-1)]
+    scaled = [(column - column.min()) / size for column in columns]
+    if max(float(column.max()) for column in scaled) >= _MOST_VOXELS:
         raise ConfigError(
             f"sample_voxels: expected size to divide the cloud's extent into less than 2^53 "
             f"cells, got {size!r}; choose a larger one."
         )
-    cell = scaled.floor()
-    x, y, z = (scaled - cell - 0.5).square().unbind(dim=-1)
-    nearest = (x + y + z).argsort(stable=True)
-    group = _group_ids(cell.long())
-    chosen = nearest[group[nearest].argsort(stable=True)]
-    first = torch.ones_like(chosen, dtype=torch.bool)
-    first[1:] = group[chosen[1:]] != group[chosen[:-1]]
-    # Groups are numbered without gaps, so the chosen points are in the order of the groups.
-    rows = order[chosen[first]]
+    cells = [column.floor() for column in scaled]
+    x, y, z = ((s - cell - 0.5).square() for s, cell in zip(scaled, cells, strict=True))
+    keys, by_voxel = cell_keys(cells).sort(stable=True)
+    voxel, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)[1:]
+    sq_distance = (x + y + z)[by_voxel]
+    least = torch.segment_reduce(sq_distance, "min", lengths=counts)
+    nearest = (sq_distance == least[voxel]).nonzero().squeeze(1)
+    if len(nearest) > len(counts):
+        nearest = _first_by_coordinates(nearest, voxel, [c[by_voxel] for c in columns])
+    rows = finite[by_voxel[nearest]]
     places = rows.argsort().argsort()
-    inverse[order] = places[group]
+    inverse[finite[by_voxel]] = places[voxel]
     return Voxels(rows.sort().values, inverse)
+
+
+def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: list[Tensor]) -> Tensor:
+    """Return of the chosen points, voxel by voxel, the one of least x, then y, then z in each."""
+    x, y, z = (column[chosen].cpu().numpy() for column in columns)
+    order = torch.from_numpy(np.lexsort((z, y, x, voxel[chosen].cpu().numpy()))).to(voxel.device)
+    chosen = chosen[order]
+    is_first = torch.ones_like(chosen, dtype=torch.bool)
+    is_first[1:] = voxel[chosen[1:]] != voxel[chosen[:-1]]
+    return chosen[is_first]
+
+
+def cell_keys(cells: Sequence[Tensor]) -> Tensor:
+    """Return a number for each point that is the same in a cell of a grid and another elsewhere.
+
+    ``cells`` are whole numbers from 0, shape ``(N,)`` each: which cell along each axis.
+    """
+    keys = torch.zeros_like(cells[0], dtype=torch.int64)
+    num_keys = 1
+    for cell in cells:
+        number, count = cell.long(), int(cell.max()) + 1
+        if num_keys * count > _MOST_KEYS:
+            values, number = torch.unique(number, return_inverse=True)
+            used, keys = torch.unique(keys, return_inverse=True)
+            num_keys, count = len(used), len(values)
+        keys = keys.mul(count).add_(number)
+        num_keys *= count
+    return keys
 
 
 def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
@@ -96,16 +128,9 @@ def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
         >>> restore_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()
         [8, -1, 7, 8]
     """
-    result = values.new_full((len(inverse), *values.shape[1:]), fill)
     has_voxel = inverse >= 0
+    if bool(has_voxel.all()):
+        return values.index_select(0, inverse)
+    result = values.new_full((len(inverse), *values.shape[1:]), fill)
     result[has_voxel] = values[inverse[has_voxel]]
     return result
-
-
-def _group_ids(cells: Tensor) -> Tensor:
-    """Number the different rows of ``(N, 3)`` whole numbers without gaps, shape ``(N,)``."""
-    group = torch.zeros(len(cells), dtype=torch.int64, device=cells.device)
-    for axis in range(3):
-        values, rank = torch.unique(cells[:, axis], return_inverse=True)
-        group = torch.unique(group * len(values) + rank, return_inverse=True)[1]
-    return group

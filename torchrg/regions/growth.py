@@ -148,7 +148,7 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
     """Return the head of each point's region, by whichever way the settings allow."""
     curvature, valid = cloud.curvature.cpu().numpy(), cloud.valid.cpu().numpy()
-    order = np.argsort(curvature, kind="stable").astype(np.int32)
+    order = torch.from_numpy(curvature).argsort(stable=True).numpy().astype(np.int32)
     order = order[valid[order]]
     limit = _curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
     if not config.is_order_free:

@@ -15,6 +15,7 @@ from torchrg.config import SuperpointsConfig
 from torchrg.linalg import sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.neighbors.voxels import cell_keys
 from torchrg.regions.adjacency import contact_neighbors
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
@@ -192,11 +193,10 @@ def _cells(places: Tensor, neighbors: Neighbors, max_extent: float | None) -> Te
         side = min(side, max_extent)
     if side == 0:
         return torch.zeros(len(places), dtype=torch.int64)
-    number = torch.zeros(len(places), dtype=torch.int64)
-    for column in places.double().unbind(dim=1):
-        values, rank = torch.unique(((column - column.min()) / side).floor(), return_inverse=True)
-        number = torch.unique(number * len(values) + rank, return_inverse=True)[1]
-    return number
+    columns = places.double().unbind(dim=1)
+    keys = cell_keys([((column - column.min()) / side).floor() for column in columns])
+    numbers: Tensor = torch.unique(keys, return_inverse=True)[1]
+    return numbers
 
 
 def _by_first_point(numbers: Tensor) -> Tensor:

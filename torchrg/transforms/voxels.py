@@ -103,15 +103,14 @@ def segment_voxels(
     config = load_config() if config is None else config
     voxels = size if isinstance(size, Voxels) else sample_voxels(tensor, size)
     seg = segment_planes(tensor[voxels.rows], config, on_stage=on_stage)
-    labels = restore_points(seg.labels, voxels.inverse, fill=UNLABELED)
-    counts = torch.bincount(labels[labels >= 0], minlength=len(seg.planes.count))
-    place = counts.argsort(descending=True, stable=True).argsort()
-    labels = torch.where(labels >= 0, place[labels], labels) if len(place) else labels
+    labels, place = _by_points(seg, voxels.inverse)
+    labels = restore_points(labels, voxels.inverse, fill=UNLABELED)
     normals, curvature, sharp, valid = (
         restore_points(values, voxels.inverse) for values in seg[1:5]
     )
     rows, up, outline = finite_rows(tensor), config.planes.up_direction, config.planes.outline
-    planes = summarize_planes(tensor[rows], normals[rows], labels[rows], up=up, outline=outline)
+    ordered = (values.index_select(0, rows) for values in (tensor, normals, labels))
+    planes = summarize_planes(*ordered, up=up, outline=outline)
     planes = planes._replace(adjacency=_renumbered(seg.planes.adjacency, place))
     return Segmentation(labels, normals, curvature, sharp, valid, planes, tensor)
 
@@ -162,6 +161,18 @@ def partition_voxels(
         for level in (found.labels, *found.levels)
     )
     return Superpoints(labels, found.plane, tuple(levels))
+
+
+def _by_points(seg: Segmentation, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    """Number the planes of voxels by descending number of points: labels, and the new numbers."""
+    num_planes, num_voxels = len(seg.planes.count), len(seg.labels)
+    # Points and voxels of none are counted in a last place that is cut off.
+    weights = torch.bincount(inverse.where(inverse >= 0, num_voxels), minlength=num_voxels + 1)
+    numbers = seg.labels.where(seg.labels >= 0, num_planes)
+    counts = torch.zeros(num_planes + 1, dtype=torch.int64, device=numbers.device)
+    counts.index_add_(0, numbers, weights[:-1])
+    place = counts[:-1].argsort(descending=True, stable=True).argsort()
+    return torch.cat([place, place.new_tensor([UNLABELED])])[numbers], place
 
 
 def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:
