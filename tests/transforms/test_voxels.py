@@ -44,6 +44,12 @@ def test_voxels_are_those_of_a_loop_over_points(rng):
     assert inverse.tolist() == expected_inverse
 
 
+def test_more_cells_than_whole_numbers_count_are_told_apart():
+    corner = 2.0**30 - 1
+    points = torch.tensor([[0.0, 0, 0], [16, 0, 0], [corner] * 3], dtype=torch.float64)
+    assert sample_voxels(points, 1.0).inverse.tolist() == [0, 1, 2]
+
+
 def test_chosen_points_do_not_depend_on_the_order(rng):
     points = torch.rand(500, 3, generator=rng).mul(8).round() / 8
     chosen = points[sample_voxels(points, 0.3).rows]
@@ -66,6 +72,16 @@ def test_labels_of_voxels_go_back_to_every_point():
     assert pairs[0].unique().numel() == pairs[1].unique().numel() == pairs.shape[1]
     assert (seg.planes.count.diff() <= 0).all()
     assert seg.planes.count.tolist() == torch.bincount(seg.labels[seg.labels >= 0]).tolist()
+
+
+def test_planes_of_voxels_are_numbered_by_their_points(rng):
+    wide = torch.rand(4000, 3, generator=rng) * torch.tensor([2.0, 2, 0])
+    dense = torch.rand(9000, 3, generator=rng) * torch.tensor([1.0, 0, 1])
+    seg = segment_voxels(torch.cat([wide, dense]), 0.05, load_config("classic"))
+    assert seg.planes.count.tolist() == torch.bincount(seg.labels[seg.labels >= 0]).tolist()
+    assert seg.labels[:4000].mode().values == 1
+    assert seg.labels[4000:].mode().values == 0
+    assert seg.planes.normal[0].abs().argmax() == 1
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])
