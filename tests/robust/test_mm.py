@@ -120,7 +120,7 @@ def test_mm_is_more_efficient_than_s_for_clean_points(rng):
 
 
 def test_refusals():
-    with pytest.raises(ConfigError, match="fit_detmm: expected tuned_for to be shape or location"):
+    with pytest.raises(ConfigError, match="fit_detmm: expected tuned_for to be one of shape"):
         fit_detmm(torch.zeros(5, 3), tuned_for="scale")
     with pytest.raises(ConfigError, match="fit_dets: expected starts to be one of paper"):
         fit_dets(torch.zeros(5, 3), starts="none")

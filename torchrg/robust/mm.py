@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
-from torchrg.errors import ConfigError
 from torchrg.linalg import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
@@ -145,11 +144,7 @@ def fit_detmm(
         >>> fit_detmm(points).support[:20].any().item()
         False
     """
-    check_choices("fit_detmm", starts=(starts, Starts))
-    if tuned_for not in ("shape", "location"):
-        raise ConfigError(
-            f"fit_detmm: expected tuned_for to be shape or location, got {tuned_for!r}."
-        )
+    check_choices("fit_detmm", starts=(starts, Starts), tuned_for=(tuned_for, Target))
 
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         first, scale = _best_s_estimate(columns, floor, size, starts)
