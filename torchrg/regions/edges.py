@@ -43,26 +43,27 @@ class EdgeLists(NamedTuple):
 
 def find_coded_edges(
     cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
-) -> tuple[EdgeLists, EdgeLists | None]:
+) -> tuple[EdgeLists, NDArray[np.bool_] | None]:
     """Return all edges with targets as ``2 * row + (whether the target becomes a seed)``.
 
-    With late promotion these are only the edges that do make a seed; those that merely claim their
-    target come as the second, uncoded. ``limit`` is that of the curvature, a scalar. Chunks of
+    With late promotion these are only the edges that do make a seed. Then there is a second result:
+    which neighbours a point merely claims, shape ``(N, K)``; these are most edges, and lists of
+    them would take more time and memory. ``limit`` is that of the curvature, a scalar. Chunks of
     every size give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
+    indices = cloud.neighbors.indices
+    claims = np.empty(indices.shape, dtype=bool) if config.promotes_late else None
 
-    def find(rows: slice) -> tuple[_Edges, _Edges]:
+    def find(rows: slice) -> _Edges:
         joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
-        seeds = _become_seeds(cloud, config, rows, limit, connected)
-        indices = cloud.neighbors.indices[rows]
-        codes = (indices.to(torch.int32) * 2).add_(seeds)
-        if not config.promotes_late:
-            return _pick(codes, joins), _NO_EDGES
-        return _pick(codes, joins & seeds), _pick(indices, joins & ~seeds)
+        becomes_seed = _become_seeds(cloud, config, rows, limit, connected)
+        if claims is not None:
+            claims[rows] = (joins & ~becomes_seed).cpu().numpy()
+            joins &= becomes_seed
+        return _pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)
 
-    edges, claims = _pack(find, cloud, spare=0, chunk_size=chunk_size)
-    return edges, claims if config.promotes_late else None
+    return _pack(find, cloud, spare=0, chunk_size=chunk_size), claims
 
 
 def find_edges(
@@ -75,14 +76,18 @@ def find_edges(
     """
     shared = _shared_neighbors(cloud, config)
     spreads = cloud.curvature <= limit
+    others: dict[int, _Edges] = {}
 
-    def find(rows: slice) -> tuple[_Edges, _Edges]:
+    def find(rows: slice) -> _Edges:
         joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
         targets = cloud.neighbors.indices[rows]
-        others = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
-        return _pick(targets, joins & spreads[rows, None]), others
+        others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
+        return _pick(targets, joins & spreads[rows, None])
 
-    return _pack(find, cloud, spare=spare, chunk_size=chunk_size)
+    edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
+    targets, counts = zip(*(others[start] for start in sorted(others)), strict=True)
+    starts = np.concatenate([[0], *counts]).cumsum()
+    return edges, EdgeLists(starts, np.concatenate(targets))
 
 
 def _become_seeds(
@@ -160,9 +165,6 @@ class _Edges(NamedTuple):
     counts: NDArray[np.signedinteger]
 
 
-_NO_EDGES = _Edges(np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32))
-
-
 def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
     """Return the accepted ones of targets ``(n, K)``."""
     chosen = targets.reshape(-1).index_select(0, places_of(accepted)).to(torch.int32)
@@ -170,36 +172,24 @@ def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
 
 
 def _pack(
-    find: Callable[[slice], tuple[_Edges, _Edges]],
-    cloud: GrowingCloud,
-    *,
-    spare: int,
-    chunk_size: int,
-) -> tuple[EdgeLists, EdgeLists]:
-    """Collect two kinds of edges of successive chunks, found by as many threads as torch uses.
-
-    The first kind has the spare room behind it, and the second is taken to be few.
-    """
+    find: Callable[[slice], _Edges], cloud: GrowingCloud, *, spare: int, chunk_size: int
+) -> EdgeLists:
+    """Collect the edges of successive chunks, found by as many threads as torch uses."""
     num_points, k = cloud.neighbors.indices.shape
     # As long as it can get: memory that is not used is not touched.
     targets = np.empty(num_points * k + spare, dtype=np.int32)
     starts: NDArray[np.signedinteger]
     starts = np.zeros(num_points + 1, dtype=np.int32 if len(targets) < 2**31 else np.int64)
-    others = []
     chunks = chunks_of(num_points, chunk_size)
     at_once = _CHUNKS_A_THREAD * allowed_threads()
     used = 0
     for first in range(0, len(chunks), at_once):
         group = chunks[first : first + at_once]
-        found = map_tasks(find, group, cloud.points.device)
-        for rows, (edges, other) in zip(group, found, strict=True):
+        for rows, edges in zip(group, map_tasks(find, group, cloud.points.device), strict=True):
             targets[used : used + len(edges.targets)] = edges.targets
             starts[rows.start + 1 : rows.stop + 1] = used + np.cumsum(edges.counts)
             used += len(edges.targets)
-            others.append(other)
-    counts = np.concatenate([np.zeros(1, starts.dtype), *(other.counts for other in others)])
-    other_targets = np.concatenate([other.targets for other in others])
-    return EdgeLists(starts, targets), EdgeLists(counts.cumsum(dtype=starts.dtype), other_targets)
+    return EdgeLists(starts, targets)
 
 
 def checked_cloud(

@@ -27,7 +27,7 @@ _LONG_QUEUE = 32
 """From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
 
 _CLAIMING_SEEDS = 2**16
-"""Seeds whose claims are gathered at a time; with 50 neighbours some 40 MB."""
+"""Seeds whose claims are gathered at a time; with 50 neighbours some 30 MB."""
 
 
 @sequential_operations()
@@ -153,7 +153,8 @@ def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArra
     limit = _curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
     if not config.is_order_free:
         edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        return _grow_first_in_first_out(edges, order, valid, claims)
+        indices = cloud.neighbors.indices.cpu().numpy()
+        return _grow_first_in_first_out(edges, order, valid, claims, indices)
     seeds = order[curvature[order] <= limit.cpu().numpy()]
     edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
     heads = _first_to_reach(edges, seeds, len(valid))
@@ -212,7 +213,8 @@ def _grow_first_in_first_out(
     edges: EdgeLists,
     order: NDArray[np.int32],
     valid: NDArray[np.bool_],
-    claims: EdgeLists | None = None,
+    claims: NDArray[np.bool_] | None = None,
+    neighbors: NDArray[np.integer] | None = None,
 ) -> NDArray[np.int32]:
     """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
 
@@ -220,15 +222,15 @@ def _grow_first_in_first_out(
     itself is a property of that edge: targets are ``2 * row + (whether it does)``.
 
     With late promotion any edge of its region may make a point a seed, whichever claimed it. Then
-    the order of the queue does not matter: all edges given make seeds, and what the seeds of a
-    region only ``claim`` joins when they all are known; the targets of these are rows.
+    the order of the queue does not matter: all edges given make seeds, and those ``neighbors``
+    ``(N, K)`` that the seeds of a region merely ``claim`` join when the seeds are all known.
 
     Long queues are taken a level at a time: all edges of the waiting seeds in their order. This is
     the order of the queue, exactly.
 
     Returns the head of each point's region, -1 where not valid.
     """
-    starts = memoryview(edges.starts.data)
+    all_codes, starts = edges.targets, memoryview(edges.starts.data)
     free = bytearray(valid.tobytes())
     heads = array("i", bytes(4 * len(valid)))
     free_view = np.frombuffer(free, dtype=np.bool_)
@@ -254,20 +256,20 @@ def _grow_first_in_first_out(
                 continue
             seed = seeds[done]
             done += 1
-            for code in edges.targets[starts[seed] : starts[seed + 1]].tolist():
+            for code in all_codes[starts[seed] : starts[seed + 1]].tolist():
                 target = code >> 1
                 if free[target]:
                     free[target] = False
                     heads[target] = head
                     if code & 1:
                         seeds.append(target)
-        if claims is not None:
+        if claims is not None and neighbors is not None:
             for first in range(0, len(seeds), _CLAIMING_SEEDS):
                 some = np.frombuffer(seeds[first : first + _CLAIMING_SEEDS], dtype=np.int32)
-                targets = _edges_of(claims, some)
-                targets = targets[free_view[targets]]
-                free_view[targets] = False
-                heads_view[targets] = head
+                claimed = neighbors[some][claims[some]]
+                claimed = claimed[free_view[claimed]]
+                free_view[claimed] = False
+                heads_view[claimed] = head
     return heads_view
 
 
