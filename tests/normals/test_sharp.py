@@ -38,7 +38,7 @@ def literal(normals, neighbors, rule, limit):
             sharp.append(2.2219 * kth > limit)
         else:
             sharp.append(np.sort(angles)[int(np.ceil(len(angles) / 4)) - 1] > limit)
-    return torch.tensor(sharp)
+    return torch.from_numpy(np.array(sharp))
 
 
 @pytest.mark.parametrize("rule", ["qn", "percentile"])
