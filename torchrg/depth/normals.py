@@ -10,7 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._parallel import map_tasks
 from torchrg.linalg import machine_epsilon
+from torchrg.linalg.moments import kth_smallest
 
 CELL_SIZES = (8, 4, 2, 1)
 """Widths of the cells in pixels, the largest first."""
@@ -329,27 +331,35 @@ def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int,
     ones = seen.to(values.dtype)
     w = torch.where(seen, values, 0.0)
     mu, mv = ones * u, ones * v
-    sums = torch.stack([ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w])
-    windows: dict[int, WindowPlanes] = {}
+    moments = [ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w]
+    sums = zip(*map_tasks(_window_sums, moments, values.device), strict=True)
+    return {
+        size: _fit_planes(some, _SIDE * size)
+        for size, some in zip(sorted(CELL_SIZES), sums, strict=True)
+    }
+
+
+def _window_sums(image: Tensor) -> list[Tensor]:
+    """Return the sums of an image over the windows of each size ``(h, w)``; sizes ascend."""
+    sums = []
     for size in sorted(CELL_SIZES):
-        if windows:
-            sums = _sums_of_wider_cells(sums)
-        windows[size] = _fit_planes(_window_sums(sums), _SIDE * size)
-    return windows
+        image = _sums_of_pairs(image) if size > 1 else image
+        sums.append(_sums_around(image))
+    return sums
 
 
-def _sums_of_wider_cells(sums: Tensor) -> Tensor:
-    """Return the sums over cells of twice the width, ``(C, ceil(h / 2), ceil(w / 2))``."""
-    height, width = sums.shape[1:]
+def _sums_of_pairs(cells: Tensor) -> Tensor:
+    """Return the sums over cells of twice the width, ``(ceil(h / 2), ceil(w / 2))``."""
+    height, width = cells.shape
     if height % 2 or width % 2:
-        sums = torch.nn.functional.pad(sums, (0, width % 2, 0, height % 2))
-    rows = sums[:, 0::2] + sums[:, 1::2]
-    return rows[..., 0::2] + rows[..., 1::2]
+        cells = torch.nn.functional.pad(cells, (0, width % 2, 0, height % 2))
+    rows = cells[0::2] + cells[1::2]
+    return rows[:, 0::2] + rows[:, 1::2]
 
 
-def _window_sums(cells: Tensor) -> Tensor:
-    """Return the sums over the cells of windows ``(C, h, w)``, from sums over each cell."""
-    for axis in (1, 2):
+def _sums_around(cells: Tensor) -> Tensor:
+    """Return the sums over the cells of the window around each, ``(h, w)``."""
+    for axis in (0, 1):
         length, total = cells.shape[axis], cells.clone()
         for step in range(1, min(_REACH, length - 1) + 1):
             total.narrow(axis, step, length - step).add_(cells.narrow(axis, 0, length - step))
@@ -358,7 +368,7 @@ def _window_sums(cells: Tensor) -> Tensor:
     return cells
 
 
-def _fit_planes(sums: Tensor, side: int) -> WindowPlanes:
+def _fit_planes(sums: Sequence[Tensor], side: int) -> WindowPlanes:
     """Return the planes of windows with so many pixels along a side, from sums of moments."""
     count, *moments = sums
     share = 1 / count.clamp(min=1)
@@ -440,7 +450,7 @@ def noise_by_size(
 
 def _low_quantile(values: Tensor) -> Tensor:
     """Return the quantile of values that flat windows reach."""
-    return values.kthvalue(1 + int(_FLAT_QUANTILE * (len(values) - 1))).values
+    return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
 
 
 def _fit_noise(windows: WindowPlanes, rounding: float) -> tuple[float, float]:

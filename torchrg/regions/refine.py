@@ -51,9 +51,8 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
         )
     if config.merge_coplanar:
         fit, floor = fit_regions(cloud, labels, config)
-        labels = merge_coplanar(
-            labels, cloud.neighbors, fit, floor, tolerance=config.merge_tolerance
-        )
+        contacts = count_contacts(labels, cloud.neighbors)
+        labels = merge_coplanar(labels, contacts, fit, floor, tolerance=config.merge_tolerance)
     if config.settle_rims:
         labels = torch.unique(labels, return_inverse=True)[1] - int((labels < 0).any())
         fit, floor = fit_regions(cloud, labels, config)
@@ -145,7 +144,12 @@ def absorb_points(
 
 
 def merge_coplanar(
-    labels: Tensor, neighbors: Neighbors, fit: FittedPlanes, floor: Tensor, *, tolerance: float
+    labels: Tensor,
+    contacts: tuple[Tensor, Tensor],
+    fit: FittedPlanes,
+    floor: Tensor,
+    *,
+    tolerance: float,
 ) -> Tensor:
     """Merge flat regions that touch and lie on one plane, the pair that fits best first.
 
@@ -153,10 +157,11 @@ def merge_coplanar(
     the plane through both is at most ``tolerance`` times what it is to its own. What is merged is
     one region from then on.
 
-    ``floor`` ``(M,)`` is the least distance to its own plane that counts for a region. A merged
-    region has the smallest label of its parts.
+    ``contacts`` are those of :func:`torchrg.regions.adjacency.count_contacts`; ``floor`` ``(M,)``
+    is the least distance to its own plane that counts for a region. A merged region has the
+    smallest label of its parts.
     """
-    pairs, num_contacts = count_contacts(labels, neighbors)
+    pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].any(dim=1)]
     moments = _moments_of(fit, floor)
     owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
