@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import places_of
+from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.normals import PixelPlanes
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
@@ -90,7 +90,11 @@ def grow_pixels(
         of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
         thicker than noise and a slight bend can make it, ``(M,)``, bool.
     """
-    down, right = (_joins(pixels, normals, u, v, axis, config) for axis in (0, 1))
+
+    def join(axis: int) -> Tensor:
+        return _joins(pixels, normals, u, v, axis, config)
+
+    down, right = map_tasks(join, (0, 1), normals.device)
     labels = number_by_size(_connected(pixels.flat, down, right), config.min_size)
     if not bool((labels >= 0).any()):
         return labels, normals.new_empty(0, 3), pixels.flat.new_empty(0)
