@@ -128,6 +128,11 @@ class Segments:
         """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
         return [self.take(column).double() for column in vectors.unbind(dim=1)]
 
+    def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
+        """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
+        pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
+        return [self.take(column).double() - self.spread(center) for column, center in pairs]
+
     def spread_columns(self, vectors: Tensor) -> list[Tensor]:
         """Return the three columns of :meth:`spread` of vectors ``(M, 3)``."""
         return [self.spread(column) for column in vectors.unbind(dim=1)]
