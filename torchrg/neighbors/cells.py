@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._parallel import CACHE_BYTES, chunks_of, map_tasks
+from torchrg.neighbors.order import bounding_box
 
 Store = Callable[[NDArray[np.integer], NDArray[np.float64], NDArray[np.integer]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""
@@ -82,7 +83,8 @@ def _search_level(
     points: NDArray[np.float64], k: int, size: float, rows: NDArray[np.int64], store: Store
 ) -> NDArray[np.int64]:
     """Answer for the rows that cells of one size can answer for, and return the others."""
-    if (np.ptp(points, axis=0) / size + 4).prod() > _MAX_KEY:
+    low, high = bounding_box(points)
+    if ((high - low) / size + 4).prod() > _MAX_KEY:
         return rows
     grid = _make_grid(points, size, rows)
     settled = np.zeros(len(points), dtype=bool)
@@ -124,10 +126,10 @@ class _CellGrid(NamedTuple):
 
 def _make_grid(points: NDArray[np.float64], size: float, rows: NDArray[np.int64]) -> _CellGrid:
     """Sort a cloud by cells, and list those around each cell that holds an asked row."""
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = bounding_box(points)
     far = low + _FAR * (high - low).max()
     cell = np.floor((points - low) / size).astype(np.int64) + 1
-    _, width, height = (int(count) + 2 for count in cell.max(axis=0))
+    _, width, height = (int(count) + 3 for count in np.floor((high - low) / size))
     keys = (cell[:, 0] * width + cell[:, 1]) * height + cell[:, 2]
     order = np.argsort(keys)
     keys = keys[order]
