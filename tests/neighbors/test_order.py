@@ -1,8 +1,8 @@
-"""Morton codes hold the bits of three numbers."""
+"""Morton codes hold the bits of three numbers; the canonical order follows them."""
 
 import torch
 
-from torchrg.neighbors.order import gather_bits, spread_bits
+from torchrg.neighbors.order import canonical_order, gather_bits, spread_bits
 
 
 def test_morton_codes_hold_the_bits_of_three_numbers(rng):
@@ -14,3 +14,13 @@ def test_morton_codes_hold_the_bits_of_three_numbers(rng):
         )
         assert code == int(bits, 2)
     assert torch.equal(torch.stack([gather_bits(codes >> a) for a in range(3)], 1), numbers)
+
+
+def test_duplicates_are_side_by_side_in_the_order_they_came_in(rng):
+    points = torch.randint(0, 4, (5000, 3), generator=rng).double()
+    order = canonical_order(points).tolist()
+    places = [tuple(row) for row in points.tolist()]
+    first = {}
+    for row in order:
+        first.setdefault(places[row], len(first))
+    assert order == sorted(range(len(places)), key=lambda row: (first[places[row]], row))

@@ -2,25 +2,15 @@
 
 import torch
 
-from torchrg.depth.growth import move_to_creases
+from torchrg.depth.growth import InverseCloud, move_to_creases
 from torchrg.linalg.moments import Segments
 from torchrg.regions.planes import fit_planes
-from torchrg.structures import Neighbors
-
-STEPS = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 
 
 def moved(image, step, *, fill):
     """Return for each pixel the value of the one a step away."""
     wide = torch.nn.functional.pad(image, (6, 6, 6, 6), value=fill)
     return wide[6 + step[0] :, 6 + step[1] :][: image.shape[0], : image.shape[1]]
-
-
-def around(height, width):
-    """Return the pixels around each pixel of an image."""
-    rows = torch.arange(height * width).view(height, width)
-    near = torch.stack([rows, *(moved(rows, step, fill=-1) for step in STEPS)], dim=-1).view(-1, 9)
-    return Neighbors(near.clamp(min=0), near >= 0)
 
 
 def move(surface, labels, *, truth, reach):
@@ -31,9 +21,9 @@ def move(surface, labels, *, truth, reach):
     columns = [x.expand(height, width), y.expand(height, width), surface]
     points = torch.stack(columns, dim=-1).view(-1, 3)
     fit = fit_planes(Segments(truth.flatten()), points, torch.ones_like(points))
-    return move_to_creases(
-        points, labels.flatten(), around(height, width), fit, torch.tensor(reach)
-    ).view(height, width)
+    seen = torch.ones(height, width, dtype=torch.bool)
+    cloud = InverseCloud(points, torch.zeros(height * width), seen)
+    return move_to_creases(cloud, labels.flatten(), fit, torch.tensor(reach)).view(height, width)
 
 
 def roof(height=40, width=60):

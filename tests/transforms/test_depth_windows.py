@@ -3,13 +3,8 @@
 import pytest
 import torch
 
-from torchrg.depth.normals import (
-    CELL_SIZES,
-    fit_pixels,
-    fit_windows,
-    least_in_windows,
-    noise_by_size,
-)
+from torchrg.depth.normals import fit_pixels, least_in_windows
+from torchrg.depth.windows import CELL_SIZES, fit_windows, noise_by_size
 
 FOCAL = (525.0, 525.0)
 

@@ -37,6 +37,9 @@ from torchrg.structures import Cloud
 
 _ORGANISED = ".pcd"
 """Suffix of organised clouds."""
+_COLORED_FROM = 200
+"""So many pixels along the longer side tell which planes are next to each other and must differ in
+colour: choosing colours from all would take as long as finding the planes."""
 _FRAMES_OF_WORKER = 8
 """Where no number of workers is given, each has so many frames at least: one takes as long to start
 as it takes for some frames of 640 x 480 pixels."""
@@ -293,7 +296,7 @@ def label_frame(frame: Frame) -> Labelled:
         rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
     if frame.picture is not None:
-        colors = color_planes(seg.labels, cloud.points.view(*depth.shape, 3))
+        colors = color_planes(seg.labels, _thinned(cloud.points.view(*depth.shape, 3)))
         write_png(frame.picture, colors * (depth > 0)[..., None])
     return Labelled(
         (depth.shape[0], depth.shape[1]),
@@ -301,6 +304,14 @@ def label_frame(frame: Frame) -> Labelled:
         int((seg.labels >= 0).sum()),
         len(seg.planes.count),
     )
+
+
+def _thinned(points: Tensor) -> Tensor:
+    """Return an image of points ``(H, W, 3)`` with NaN but for rows and columns evenly apart."""
+    apart = -(-max(points.shape) // _COLORED_FROM)
+    thinned = torch.full_like(points, torch.nan)
+    thinned[::apart, ::apart] = points[::apart, ::apart]
+    return thinned
 
 
 def _read_frame(source: Path, arguments: Arguments) -> tuple[Cloud, Tensor, Tensor]:

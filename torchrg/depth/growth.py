@@ -6,19 +6,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.normals import PixelPlanes
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
-from torchrg.regions.adjacency import contact_neighbors
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.planes import FittedPlanes
 from torchrg.regions.refine import merge_coplanar, reach_of_planes
 from torchrg.robust.scale import MAD_FACTOR
-from torchrg.structures import UNLABELED, Neighbors
+from torchrg.structures import UNLABELED
 
-_AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Steps in rows and columns to the pixels around one, the nearest first."""
+_AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
+"""Steps in rows and columns to those around a pixel that come after it."""
+
+_AROUND = (*_AHEAD, *((-down, -right) for down, right in _AHEAD))
 
 _NUM_PASSES = 2
 """Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
@@ -88,7 +90,11 @@ def grow_pixels(
         of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
         thicker than noise and a slight bend can make it, ``(M,)``, bool.
     """
-    down, right = (_joins(pixels, normals, u, v, axis, config) for axis in (0, 1))
+
+    def join(axis: int) -> Tensor:
+        return _joins(pixels, normals, u, v, axis, config)
+
+    down, right = map_tasks(join, (0, 1), normals.device)
     labels = number_by_size(_connected(pixels.flat, down, right), config.min_size)
     if not bool((labels >= 0).any()):
         return labels, normals.new_empty(0, 3), pixels.flat.new_empty(0)
@@ -146,18 +152,41 @@ def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
     return torch.from_numpy(parts.ravel() - 1).to(flat.device)
 
 
-def _pixels_around(seen: Tensor) -> Neighbors:
-    """Return the pixels around each pixel, itself first; those with depth around such count."""
-    height, width = seen.shape
-    rows = torch.arange(height * width, device=seen.device).view(height, width)
-    wide = torch.nn.functional.pad(seen, (1, 1, 1, 1))
-    indices = torch.empty(height, width, 9, dtype=torch.int64, device=seen.device)
-    counted = torch.empty_like(indices, dtype=torch.bool)
-    for column, (down, right) in enumerate([(0, 0), *_AROUND]):
-        indices[..., column] = rows + (down * width + right)
-        counted[..., column] = wide[1 + down :, 1 + right :][:height, :width] & seen
-    last = max(height * width - 1, 0)
-    return Neighbors(indices.clamp_(0, last).view(-1, 9), counted.view(-1, 9))
+def _pixels_around(pixels: Tensor, shape: torch.Size) -> Tensor:
+    """Return the pixels around each of some ``(n,)``, by row-major place, shape ``(n, 8)``.
+
+    For those outside of the image stand the nearest inside.
+    """
+    height, width = shape
+    down, right = torch.tensor(_AROUND, device=pixels.device).T
+    row = (pixels[:, None] // width + down).clamp(0, height - 1)
+    column = (pixels[:, None] % width + right).clamp(0, width - 1)
+    around: Tensor = row * width + column
+    return around
+
+
+def _border_pixels(labels: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Return the pairs of pixels of two regions side by side, each once, by row-major place."""
+    pairs = []
+    for down, right in _AHEAD:
+        step = down * width + right
+        here = places_of(labels[: max(len(labels) - step, 0)] != labels[step:])
+        column = here % width + right
+        has_next = (column >= 0) & (column < width)
+        here = here[has_next & (labels[here] >= 0) & (labels[here + step] >= 0)]
+        pairs.append((here, here + step))
+    first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
+    return first, second
+
+
+def _contacts(labels: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Do as :func:`torchrg.regions.adjacency.count_contacts` where pixels side by side touch."""
+    regions = torch.stack([labels[pixels] for pixels in _border_pixels(labels, width)])
+    num_regions = int(labels.max()) + 1
+    keys = regions.amin(dim=0) * num_regions + regions.amax(dim=0)
+    keys, counts = torch.unique(keys, return_counts=True)
+    # Either pixel is a neighbour of the other.
+    return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
 
 
 def _refine(
@@ -172,16 +201,16 @@ def _refine(
     At least one pixel has a label. Returns labels by descending size, and the planes of the regions
     in the cloud; curved are those thicker than noise and a slight bend can make them.
     """
-    touching = _pixels_around(cloud.seen)
     for _ in range(_NUM_PASSES):
         fit, noise = _fit(cloud, labels)
         reach = reach_of_planes(fit, noise, config.absorb_reach)
-        labels = absorb_pixels(cloud, labels, touching, fit, reach)
-        merged = merge_coplanar(labels, touching, fit, noise, tolerance=config.merge_tolerance)
+        labels = absorb_pixels(cloud, labels, fit, reach)
+        contacts = _contacts(labels, cloud.seen.shape[1])
+        merged = merge_coplanar(labels, contacts, fit, noise, tolerance=config.merge_tolerance)
         labels = number_by_size(merged, config.min_size)
     fit, noise = _fit(cloud, labels)
     reach = reach_of_planes(fit, noise, config.absorb_reach)
-    moved = move_to_creases(cloud.points, labels, touching, fit, reach)
+    moved = move_to_creases(cloud, labels, fit, reach)
     labels = number_by_size(moved, config.min_size)
     return labels, _fit(cloud, labels)[0]
 
@@ -236,21 +265,18 @@ def fit_regions(segments: Segments, points: Tensor, noise: Tensor) -> FittedPlan
     )
 
 
-def absorb_pixels(
-    cloud: InverseCloud, labels: Tensor, touching: Neighbors, fit: FittedPlanes, reach: Tensor
-) -> Tensor:
+def absorb_pixels(cloud: InverseCloud, labels: Tensor, fit: FittedPlanes, reach: Tensor) -> Tensor:
     """Give pixels without a region to regions they touch, until none can be given.
 
     This is :func:`torchrg.regions.refine.absorb_points` without an angle, where whoever is beside a
     pixel has it beside itself: after the first time, only pixels beside those that joined are
     looked at. ``reach`` ``(M,)`` is that of the planes, NaN where a region takes none.
     """
-    around, counted = contact_neighbors(touching)
     labels, offset = labels.clone(), (fit.normal * fit.center).sum(dim=1)
     free = (labels == UNLABELED) & cloud.seen.flatten()
     rows = free.nonzero().squeeze(1)
     while len(rows):
-        near = torch.where(counted[rows], labels[around[rows]], UNLABELED)
+        near = labels[_pixels_around(rows, cloud.seen.shape)]
         touches = (near >= 0).any(dim=1)
         rows, near = rows[touches], near[touches]
         region = near.clamp(min=0)
@@ -262,22 +288,13 @@ def absorb_pixels(
         rows = rows[joined]
         labels[rows] = choice[joined]
         free[rows] = False
-        rows = torch.unique(around[rows])
-        rows = rows[free[rows]]
+        beside = _pixels_around(rows, cloud.seen.shape)
+        rows = torch.unique(beside[free[beside]])
     return labels
 
 
-def _at_borders(labels: Tensor, around: Tensor, counted: Tensor) -> Tensor:
-    """Return the rows of pixels with a region that have another beside them."""
-    other = torch.zeros_like(labels, dtype=torch.bool)
-    for column in range(around.shape[1]):
-        near = labels[around[:, column]]
-        other |= (near >= 0) & (near != labels) & counted[:, column]
-    return (other & (labels >= 0)).nonzero().squeeze(1)
-
-
 def move_to_creases(
-    points: Tensor, labels: Tensor, touching: Neighbors, fit: FittedPlanes, reach: Tensor
+    cloud: InverseCloud, labels: Tensor, fit: FittedPlanes, reach: Tensor
 ) -> Tensor:
     """Move borders between flat regions to where their planes meet.
 
@@ -287,30 +304,27 @@ def move_to_creases(
     its plane and next to a pixel of it that is straight behind, as seen from the crease: borders
     move across to the crease, never along it. Pixels that went are followed by those beside them.
 
-    ``points`` are an image as a cloud, ``touching`` the pixels around each pixel, itself first, and
-    ``reach`` the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
+    ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
     """
     offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
     planes = torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
     middles = torch.cat([fit.center[:, :2], torch.ones_like(offset)], dim=1)
-    around, counted = contact_neighbors(touching)
-    rays = torch.cat([points[:, :2], torch.ones_like(points[:, :1])], dim=1)
     labels = labels.clone()
-    rows = _at_borders(labels, around, counted)
+    rows = torch.unique(torch.cat(_border_pixels(labels, cloud.seen.shape[1])))
     for _ in range(_MOST_MOVES):
-        near = labels[around[rows]]
-        other = counted[rows] & (near >= 0) & (near != labels[rows][:, None])
+        around = _pixels_around(rows, cloud.seen.shape)
+        near = labels[around]
+        other = (near >= 0) & (near != labels[rows][:, None])
         at_border = other.any(dim=1)
-        rows, near, other = rows[at_border], near[at_border].clamp(min=0), other[at_border]
-        own = labels[rows][:, None]
-        around_rays = rays[around[rows]]
-        ray = rays[rows][:, None]
+        rows, around, other = rows[at_border], around[at_border], other[at_border]
+        near, own = near[at_border].clamp(min=0), labels[rows][:, None]
+        ray, around_rays = _rays(cloud, rows[:, None]), _rays(cloud, around)
         apart = planes[own] - planes[near]
         here, there = (apart * ray).sum(dim=2), (apart * around_rays).sum(dim=2)
         mine, theirs = (apart * middles[own]).sum(dim=2), (apart * middles[near]).sum(dim=2)
         slope, step = apart[..., :2].norm(dim=2), (around_rays - ray)[..., :2].norm(dim=2)
         straight = there.abs() - here.abs() >= _STRAIGHT * slope * step
-        away = (points[rows, 2:] - (planes[near] * ray).sum(dim=2)).abs()
+        away = (cloud.points[rows, 2:] - (planes[near] * ray).sum(dim=2)).abs()
         goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
         goes &= (mine.abs() > reach[near]) & (theirs.abs() > reach[own])
         away = torch.where(goes, away, torch.inf)
@@ -320,6 +334,12 @@ def move_to_creases(
             break
         choice = torch.where(away == least, near, len(planes)).amin(dim=1)
         labels[rows[moved]] = choice[moved]
-        rows = torch.unique(torch.cat([rows[moved], around[rows[moved]].flatten()]))
+        rows = torch.unique(torch.cat([rows[moved], around[moved].flatten()]))
         rows = rows[labels[rows] >= 0]
     return labels
+
+
+def _rays(cloud: InverseCloud, pixels: Tensor) -> Tensor:
+    """Return the rays ``(x, y, 1)`` of some pixels ``(*)``, shape ``(*, 3)``."""
+    x, y, _ = cloud.points.unbind(dim=1)
+    return torch.stack([x[pixels], y[pixels], torch.ones_like(x[pixels])], dim=-1)

@@ -1,23 +1,21 @@
-"""The plane at each pixel of a depth image: square windows, their noise, the largest flat one.
+"""The plane at each pixel of a depth image: that of the largest flat window around it."""
 
-Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows stand a cell
-apart, so that the sums over all large ones together cost less than those over the smallest.
-"""
-
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg.linalg import machine_epsilon
+from torchrg.depth.windows import (
+    CELL_SIZES,
+    REACH,
+    SIDE,
+    WindowNoise,
+    WindowPlanes,
+    fit_windows,
+    noise_by_size,
+)
 
-CELL_SIZES = (8, 4, 2, 1)
-"""Widths of the cells in pixels, the largest first."""
-_REACH = 2
-"""A window reaches over so many cells around its middle one."""
-_SIDE = 2 * _REACH + 1
-"""Cells along a side of a window."""
 _FLAT = 1.35
 """A flat window deviates from its plane by at most this many times the tolerance."""
 _OWN_REACH = 3.5
@@ -32,40 +30,6 @@ _MOST_BEND = 0.03
 """A smallest window by this, where none is flat: twice as much would hide creases of 20 degrees."""
 _STEEPEST = 4.0
 """Surfaces seen at a cosine below the inverse of this may not bend: there a step looks like one."""
-_LEAST_SHARE = 0.4
-"""A window with fewer of its pixels seen has no plane."""
-_LEAST_SPREAD = 0.2
-"""Nor has one whose pixels have a covariance with less than this of a full window's determinant:
-they lie nearly on a line."""
-_FLAT_QUANTILE = 0.35
-"""At least a third of an indoor image is flat: its windows deviate by noise alone."""
-_NUM_BINS = 12
-"""Classes of depth that noise is fitted to."""
-_MOST_GROWTH = 1.4
-"""Noise of windows grows at most by this from one size to the next."""
-_ROUNDING = 8.0
-"""Least noise of inverse depth, in units of the rounding of the depth."""
-_LEAST_ROUNDING = 1e-7
-"""And as a share of it, whatever the dtype."""
-
-
-class WindowPlanes(NamedTuple):
-    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows.
-
-    ``deviation`` is the standard deviation of a window's pixels from its plane, infinite where
-    there is none, ``mean`` their mean value. All are of one shape, ``(h, w)`` for the windows
-    around the cells of an image.
-    """
-
-    u_slope: Tensor
-    v_slope: Tensor
-    origin: Tensor
-    deviation: Tensor
-    mean: Tensor
-
-    def take(self, places: Tensor) -> "WindowPlanes":
-        """Return those at some row-major places."""
-        return WindowPlanes(*(part.flatten()[places] for part in self))
 
 
 class PixelPlanes(NamedTuple):
@@ -167,7 +131,7 @@ class _SizedWindows(NamedTuple):
     size: int
     first: int
     planes: WindowPlanes
-    noise: "WindowNoise"
+    noise: WindowNoise
     limit: _Tolerances
 
 
@@ -182,7 +146,7 @@ def _offer_windows(
     if quarters is None:
         smooth = torch.where(deviation <= limit.most, own, -1)
         choice.offer(windows, smooth, torch.full_like(deviation, torch.inf))
-    least, places = least_in_windows(relative, _REACH)
+    least, places = least_in_windows(relative, REACH)
     reach = torch.maximum(_OWN_REACH * limit.noise, limit.flat)
     choice.offer(windows, torch.where(least <= _FLAT, places, -1), reach, beside=True)
 
@@ -197,7 +161,7 @@ def _flatness(windows: _SizedWindows, quarters: _SizedWindows | None) -> Tensor:
     # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
     usual = usual * (limit.noise / quarters.noise.at(windows.planes.mean))
     usual = torch.maximum(usual, _LEAST_QUARTERS * limit.flat)
-    same = deviation <= (1 + _SAME_NOISE / (_SIDE * windows.size)) * usual
+    same = deviation <= (1 + _SAME_NOISE / (SIDE * windows.size)) * usual
     return torch.where(same, relative, torch.inf)
 
 
@@ -251,7 +215,7 @@ def _pixel_planes(
     table = zip(*(part.planes for part in sizes), strict=True)
     planes = WindowPlanes(*(choice.take(part) for part in table))
     tolerance = choice.take([part.limit.flat for part in sizes])
-    side = choice.take([torch.full_like(w.planes.mean, _SIDE * w.size) for w in sizes])
+    side = choice.take([torch.full_like(w.planes.mean, SIDE * w.size) for w in sizes])
     middles = zip(*(_middles(part) for part in sizes), strict=True)
     flat = choice.flat.view(choice.shape)
     is_smooth = flat & (planes.deviation > _FLAT * tolerance)
@@ -280,7 +244,7 @@ def _middles(windows: _SizedWindows) -> tuple[Tensor, Tensor]:
 
 
 def _tolerances(
-    planes: WindowPlanes, noise: "WindowNoise", size: int, focal: tuple[float, float]
+    planes: WindowPlanes, noise: WindowNoise, size: int, focal: tuple[float, float]
 ) -> _Tolerances:
     """Return what windows of a size may deviate by.
 
@@ -293,7 +257,7 @@ def _tolerances(
         (planes.u_slope * fx).square() + (planes.v_slope * fy).square() + planes.origin.square()
     )
     is_steep = sq_nearness > (_STEEPEST * planes.mean).square()
-    half = _SIDE * size / 2 / max(abs(fx), abs(fy))
+    half = SIDE * size / 2 / max(abs(fx), abs(fy))
     bend = half * torch.where(is_steep, 0.0, sq_nearness) / planes.mean
     bend = torch.where(planes.mean > 0, bend, 0.0)
     return _Tolerances(level, torch.maximum(level, _BEND * bend), _MOST_BEND * bend)
@@ -305,9 +269,9 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
     They are windows of half the size: the four at the corners of a window cover it exactly.
     """
     height, width = shape
-    corner = _SIDE
+    corner = SIDE
     padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)
-    padded[_REACH : _REACH + deviation.shape[0], _REACH : _REACH + deviation.shape[1]] = deviation
+    padded[REACH : REACH + deviation.shape[0], REACH : REACH + deviation.shape[1]] = deviation
     squares, count = deviation.new_zeros(shape), deviation.new_zeros(shape)
     for row in (0, corner):
         for column in (0, corner):
@@ -316,68 +280,6 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
             squares += torch.where(found, part * part, 0.0)
             count += found
     return torch.where(count > 0, squares / count, torch.inf).sqrt()
-
-
-def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int, WindowPlanes]:
-    """Fit a plane by least squares to the window around each cell, for each size of cells.
-
-    The image ``(H, W)``, float64, holds anything finite where not seen; its columns are at ``u``
-    ``(W,)``, its rows at ``v`` ``(H, 1)``. Cells begin at the first pixel, and windows are cut off
-    at the borders of the image. One with too few pixels seen, or whose pixels lie nearly on a line,
-    has no plane. Sizes ascend.
-    """
-    ones = seen.to(values.dtype)
-    w = torch.where(seen, values, 0.0)
-    mu, mv = ones * u, ones * v
-    sums = torch.stack([ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w])
-    windows: dict[int, WindowPlanes] = {}
-    for size in sorted(CELL_SIZES):
-        if windows:
-            sums = _sums_of_wider_cells(sums)
-        windows[size] = _fit_planes(_window_sums(sums), _SIDE * size)
-    return windows
-
-
-def _sums_of_wider_cells(sums: Tensor) -> Tensor:
-    """Return the sums over cells of twice the width, ``(C, ceil(h / 2), ceil(w / 2))``."""
-    height, width = sums.shape[1:]
-    if height % 2 or width % 2:
-        sums = torch.nn.functional.pad(sums, (0, width % 2, 0, height % 2))
-    rows = sums[:, 0::2] + sums[:, 1::2]
-    return rows[..., 0::2] + rows[..., 1::2]
-
-
-def _window_sums(cells: Tensor) -> Tensor:
-    """Return the sums over the cells of windows ``(C, h, w)``, from sums over each cell."""
-    for axis in (1, 2):
-        length, total = cells.shape[axis], cells.clone()
-        for step in range(1, min(_REACH, length - 1) + 1):
-            total.narrow(axis, step, length - step).add_(cells.narrow(axis, 0, length - step))
-            total.narrow(axis, 0, length - step).add_(cells.narrow(axis, step, length - step))
-        cells = total
-    return cells
-
-
-def _fit_planes(sums: Tensor, side: int) -> WindowPlanes:
-    """Return the planes of windows with so many pixels along a side, from sums of moments."""
-    count, *moments = sums
-    share = 1 / count.clamp(min=1)
-    mean_u, mean_v, mean_w, uu, uv, vv, uw, vw, ww = (part * share for part in moments)
-    uu, uv, vv = uu - mean_u * mean_u, uv - mean_u * mean_v, vv - mean_v * mean_v
-    uw, vw, ww = uw - mean_u * mean_w, vw - mean_v * mean_w, ww - mean_w * mean_w
-    spread = uu * vv - uv * uv
-    full = (side * side - 1) / 12
-    found = (count >= _LEAST_SHARE * side**2) & (spread > _LEAST_SPREAD * full**2)
-    spread = torch.where(found, spread, 1.0)
-    u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
-    variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
-    return WindowPlanes(
-        u_slope,
-        v_slope,
-        mean_w - u_slope * mean_u - v_slope * mean_v,
-        torch.where(found, variance.sqrt(), torch.inf),
-        mean_w,
-    )
 
 
 def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
@@ -389,77 +291,3 @@ def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
         place = place[chosen.flatten()]
     return -best[0, 0], place.view(image.shape)
-
-
-class WindowNoise(NamedTuple):
-    """Noise of inverse depth ``w`` as windows of a size see it: ``factor (growth + constant w^2)``.
-
-    It is never less than ``rounding`` times the inverse depth.
-    """
-
-    factor: float
-    constant: float
-    growth: float
-    rounding: float
-
-    def at(self, inverse: Tensor) -> Tensor:
-        """Return the noise at inverse depths."""
-        least = self.rounding * inverse
-        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
-        return torch.maximum(self.factor * usual, least)
-
-
-def noise_by_size(
-    windows: Mapping[int, WindowPlanes], given: tuple[float, float] | None, dtype: torch.dtype
-) -> dict[int, WindowNoise]:
-    r"""Return the noise of inverse depth as windows of each size see it.
-
-    A standard deviation of ``a + b z^2`` in depth is one of ``b + a w^2`` in inverse depth
-    ``w = 1 / z``. Where ``a`` and ``b`` are not given, they are fitted to what windows deviate from
-    their planes: to the 35 % quantiles of twelve classes of depth. Neighbouring pixels of a sensor
-    err alike, and its depth has steps, so that large windows deviate more than small ones: the
-    noise has a factor for each size. It is never less than the rounding of ``dtype``, that of the
-    depth.
-    """
-    rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING)
-    if given is not None:
-        constant, growth = given
-        return dict.fromkeys(windows, WindowNoise(1.0, constant, growth, rounding))
-    middle = windows[sorted(windows)[len(windows) // 2 - 1]]
-    shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
-    noises, factor = {}, 0.0
-    for size in sorted(windows):
-        found = windows[size].deviation.isfinite()
-        deviation, mean = windows[size].deviation[found], windows[size].mean[found]
-        ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
-        usual = float(_low_quantile(ratios)) if len(ratios) else factor
-        factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
-        noises[size] = shape._replace(factor=factor)
-    return noises
-
-
-def _low_quantile(values: Tensor) -> Tensor:
-    """Return the quantile of values that flat windows reach."""
-    return values.kthvalue(1 + int(_FLAT_QUANTILE * (len(values) - 1))).values
-
-
-def _fit_noise(windows: WindowPlanes, rounding: float) -> tuple[float, float]:
-    """Fit ``b + a w^2``, both not negative, to the deviations of flat windows; return a and b."""
-    used = windows.deviation.isfinite()
-    mean, order = windows.mean[used].sort()
-    deviation = torch.maximum(windows.deviation[used][order], rounding * mean)
-    bins = [part for part in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(part)]
-    if not bins:
-        return 0.0, 0.0
-    x = torch.stack([mean[part].square().mean() for part in bins])
-    q = torch.stack([_low_quantile(deviation[part]) for part in bins])
-    # Relative errors: a class whose windows are all cluttered counts little.
-    p, e = x / q, 1 / q
-    spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2
-    constant = (p.sum() * (e * e).sum() - e.sum() * (p * e).sum()) / spread
-    growth = (e.sum() * (p * p).sum() - p.sum() * (p * e).sum()) / spread
-    if not bool(growth > 0):
-        return float(p.sum() / (p * p).sum()), 0.0
-    if not bool(constant > 0):
-        return 0.0, float(e.sum() / (e * e).sum())
-    return float(constant), float(growth)

@@ -8,7 +8,8 @@ from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
 from torchrg.depth.camera import depth_to_points, has_depth
 from torchrg.depth.growth import InverseCloud, grow_pixels
-from torchrg.depth.normals import PixelPlanes, WindowPlanes, fit_pixels
+from torchrg.depth.normals import PixelPlanes, fit_pixels
+from torchrg.depth.windows import WindowPlanes
 from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 

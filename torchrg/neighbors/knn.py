@@ -60,8 +60,8 @@ def search_knn(
     check_shapes("search_knn", points=(tensor, "N 3"))
     check_floating("search_knn", points=tensor)
     coordinates = tensor.detach().cpu().numpy()
-    num_bad = len(coordinates) - int(np.isfinite(coordinates).all(axis=1).sum())
-    if num_bad:
+    if not np.isfinite(coordinates).all():
+        num_bad = int((~np.isfinite(coordinates)).any(axis=1).sum())
         raise ShapeError(
             f"search_knn: expected finite points, got {num_bad:,} of {len(coordinates):,} with NaN "
             "or Inf; leave them out first."
@@ -120,7 +120,7 @@ def _search_cloud(
 
     k = indices.shape[1]
     is_first = np.ones(len(points), dtype=bool)
-    is_first[1:] = (points[1:] != points[:-1]).any(axis=1)
+    is_first[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in points.T])
     starts = np.flatnonzero(is_first)
     counts = np.diff(starts, append=len(points))
     places = points[starts].astype(np.float64)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, places_of
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of, places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency
 
@@ -79,10 +79,11 @@ def find_adjacency(
 
 def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
     """Return the (at most) 8 nearest neighbours of each point ``(N, n)``, and which count."""
-    nearest = neighbors.indices[:, 1 : _NUM_CONTACTS + 1].long()
+    columns = slice(1, _NUM_CONTACTS + 1)
+    nearest = neighbors.indices[:, columns]
     if neighbors.valid is None:
-        return nearest, torch.ones_like(nearest, dtype=torch.bool)
-    return nearest, neighbors.valid[:, 1 : _NUM_CONTACTS + 1]
+        return nearest, torch.ones((), dtype=torch.bool, device=nearest.device).expand_as(nearest)
+    return nearest, neighbors.valid[:, columns]
 
 
 def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
@@ -122,8 +123,10 @@ def _find_contacts(
         source, column = places // touches.shape[1], places % touches.shape[1]
         first, second = own[source].long(), other.reshape(-1)[places].long()
         key = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
-        found.append((key, source + start, target[places].long(), column))
+        ends = ((source + start).int(), target[places].int(), column.to(torch.int16))
+        found.append((key, *ends))
     keys, sources, targets, columns = (torch.cat(parts) for parts in zip(*found, strict=True))
+    del found
     numbers, pair = torch.unique(keys, return_inverse=True)
     width = max(num_regions, 1)
     pairs = torch.stack([numbers // width, numbers % width], dim=1)
@@ -139,10 +142,15 @@ def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
 def _length_on_line(points: Tensor, contacts: _Contacts, along: Tensor, num_pairs: int) -> Tensor:
     """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
     origin = points[:1].double()
-    start, end = (points[rows].double() - origin for rows in (contacts.source, contacts.target))
-    size = _sum_of(contacts.pair, (end - start).norm(dim=1), num_pairs)
+    lengths, places = [], []
+    for some in chunks_of(len(contacts.pair), ROWS_AT_ONCE):
+        ends = (contacts.source[some], contacts.target[some])
+        start, end = (points[rows].double() - origin for rows in ends)
+        lengths.append((end - start).norm(dim=1))
+        places.append(((start + end) / 2 * along[contacts.pair[some]]).sum(dim=1))
+    size = _sum_of(contacts.pair, torch.cat([points.new_empty(0).double(), *lengths]), num_pairs)
     size = size / torch.bincount(contacts.pair, minlength=num_pairs)
-    place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / size[contacts.pair]
+    place = torch.cat([size[:0], *places]) / size[contacts.pair]
     cell = torch.where(place.isfinite(), place, 0.0).floor().long()
     low = int(cell.min()) if len(cell) else 0
     width = int(cell.max()) - low + 2 if len(cell) else 1

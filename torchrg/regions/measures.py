@@ -14,6 +14,12 @@ from torchrg.linalg.moments import Segments
 _TIE = 1e-9
 """Rectangles whose areas differ by less than this share are equal but for rounding."""
 
+_COMPASS = np.array([[1.0, 0], [1, 1], [0, 1], [-1, 1]])
+"""Four directions counter-clockwise; the opposite ones follow."""
+
+_ROUNDING = 1e-12
+"""Share of the coordinates by which a point inside an octagon is inside beyond rounding."""
+
 _TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
 """From an edge to the edges across its direction in front, to the opposite one, and to those behind
 it: 0.5, 1 and 1.5 times pi, and another pi that the range of angles begins below 0."""
@@ -82,11 +88,34 @@ def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
     """Return the corners of the convex hull, counter-clockwise; the two ends of a line."""
     from scipy.spatial import ConvexHull, QhullError
 
+    outer = _outer_places(places)
     try:
-        corners: NDArray[np.integer] = ConvexHull(places).vertices
+        corners: NDArray[np.integer] = outer[ConvexHull(places[outer]).vertices]
     except QhullError:
         corners = np.lexsort(places.T)[[0, -1]]
     return corners
+
+
+def _outer_places(places: NDArray[np.float64]) -> NDArray[np.integer]:
+    """Return the rows of points ``(n, 2)`` that may be corners of their convex hull.
+
+    Not those inside the octagon of the farthest points in eight directions [1].
+
+    References:
+        [1] S. Akl, G. Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5),
+        1978.
+    """
+    along = _COMPASS @ places.T
+    ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
+    octagon = places[ends[ends != np.roll(ends, 1)]]
+    if len(octagon) < 3:
+        return np.arange(len(places))
+    edges = np.roll(octagon, -1, axis=0) - octagon
+    inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
+    offsets = (inward * octagon).sum(axis=1)
+    rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(places).max()
+    inside = (inward @ places.T > (offsets + rounding)[:, None]).all(axis=0)
+    return np.flatnonzero(~inside)
 
 
 _POINTS_PER_CELL = 9.0

@@ -118,8 +118,7 @@ def summarize_planes(
     segments = Segments(labels)
     fit = fit_planes(segments, points, normals)
     first, second = _plane_axes(fit)
-    places, centers = segments.take_columns(points), segments.spread_columns(fit.center)
-    centered = [place - center for place, center in zip(places, centers, strict=True)]
+    centered = segments.take_about(points, fit.center)
     u, v = (_sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
 
     def measure() -> tuple[Rectangles, Tensor, Tensor]:
@@ -202,21 +201,18 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
-    columns = segments.take_columns(normals)
-    shares, directions = eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
+    shares, directions = eigh3_of_few(_spread_of(segments, normals))
     # The direction that the normals of a region share, signs aside, and their angle to it.
     usual = directions[:, :, 2]
     spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
     origin = segments.first(points).double()
-    starts = segments.spread_columns(origin)
-    local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
+    local = segments.take_about(points, origin)
     resolution = coordinate_resolution(segments.first(points)).double()
     weights = torch.ones_like(local[0])
     for last in range(_NUM_FITS):
         total = segments.sum(weights)
         mean = torch.stack([segments.sum(x * weights) / total for x in local], dim=1)
-        middle = segments.spread_columns(mean)
-        centered = [x - m for x, m in zip(local, middle, strict=True)]
+        centered = [x - segments.spread(m) for x, m in zip(local, mean.unbind(dim=1), strict=True)]
         covariance = _covariances(segments, centered, weights)
         variances, axes = eigh3_of_few(covariance)
         normal = _with_sign(_plane_normals(variances, axes, usual))
@@ -237,6 +233,12 @@ def _sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
     """Return the scalar products of vectors given by columns."""
     (a, b, c), (x, y, z) = first, second
     return a * x + b * y + c * z
+
+
+def _spread_of(segments: Segments, normals: Tensor) -> Tensor:
+    """Return the second moments of the regions' normals, shape ``(M, 3, 3)``."""
+    columns = segments.take_columns(normals)
+    return _covariances(segments, columns, torch.ones_like(columns[0]))
 
 
 def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:

@@ -51,9 +51,8 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
         )
     if config.merge_coplanar:
         fit, floor = fit_regions(cloud, labels, config)
-        labels = merge_coplanar(
-            labels, cloud.neighbors, fit, floor, tolerance=config.merge_tolerance
-        )
+        contacts = count_contacts(labels, cloud.neighbors)
+        labels = merge_coplanar(labels, contacts, fit, floor, tolerance=config.merge_tolerance)
     if config.settle_rims:
         labels = torch.unique(labels, return_inverse=True)[1] - int((labels < 0).any())
         fit, floor = fit_regions(cloud, labels, config)
@@ -145,7 +144,12 @@ def absorb_points(
 
 
 def merge_coplanar(
-    labels: Tensor, neighbors: Neighbors, fit: FittedPlanes, floor: Tensor, *, tolerance: float
+    labels: Tensor,
+    contacts: tuple[Tensor, Tensor],
+    fit: FittedPlanes,
+    floor: Tensor,
+    *,
+    tolerance: float,
 ) -> Tensor:
     """Merge flat regions that touch and lie on one plane, the pair that fits best first.
 
@@ -153,10 +157,11 @@ def merge_coplanar(
     the plane through both is at most ``tolerance`` times what it is to its own. What is merged is
     one region from then on.
 
-    ``floor`` ``(M,)`` is the least distance to its own plane that counts for a region. A merged
-    region has the smallest label of its parts.
+    ``contacts`` are those of :func:`torchrg.regions.adjacency.count_contacts`; ``floor`` ``(M,)``
+    is the least distance to its own plane that counts for a region. A merged region has the
+    smallest label of its parts.
     """
-    pairs, num_contacts = count_contacts(labels, neighbors)
+    pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].any(dim=1)]
     moments = _moments_of(fit, floor)
     owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
@@ -200,31 +205,36 @@ def _moments_of(fit: FittedPlanes, floor: Tensor) -> _Moments:
 
 def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
     """Return for each region the smallest of those that it is merged with."""
-    groups = [moments.at(slice(i, i + 1)) for i in range(len(moments.weight))]
-    touching: list[set[int]] = [set() for _ in groups]
-    owner, age = list(range(len(groups))), [0] * len(groups)
-    queue = []
-    misfits = _misfit(moments.at(pairs[:, 0]), moments.at(pairs[:, 1]))
-    for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
+    groups = _Moments(*(values.clone() for values in moments))
+    touching: list[set[int]] = [set() for _ in groups.weight]
+    owner, age = list(range(len(touching))), [0] * len(touching)
+    queue: list[tuple[float, int, int, int, int]] = []
+
+    def offer(pairs: Tensor) -> None:
+        first, second = pairs.unbind(dim=1)
+        misfits = _misfit(groups.at(first), groups.at(second)).tolist()
+        for (a, b), misfit in zip(pairs.tolist(), misfits, strict=True):
+            if misfit <= tolerance:
+                heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
+
+    for a, b in pairs.tolist():
         touching[a].add(b)
         touching[b].add(a)
-        if misfit <= tolerance:
-            queue.append((misfit, a, b, 0, 0))
-    heapq.heapify(queue)
+    offer(pairs)
     while queue:
         _, a, b, age_a, age_b = heapq.heappop(queue)
         if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
             continue
-        groups[a] = _joined(groups[a], groups[b])
+        both = _joined(groups.at(slice(a, a + 1)), groups.at(slice(b, b + 1)))
+        for values, joined in zip(groups, both, strict=True):
+            values[a] = joined[0]
         owner[b] = a
         age[a] += 1
         touching[a] = {_root(owner, c) for c in touching[a] | touching[b]} - {a}
         for c in touching[a]:
             touching[c].add(a)
-            first, second = min(a, c), max(a, c)
-            misfit = float(_misfit(groups[first], groups[second]))
-            if misfit <= tolerance:
-                heapq.heappush(queue, (misfit, first, second, age[first], age[second]))
+        beside = [(min(a, c), max(a, c)) for c in touching[a]]
+        offer(torch.tensor(beside, dtype=torch.int64).view(-1, 2))
     return [_root(owner, i) for i in range(len(owner))]
 
 

@@ -1,0 +1,200 @@
+"""Planes of square windows all over a depth image, and the noise they tell.
+
+Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows stand a cell
+apart, so that the sums over all large ones together cost less than those over the smallest.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg._parallel import map_tasks
+from torchrg.linalg import machine_epsilon
+from torchrg.linalg.moments import kth_smallest
+
+CELL_SIZES = (8, 4, 2, 1)
+"""Widths of the cells in pixels, the largest first."""
+REACH = 2
+"""A window reaches over so many cells around its middle one."""
+SIDE = 2 * REACH + 1
+"""Cells along a side of a window."""
+_LEAST_SHARE = 0.4
+"""A window with fewer of its pixels seen has no plane."""
+_LEAST_SPREAD = 0.2
+"""Nor has one whose pixels have a covariance with less than this of a full window's determinant:
+they lie nearly on a line."""
+_FLAT_QUANTILE = 0.35
+"""At least a third of an indoor image is flat: its windows deviate by noise alone."""
+_NUM_BINS = 12
+"""Classes of depth that noise is fitted to."""
+_MOST_GROWTH = 1.4
+"""Noise of windows grows at most by this from one size to the next."""
+_ROUNDING = 8.0
+"""Least noise of inverse depth, in units of the rounding of the depth."""
+_LEAST_ROUNDING = 1e-7
+"""And as a share of it, whatever the dtype."""
+
+
+class WindowPlanes(NamedTuple):
+    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows.
+
+    ``deviation`` is the standard deviation of a window's pixels from its plane, infinite where
+    there is none, ``mean`` their mean value. All are of one shape, ``(h, w)`` for the windows
+    around the cells of an image.
+    """
+
+    u_slope: Tensor
+    v_slope: Tensor
+    origin: Tensor
+    deviation: Tensor
+    mean: Tensor
+
+    def take(self, places: Tensor) -> "WindowPlanes":
+        """Return those at some row-major places."""
+        return WindowPlanes(*(part.flatten()[places] for part in self))
+
+
+def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int, WindowPlanes]:
+    """Fit a plane by least squares to the window around each cell, for each size of cells.
+
+    The image ``(H, W)``, float64, holds anything finite where not seen; its columns are at ``u``
+    ``(W,)``, its rows at ``v`` ``(H, 1)``. Cells begin at the first pixel, and windows are cut off
+    at the borders of the image. One with too few pixels seen, or whose pixels lie nearly on a line,
+    has no plane. Sizes ascend.
+    """
+    ones = seen.to(values.dtype)
+    w = torch.where(seen, values, 0.0)
+    mu, mv = ones * u, ones * v
+    moments = [ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w]
+    sums = zip(*map_tasks(_window_sums, moments, values.device), strict=True)
+    return {
+        size: _fit_planes(some, SIDE * size)
+        for size, some in zip(sorted(CELL_SIZES), sums, strict=True)
+    }
+
+
+def _window_sums(image: Tensor) -> list[Tensor]:
+    """Return the sums of an image over the windows of each size ``(h, w)``; sizes ascend."""
+    sums = []
+    for size in sorted(CELL_SIZES):
+        image = _sums_of_pairs(image) if size > 1 else image
+        sums.append(_sums_around(image))
+    return sums
+
+
+def _sums_of_pairs(cells: Tensor) -> Tensor:
+    """Return the sums over cells of twice the width, ``(ceil(h / 2), ceil(w / 2))``."""
+    height, width = cells.shape
+    if height % 2 or width % 2:
+        cells = torch.nn.functional.pad(cells, (0, width % 2, 0, height % 2))
+    rows = cells[0::2] + cells[1::2]
+    return rows[:, 0::2] + rows[:, 1::2]
+
+
+def _sums_around(cells: Tensor) -> Tensor:
+    """Return the sums over the cells of the window around each, ``(h, w)``."""
+    for axis in (0, 1):
+        length, total = cells.shape[axis], cells.clone()
+        for step in range(1, min(REACH, length - 1) + 1):
+            total.narrow(axis, step, length - step).add_(cells.narrow(axis, 0, length - step))
+            total.narrow(axis, 0, length - step).add_(cells.narrow(axis, step, length - step))
+        cells = total
+    return cells
+
+
+def _fit_planes(sums: Sequence[Tensor], side: int) -> WindowPlanes:
+    """Return the planes of windows with so many pixels along a side, from sums of moments."""
+    count, *moments = sums
+    share = 1 / count.clamp(min=1)
+    mean_u, mean_v, mean_w, uu, uv, vv, uw, vw, ww = (part * share for part in moments)
+    uu, uv, vv = uu - mean_u * mean_u, uv - mean_u * mean_v, vv - mean_v * mean_v
+    uw, vw, ww = uw - mean_u * mean_w, vw - mean_v * mean_w, ww - mean_w * mean_w
+    spread = uu * vv - uv * uv
+    full = (side * side - 1) / 12
+    found = (count >= _LEAST_SHARE * side**2) & (spread > _LEAST_SPREAD * full**2)
+    spread = torch.where(found, spread, 1.0)
+    u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
+    variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
+    return WindowPlanes(
+        u_slope,
+        v_slope,
+        mean_w - u_slope * mean_u - v_slope * mean_v,
+        torch.where(found, variance.sqrt(), torch.inf),
+        mean_w,
+    )
+
+
+class WindowNoise(NamedTuple):
+    """Noise of inverse depth ``w`` as windows of a size see it: ``factor (growth + constant w^2)``.
+
+    It is never less than ``rounding`` times the inverse depth.
+    """
+
+    factor: float
+    constant: float
+    growth: float
+    rounding: float
+
+    def at(self, inverse: Tensor) -> Tensor:
+        """Return the noise at inverse depths."""
+        least = self.rounding * inverse
+        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
+        return torch.maximum(self.factor * usual, least)
+
+
+def noise_by_size(
+    windows: Mapping[int, WindowPlanes], given: tuple[float, float] | None, dtype: torch.dtype
+) -> dict[int, WindowNoise]:
+    r"""Return the noise of inverse depth as windows of each size see it.
+
+    A standard deviation of ``a + b z^2`` in depth is one of ``b + a w^2`` in inverse depth
+    ``w = 1 / z``. Where ``a`` and ``b`` are not given, they are fitted to what windows deviate from
+    their planes: to the 35 % quantiles of twelve classes of depth. Neighbouring pixels of a sensor
+    err alike, and its depth has steps, so that large windows deviate more than small ones: the
+    noise has a factor for each size. It is never less than the rounding of ``dtype``, that of the
+    depth.
+    """
+    rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING)
+    if given is not None:
+        constant, growth = given
+        return dict.fromkeys(windows, WindowNoise(1.0, constant, growth, rounding))
+    middle = windows[sorted(windows)[len(windows) // 2 - 1]]
+    shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
+    noises, factor = {}, 0.0
+    for size in sorted(windows):
+        found = windows[size].deviation.isfinite()
+        deviation, mean = windows[size].deviation[found], windows[size].mean[found]
+        ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
+        usual = float(_low_quantile(ratios)) if len(ratios) else factor
+        factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
+        noises[size] = shape._replace(factor=factor)
+    return noises
+
+
+def _low_quantile(values: Tensor) -> Tensor:
+    """Return the quantile of values that flat windows reach."""
+    return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
+
+
+def _fit_noise(windows: WindowPlanes, rounding: float) -> tuple[float, float]:
+    """Fit ``b + a w^2``, both not negative, to the deviations of flat windows; return a and b."""
+    used = windows.deviation.isfinite()
+    mean, order = windows.mean[used].sort()
+    deviation = torch.maximum(windows.deviation[used][order], rounding * mean)
+    bins = [part for part in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(part)]
+    if not bins:
+        return 0.0, 0.0
+    x = torch.stack([mean[part].square().mean() for part in bins])
+    q = torch.stack([_low_quantile(deviation[part]) for part in bins])
+    # Relative errors: a class whose windows are all cluttered counts little.
+    p, e = x / q, 1 / q
+    spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2
+    constant = (p.sum() * (e * e).sum() - e.sum() * (p * e).sum()) / spread
+    growth = (e.sum() * (p * p).sum() - p.sum() * (p * e).sum()) / spread
+    if not bool(growth > 0):
+        return float(p.sum() / (p * p).sum()), 0.0
+    if not bool(constant > 0):
+        return 0.0, float(e.sum() / (e * e).sum())
+    return float(constant), float(growth)
