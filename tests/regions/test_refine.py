@@ -10,7 +10,7 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
-from torchrg.regions.criteria import GrowingCloud
+from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.refine import absorb_points, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 

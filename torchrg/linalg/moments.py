@@ -95,6 +95,7 @@ class Segments:
 
     Args:
         labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
+        most: Points of a region that are taken, evenly along their rows. Default: all.
 
     Example:
         >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
@@ -104,12 +105,21 @@ class Segments:
         [2.0, 2.0]
     """
 
-    def __init__(self, labels: Tensor) -> None:
+    def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
         ascending, rows = labels.sort(stable=True)
         num_unlabeled = int(torch.searchsorted(ascending, 0))
         self.rows = rows[num_unlabeled:]
         self.labels = ascending[num_unlabeled:].long()
         self.counts = torch.bincount(self.labels)
+        if most is not None:
+            ends = self.counts.cumsum(0).tolist()
+            parts = [
+                torch.arange(end - count, end, -(-count // most), device=labels.device)
+                for end, count in zip(ends, self.counts.tolist(), strict=True)
+            ]
+            taken = torch.cat(parts) if parts else self.rows
+            self.rows, self.labels = self.rows[taken], self.labels[taken]
+            self.counts = torch.bincount(self.labels)
 
     def take(self, values: Tensor) -> Tensor:
         """Return the values of the points that have a region, region by region."""

@@ -1,5 +1,6 @@
-"""Faces that growth joined through a few doubtful points, told apart again."""
+"""What is one face: regions that only a bridge joins are split, coplanar ones become one."""
 
+import heapq
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,13 +10,15 @@ from torch import Tensor
 
 from torchrg._parallel import chunks_of
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords
 from torchrg.linalg.moments import Segments
-from torchrg.regions.criteria import GrowingCloud, within_angle
-from torchrg.regions.edges import accept_edges
-from torchrg.regions.planes import fit_planes
-from torchrg.regions.refine import fit_regions, joint_misfits
+from torchrg.regions.adjacency import count_contacts
+from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
+from torchrg.regions.planes import FittedPlanes, fit_planes, fit_regions
 from torchrg.structures import UNLABELED, Neighbors
+
+_LEAST_CONTACTS = 3
+"""Regions that touch in fewer points are not merged: one may be an outlier's."""
 
 _STRICTER = 0.5
 """Share of the limits of angle and distance within which the core of a face holds together."""
@@ -128,24 +131,21 @@ def cut_bridges(
 
 def _find_suspects(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> _Suspects:
     """Return the doubtful and the sound points of regions with many points off their plane."""
-    fit, floor = fit_regions(cloud, labels, config)
-    segments = Segments(labels)
-    limit = _EXACT_REACH * floor
-    if cloud.reach is not None:
-        usual = segments.median(segments.take(cloud.reach)).double()
-        limit = torch.maximum(torch.where(usual.isfinite(), usual, limit), limit)
-    off = fit.residuals.abs() > segments.spread(limit)
-    num_off = segments.sum(off.double())
-    on_plane = num_off <= _MOST_OFF_PLANE * segments.counts
-    bent = num_off >= config.min_size
-    chosen = (off | ~segments.spread(on_plane)) & segments.spread(bent)
-    rows = segments.rows[chosen].sort().values
-    directions = segments.spread_columns(fit.normal)
-    aligned = sq_chords(segments.take_columns(cloud.normals), directions) <= deg_to_sq_chord(
-        _STRICTER * config.max_angle_deg
-    )
-    sound = torch.zeros_like(labels, dtype=torch.bool)
-    sound[segments.rows] = aligned & ~off & segments.spread(on_plane & bent)
+    planes = fit_regions(cloud, labels, config)
+    limit = _EXACT_REACH * planes.floor
+    limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
+    region, has_region = labels.clamp(min=0), labels >= 0
+    off = has_region & (planes.distances(cloud.points, region) > limit[region])
+    num_off = torch.bincount(labels[off], minlength=len(limit))
+    on_plane = num_off <= _MOST_OFF_PLANE * planes.fit.num_points
+    mixed = num_off >= config.min_size
+    doubtful = torch.where(on_plane[region], off, has_region) & mixed[region]
+    rows = doubtful.nonzero().squeeze(1)
+    others = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
+    directions = planes.fit.normal[labels[others]].unbind(dim=1)
+    turn = sq_chords(cloud.normals[others].double().unbind(dim=1), directions)
+    aligned = turn <= deg_to_sq_chord(_STRICTER * config.max_angle_deg)
+    sound = torch.zeros_like(off).index_fill_(0, others[aligned], True)
     return _Suspects(rows, sound, on_plane)
 
 
@@ -220,7 +220,7 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _Edges) -> Tensor:
     num_edges = torch.bincount(numbers, minlength=len(pairs))
     num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
     fit = fit_planes(Segments(cores), cloud.points, cloud.normals)
-    joined = joint_misfits(fit, pairs) < _LEAST_MISFIT
+    joined = _explains_both(fit, pairs)
     joined |= num_open >= _OPEN_SHARE * num_edges
     ends = pairs[joined].T.cpu().numpy()
     ones = np.ones(ends.shape[1], dtype=np.int8)
@@ -243,3 +243,134 @@ def _follow(cores: Tensor, edges: _Edges) -> Tensor:
         cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
         waiting = waiting[~joined]
     return cores
+
+
+def merge_coplanar(
+    labels: Tensor,
+    neighbors: Neighbors,
+    fit: FittedPlanes,
+    floor: Tensor,
+    noise: Tensor | None = None,
+    *,
+    tolerance: float,
+) -> Tensor:
+    """Merge regions that touch and lie on one plane, the pair that fits best first.
+
+    Two regions are merged when one plane explains both: the root mean square distance of either to
+    the plane through both is at most ``tolerance`` times what it is to its own. Of the smaller one
+    the larger one's noise counts if that is more: what noise breaks off a face is thinner than the
+    face, or curved. Otherwise curved regions have no plane. What is merged is one region from then
+    on.
+
+    ``floor`` ``(M,)`` is the least distance to its own plane that counts for a region, ``noise``
+    ``(M,)`` that of the points around it, 0 where that is not known. A merged region has the
+    smallest label of its parts.
+    """
+    pairs, num_contacts = count_contacts(labels, neighbors)
+    pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].all(dim=1)]
+    moments = _moments_of(fit, floor, noise)
+    owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
+    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+
+
+class _Moments(NamedTuple):
+    """What merging reads of M regions, in float64.
+
+    Number of points, their mean, about an origin near them, and covariance, the distance from its
+    plane that counts as lying on it (none from that of a curved one), and the noise it lends.
+    """
+
+    weight: Tensor
+    mean: Tensor
+    covariance: Tensor
+    scale: Tensor
+    noise: Tensor
+
+    def at(self, rows: Tensor | slice) -> "_Moments":
+        """Return those of some of the regions."""
+        return _Moments(*(values[rows] for values in self))
+
+
+def _moments_of(fit: FittedPlanes, floor: Tensor, noise: Tensor | None) -> _Moments:
+    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
+    return _Moments(
+        fit.num_points.double(),
+        fit.center - fit.center[:1],
+        fit.covariance,
+        torch.where(fit.curved, 0.0, torch.maximum(own.clamp(min=0).sqrt(), floor)),
+        torch.zeros_like(own) if noise is None else noise,
+    )
+
+
+def _explains_both(fit: FittedPlanes, pairs: Tensor) -> Tensor:
+    """Tell which pairs of regions one plane explains, by the thickness of the thicker one."""
+    moments = _moments_of(fit, fit.thickness, None)
+    thickness = fit.thickness[pairs].amax(dim=1)
+    first, second = (moments.at(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
+    return _misfit(first, second) < _LEAST_MISFIT
+
+
+def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
+    """Return for each region the smallest of those that it is merged with."""
+    groups = [moments.at(slice(i, i + 1)) for i in range(len(moments.weight))]
+    touching: list[set[int]] = [set() for _ in groups]
+    owner, age = list(range(len(groups))), [0] * len(groups)
+    queue = []
+    misfits = _misfit(moments.at(pairs[:, 0]), moments.at(pairs[:, 1]))
+    for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
+        touching[a].add(b)
+        touching[b].add(a)
+        if misfit <= tolerance:
+            queue.append((misfit, a, b, 0, 0))
+    heapq.heapify(queue)
+    while queue:
+        _, a, b, age_a, age_b = heapq.heappop(queue)
+        if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
+            continue
+        groups[a] = _joined(groups[a], groups[b])
+        owner[b] = a
+        age[a] += 1
+        touching[a] = {_root(owner, c) for c in touching[a] | touching[b]} - {a}
+        for c in touching[a]:
+            touching[c].add(a)
+            first, second = min(a, c), max(a, c)
+            misfit = float(_misfit(groups[first], groups[second]))
+            if misfit <= tolerance:
+                heapq.heappush(queue, (misfit, first, second, age[first], age[second]))
+    return [_root(owner, i) for i in range(len(owner))]
+
+
+def _root(owner: list[int], i: int) -> int:
+    """Return the region that region i has become part of."""
+    while owner[i] != i:
+        owner[i] = owner[owner[i]]
+        i = owner[i]
+    return i
+
+
+def _joined(a: _Moments, b: _Moments) -> _Moments:
+    """Return the moments of two sets of regions, taken together one by one."""
+    weight = a.weight + b.weight
+    share_a, share_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
+    mean = share_a * a.mean + share_b * b.mean
+    covariance = torch.zeros_like(a.covariance)
+    for part, share in ((a, share_a), (b, share_b)):
+        shift = part.mean - mean
+        spread = part.covariance + shift[:, :, None] * shift[:, None, :]
+        covariance = covariance + share[:, :, None] * spread
+    noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
+    return _Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale), noise)
+
+
+def _misfit(a: _Moments, b: _Moments) -> Tensor:
+    """Return how far from the joint plane the worse of two regions is, in its own scales."""
+    both = _joined(a, b)
+    normal = eigh3_of_few(both.covariance)[1][:, :, 0]
+    misfits = []
+    for part, other in ((a, b), (b, a)):
+        own = (normal[:, None] @ part.covariance @ normal[:, :, None])[:, 0, 0]
+        shift = ((part.mean - both.mean) * normal).sum(dim=1)
+        rms = (own.clamp(min=0) + shift * shift).sqrt()
+        lent = torch.where(other.weight > part.weight, other.noise, 0.0)
+        misfits.append(torch.where(rms > 0, rms / torch.maximum(part.scale, lent), 0.0))
+    return torch.maximum(*misfits)
