@@ -114,7 +114,7 @@ class Segments:
         if most is not None:
             ends = self.counts.cumsum(0).tolist()
             parts = [
-                torch.arange(end - count, end, -(-count // most), device=labels.device)
+                torch.arange(end - count, end, max(-(-count // most), 1), device=labels.device)
                 for end, count in zip(ends, self.counts.tolist(), strict=True)
             ]
             taken = torch.cat(parts) if parts else self.rows

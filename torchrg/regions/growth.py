@@ -101,7 +101,9 @@ def grow_regions(
     if order is not None:
         cloud = _reordered(cloud, order)
     heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
-    labels = number_by_size(heads, config.min_size)
+    # A region may be large enough only with the points that it absorbs.
+    least = -(-config.min_size // 2) if config.absorb else config.min_size
+    labels = number_by_size(heads, least)
     if config.cut_bridges and bool((labels >= 0).any()):
 
         def grow(part: GrowingCloud, share: float) -> Tensor:
@@ -110,7 +112,7 @@ def grow_regions(
             return number_by_size(found, config.min_size)
 
         parts = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
-        labels = number_by_size(parts, config.min_size)
+        labels = number_by_size(parts, least)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
