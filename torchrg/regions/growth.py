@@ -21,6 +21,7 @@ from torchrg.regions.edges import (
     neighborhood_radii,
 )
 from torchrg.regions.faces import cut_bridges
+from torchrg.regions.planes import LEAST_FITTED
 from torchrg.regions.refine import refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -101,8 +102,10 @@ def grow_regions(
     if order is not None:
         cloud = _reordered(cloud, order)
     heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
-    # A region may be large enough only with the points that it absorbs.
-    least = -(-config.min_size // 2) if config.absorb else config.min_size
+    least = config.min_size
+    if config.absorb:
+        # A region may be large enough only with the points that it absorbs.
+        least = min(least, max(least // 2, LEAST_FITTED))
     labels = number_by_size(heads, least)
     if config.cut_bridges and bool((labels >= 0).any()):
 

@@ -42,6 +42,9 @@ _MOST_FITTED = 4096
 """Points of a region that its plane is fitted to while regions change: more of them move it by less
 than a fiftieth of their noise."""
 
+LEAST_FITTED = 10
+"""Points whose plane says where others at its border belong: that of three passes through them."""
+
 _BENT = 0.5
 """Reaches. A region thicker than this share of the reach that its points have is bent: twice as
 thick as the neighbourhoods in it. From 0.3 to 0.5 made rooms come out the same."""

@@ -12,7 +12,7 @@ from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import contact_neighbors
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.faces import merge_coplanar
-from torchrg.regions.planes import FittedPlanes, fit_regions
+from torchrg.regions.planes import LEAST_FITTED, FittedPlanes, fit_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 _AGREE = 0.3
@@ -22,6 +22,9 @@ regions instead of 308."""
 
 _MAX_PASSES = 10
 """Times. Points that moved are neighbours of the next: narrow strips fill from their ends."""
+
+_ROUNDING = 0.01
+"""Thicknesses. Smaller distances decide nothing."""
 
 _PARALLEL_DEG = 15.0
 """At a smaller angle the line in which two planes cross may be far from where the faces end."""
@@ -74,7 +77,8 @@ def refine_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
         fit = planes.fit
         reach = reach_of_planes(fit, planes.floor, config.absorb_reach)
         # Where a bent face ends its plane does not say.
-        reach = torch.where(planes.bent, torch.nan, reach)
+        vague = planes.bent | (fit.num_points < LEAST_FITTED)
+        reach = torch.where(vague, torch.nan, reach)
         rims = RimPlanes(fit.normal, fit.center, planes.thickness, reach)
         labels = settle_rims(cloud, labels, rims)
     return labels
@@ -241,7 +245,8 @@ def _choose(
     known = options.clamp(min=0)
     distance = planes.distances(place, known).abs()
     usable = (options >= 0) & (distance <= planes.reach[known])
-    cost = torch.where(usable, (distance / planes.thickness[known]).square(), torch.inf)
+    cost = (distance / planes.thickness[known]).square() + _ROUNDING**2 * (options != own[:, None])
+    cost = torch.where(usable, cost, torch.inf)
     first, first_cost = _least(cost, options)
     second, second_cost = _least(torch.where(options == first[:, None], torch.inf, cost), options)
     # A region that the point is far from is growth's choice.
@@ -291,7 +296,8 @@ def _beyond(
         away += (x[indices].double() - start[:, None]) * part[:, None]
     away *= inside
     total = away.sum(dim=1)
-    one_sided = total.abs() > _ONE_SIDED * away.abs().sum(dim=1)
+    rounding = _ROUNDING * planes.thickness[own] * inside.sum(dim=1)
+    one_sided = total.abs() > (_ONE_SIDED * away.abs().sum(dim=1)).clamp(min=rounding)
     foot = place - planes.distances(place, own[:, None]) * planes.normal[own]
     over = -total.sign() * planes.distances(foot, other[:, None]).squeeze(1)
     return torch.where(one_sided, over.clamp(min=0), 0.0)
