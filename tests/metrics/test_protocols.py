@@ -215,3 +215,10 @@ def test_split_faces_cost_no_voxels_and_merged_ones_do():
     assert score_voxels(points, nothing, truth, voxel_size=1.0) == (0.0, 0.0, 0.0)
     points[0] = torch.nan
     assert score_voxels(points, split, nothing, voxel_size=1.0) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("truth", "recall"), [([0, 0, 1, 2], 0.5), ([0, 0, 1, 2, 3], 0.0)])
+def test_a_region_has_a_face_if_that_holds_half_of_its_points(truth, recall):
+    points = torch.arange(float(len(truth)))[:, None] * torch.tensor([1.0, 0, 0])
+    labels, truth = torch.zeros(len(truth), dtype=torch.int64), torch.tensor(truth)
+    assert score_voxels(points, labels, truth, voxel_size=1.0).recall == recall
