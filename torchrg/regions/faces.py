@@ -14,7 +14,7 @@ from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import count_contacts
 from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
-from torchrg.regions.planes import FittedPlanes, fit_planes, fit_regions
+from torchrg.regions.planes import MOST_FITTED, FittedPlanes, fit_planes, fit_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 _LEAST_CONTACTS = 3
@@ -54,12 +54,13 @@ class _Suspects(NamedTuple):
     Attributes:
         rows: Points that may be of another face, ascending: those off the plane where nearly all
             are on it, all others.
-        sound: Points on the plane of a region of which nearly all are, with its direction, shape
-            ``(N,)``, bool.
+        near: Points on the plane of a region of which nearly all are, shape ``(N,)``, bool.
+        sound: Those of them with its direction.
         on_plane: Regions of which nearly all points are on one plane, shape ``(M,)``, bool.
     """
 
     rows: Tensor
+    near: Tensor
     sound: Tensor
     on_plane: Tensor
 
@@ -98,7 +99,7 @@ def cut_bridges(
     perhaps with gaps in their numbers. ``grow`` returns the labels of a cloud within a share of the
     limits.
     """
-    rows, sound, on_plane = _find_suspects(cloud, labels, config)
+    rows, near, sound, on_plane = _find_suspects(cloud, labels, config)
     if len(rows) == 0:
         return labels
     cores = torch.full_like(labels, UNLABELED)
@@ -117,12 +118,17 @@ def cut_bridges(
     cores = torch.unique(cores, return_inverse=True)[1] - int((cores < 0).any())
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
 
-    pairs = torch.unique(torch.stack([labels, cores])[:, cores >= 0], dim=1)
-    split = torch.bincount(pairs[0], minlength=len(others)) > 1
-    flat = ~fit_planes(Segments(cores), cloud.points, cloud.normals).curved
+    owner = torch.full((int(cores.max()) + 1,), UNLABELED, device=labels.device)
+    owner[cores[cores >= 0]] = labels[cores >= 0]
+    split = torch.bincount(owner, minlength=len(others)) > 1
+    flat = ~fit_planes(Segments(cores, most=MOST_FITTED), cloud.points, cloud.normals).curved
     covered = torch.bincount(labels[(cores >= 0) & flat[cores.clamp(min=0)]], minlength=len(others))
     split &= on_plane | (covered >= _LEAST_FLAT * torch.bincount(labels[labels >= 0]))
     free = (labels >= 0) & split[labels.clamp(min=0)]
+    # Of points on the plane only those with its direction tell which cores it meets.
+    plane_of = torch.full_like(others, UNLABELED, dtype=torch.int64)
+    plane_of[labels[sound]] = cores[sound]
+    cores = torch.where(near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
     waiting = (free & (cores < 0)).nonzero().squeeze(1)
     cores = _follow(cores, _find_edges(cloud, labels, config, waiting, chunk_size))
     new = torch.where(cores >= 0, cores + len(others), UNLABELED)
@@ -141,12 +147,15 @@ def _find_suspects(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
     mixed = num_off >= config.min_size
     doubtful = torch.where(on_plane[region], off, has_region) & mixed[region]
     rows = doubtful.nonzero().squeeze(1)
-    others = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
+    near = has_region & ~off & (on_plane & mixed)[region]
+    others = near.nonzero().squeeze(1)
     directions = planes.fit.normal[labels[others]].unbind(dim=1)
     turn = sq_chords(cloud.normals[others].double().unbind(dim=1), directions)
-    aligned = turn <= deg_to_sq_chord(_STRICTER * config.max_angle_deg)
-    sound = torch.zeros_like(off).index_fill_(0, others[aligned], True)
-    return _Suspects(rows, sound, on_plane)
+    near, sound = (
+        torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
+        for limit in (config.max_angle_deg, _STRICTER * config.max_angle_deg)
+    )
+    return _Suspects(rows, near, sound, on_plane)
 
 
 def _are_level(
@@ -219,7 +228,7 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _Edges) -> Tensor:
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(numbers, minlength=len(pairs))
     num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
-    fit = fit_planes(Segments(cores), cloud.points, cloud.normals)
+    fit = fit_planes(Segments(cores, most=MOST_FITTED), cloud.points, cloud.normals)
     joined = _explains_both(fit, pairs)
     joined |= num_open >= _OPEN_SHARE * num_edges
     ends = pairs[joined].T.cpu().numpy()

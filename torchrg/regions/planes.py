@@ -38,7 +38,7 @@ _CURVED_SPREAD_DEG = 8.0
 """Root mean square angle of a region's normals to the direction they share, from which on it is
 curved: a smooth bend by three to four times this angle has this spread, a full column 45."""
 
-_MOST_FITTED = 4096
+MOST_FITTED = 4096
 """Points of a region that its plane is fitted to while regions change: more of them move it by less
 than a fiftieth of their noise."""
 
@@ -290,7 +290,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
 
     ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative.
     """
-    segments = Segments(labels, most=_MOST_FITTED)
+    segments = Segments(labels, most=MOST_FITTED)
     fit = fit_planes(segments, cloud.points, cloud.normals)
     indices, counted = cloud.neighbors
     some = Neighbors(indices[segments.rows], None if counted is None else counted[segments.rows])

@@ -142,12 +142,13 @@ def absorb_points(
     nearest, counted = contact_neighbors(neighbors)
     limit = deg_to_sq_chord(max_angle_deg)
     waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
+    new = labels != UNLABELED
     while len(waiting):
-        near = torch.where(counted[waiting], labels[nearest[waiting]], UNLABELED)
-        touches = (near >= 0).any(dim=1)
-        rows, near = waiting[touches], near[touches]
+        # What did not fit does not fit later: only new neighbours may change it.
+        rows = waiting[(new[nearest[waiting]] & counted[waiting]).any(dim=1)]
         if len(rows) == 0:
             break
+        near = torch.where(counted[rows], labels[nearest[rows]], UNLABELED)
         region = near.clamp(min=0)
         away = points[rows].double()[:, None] - center[region]
         distance = (away * normal[region]).sum(dim=2).abs()
@@ -157,10 +158,10 @@ def absorb_points(
         distance = torch.where(fits, distance, torch.inf)
         least = distance.amin(dim=1, keepdim=True)
         joined = least.squeeze(1).isfinite()
-        if not joined.any():
-            break
         choice = torch.where(distance == least, near, len(normal)).amin(dim=1)
-        labels[rows[joined]] = choice[joined]
+        rows = rows[joined]
+        labels[rows] = choice[joined]
+        new = torch.zeros_like(new).index_fill_(0, rows, True)
         waiting = waiting[labels[waiting] == UNLABELED]
     return labels
 
