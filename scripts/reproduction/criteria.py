@@ -13,7 +13,7 @@ from reproduction.runs import Run
 from reproduction.sections import Block, figure, text
 from torchrg import estimate_normals, load_config, search_knn
 from torchrg.neighbors import gather_patches
-from torchrg.regions.criteria import coplanarity_limits, patch_radii, plane_residuals
+from torchrg.regions.edges import coplanarity_limits, patch_radii, plane_residuals
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.structures import Neighbors
 

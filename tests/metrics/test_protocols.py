@@ -6,7 +6,13 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError
-from torchrg.metrics import SegCompCounts, contingency_table, count_segcomp, score_evops
+from torchrg.metrics import (
+    SegCompCounts,
+    contingency_table,
+    count_segcomp,
+    score_evops,
+    score_voxels,
+)
 
 
 def sets_of(labels):
@@ -165,3 +171,54 @@ def test_segcomp_refuses_a_threshold_without_unique_classes(threshold):
     table = contingency_table(torch.tensor([0]), torch.tensor([0]))
     with pytest.raises(ConfigError, match=r"count_segcomp: expected threshold in \[0.5, 1\), got"):
         count_segcomp(table, threshold=threshold)
+
+
+def voxels_by_definition(points, labels, truth, size):
+    """The published evaluator, literally: voxels of each plane as sets, one plane at a time."""
+    low = points.amin(dim=0)
+    cells = [tuple(cell) for cell in ((points - low) / size).floor().long().tolist()]
+    regions, faces = sets_of(labels), sets_of(truth)
+    face_of = {}
+    for a, region in regions.items():
+        held = {b: len(region & face) for b, face in faces.items()}
+        best = max(sorted(held), key=lambda b: held[b])
+        face_of[a] = best if held[best] >= len(region) / 2 else None
+    inside = {name: {cells[i] for i in rows} for name, rows in regions.items()}
+    true = {name: {cells[i] for i in rows} for name, rows in faces.items()}
+    found, all_true = set().union(*inside.values()), set().union(*true.values())
+    right = set().union(*(inside[a] & true[b] for a, b in face_of.items() if b is not None))
+    return len(right) / len(found), len(right) / len(all_true)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_voxel_shares_are_those_of_the_definition(seed):
+    labels, truth = spoiled_labels(seed)
+    rng = torch.Generator().manual_seed(seed)
+    points = torch.rand(len(truth), 3, generator=rng, dtype=torch.float64)
+    points[:, 0] += 0.3 * truth.clamp(min=0)
+    score = score_voxels(points, labels, truth, voxel_size=0.25)
+    precision, recall = voxels_by_definition(points, labels.tolist(), truth.tolist(), 0.25)
+    assert (score.precision, score.recall) == pytest.approx((precision, recall), abs=1e-14)
+    assert 0 < recall < 1
+    order = torch.randperm(len(truth), generator=rng)
+    assert score_voxels(points[order], labels[order], truth[order], voxel_size=0.25) == score
+
+
+def test_split_faces_cost_no_voxels_and_merged_ones_do():
+    points = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
+    truth = (points[:, 0] >= 2).long()
+    split = points[:, 0].long()
+    assert score_voxels(points, split, truth, voxel_size=1.0) == (1.0, 1.0, 1.0)
+    merged = torch.zeros_like(truth)
+    assert score_voxels(points, merged, truth, voxel_size=1.0) == (0.5, 0.5, 0.5)
+    nothing = torch.full_like(truth, -1)
+    assert score_voxels(points, nothing, truth, voxel_size=1.0) == (0.0, 0.0, 0.0)
+    points[0] = torch.nan
+    assert score_voxels(points, split, nothing, voxel_size=1.0) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("truth", "recall"), [([0, 0, 1, 2], 0.5), ([0, 0, 1, 2, 3], 0.0)])
+def test_a_region_has_a_face_if_that_holds_half_of_its_points(truth, recall):
+    points = torch.arange(float(len(truth)))[:, None] * torch.tensor([1.0, 0, 0])
+    labels, truth = torch.zeros(len(truth), dtype=torch.int64), torch.tensor(truth)
+    assert score_voxels(points, labels, truth, voxel_size=1.0).recall == recall

@@ -17,8 +17,8 @@ PLAIN = GrowingConfig(
     seed_rule="curvature", connectivity=None, coplanarity=False, min_size=20, max_angle_deg=15.0
 )
 CUTTING = dataclasses.replace(PLAIN, cut_bridges=True)
-WHOLE = load_config("consensus")
-CUT = dataclasses.replace(WHOLE, growing=dataclasses.replace(WHOLE.growing, cut_bridges=True))
+CUT = load_config("consensus")
+WHOLE = dataclasses.replace(CUT, growing=dataclasses.replace(CUT.growing, cut_bridges=False))
 
 
 def crease(angle_deg, noise, joint, num_points=4000):

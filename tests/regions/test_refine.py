@@ -7,10 +7,12 @@ import torch
 from tests.regions import growing_clouds
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError
+from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.adjacency import contact_neighbors, count_contacts
-from torchrg.regions.criteria import GrowingCloud
+from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.planes import fit_planes, fit_regions
 from torchrg.regions.refine import absorb_points, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -180,6 +182,90 @@ def test_curved_regions_are_neither_merged_nor_fed():
     labels[cloud.points[:, 2] > 7.2] = UNLABELED
     config = with_settings(absorb=True, merge_coplanar=True)
     assert torch.equal(refine_regions(cloud, labels, config), labels)
+
+
+def test_planes_of_large_regions_are_those_of_all_their_points():
+    points = sheet(np.random.default_rng(11), 20_000)
+    points[::2] = points[::2, [2, 1, 0]]
+    cloud, order = flat_cloud(points)
+    labels = order % 2
+    normals = torch.eye(3, dtype=torch.float64)[torch.where(labels == 0, 0, 2)]
+    cloud = cloud._replace(normals=normals)
+    found = fit_regions(cloud, labels, OFF)
+    full = fit_planes(Segments(labels), cloud.points, cloud.normals)
+    assert found.fit.num_points.tolist() == [10_000, 10_000]
+    torch.testing.assert_close(found.thickness, full.thickness, rtol=0.03, atol=0)
+    assert (found.fit.normal * full.normal).sum(dim=1).min() > np.cos(np.radians(0.02))
+    away = found.distances(cloud.points, labels)
+    in_order = torch.empty_like(away).index_copy_(0, Segments(labels).rows, full.residuals.abs())
+    assert (away - in_order).abs().max() < 1e-3
+
+
+def scattered(rng, count, angle_deg):
+    """Upward normals that are off by some degrees along both axes."""
+    slopes = np.tan(np.radians(angle_deg)) * rng.normal(size=(count, 2))
+    normals = np.concatenate([slopes, np.ones((count, 1))], axis=1)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def test_scattered_normals_make_a_region_curved_only_where_noise_does_not_explain_its_thickness():
+    rng = np.random.default_rng(12)
+    strip = sheet(rng, 400) * [1, 0.04, 1]
+    cloud, _ = flat_cloud(strip, normals=scattered(rng, 400, 10.0))
+    whole = torch.zeros(400, dtype=torch.int64)
+    reach = torch.full((400,), 4 * 0.002)
+    assert fit_regions(cloud, whole, OFF).fit.curved.tolist() == [True]
+    found = fit_regions(cloud._replace(reach=reach), whole, OFF)
+    assert (found.fit.curved.tolist(), found.bent.tolist()) == ([False], [False])
+    assert found.noise.item() == pytest.approx(0.002, rel=0.2)
+    for unknown in (reach / 4, torch.full_like(reach, torch.inf)):
+        found = fit_regions(cloud._replace(reach=unknown), whole, OFF)
+        assert (found.fit.curved.tolist(), found.noise.tolist()) == ([True], [0.0])
+
+
+@pytest.mark.parametrize("scatter_deg", [0.0, 12.0])
+def test_what_lies_within_the_noise_of_a_larger_face_is_part_of_it(scatter_deg):
+    rng = np.random.default_rng(13)
+    points = sheet(rng, 4000, 0.003)
+    patch = (np.abs(points[:, :2] - 0.5) < 0.1).all(axis=1)
+    points[patch, 2] = points[patch, 2] / 10 + 0.03 * (points[patch, 0] - 0.5)
+    lifted = points + np.outer(patch, [0, 0, 0.009])
+    normals = np.tile([0.0, 0.0, 1.0], (4000, 1))
+    normals[patch] = scattered(rng, int(patch.sum()), scatter_deg)
+    config = with_settings(merge_coplanar=True, plane_reach=4.0)
+    reach = torch.full((4000,), 4 * 0.003)
+    for coordinates, noise, regions in (
+        (points, reach, 1),
+        (lifted, reach, 2),
+        (points, reach / 4, 2),
+    ):
+        cloud, order = flat_cloud(coordinates, normals=normals)
+        labels = torch.from_numpy(patch)[order].long()
+        refined = refine_regions(cloud._replace(reach=noise), labels, config)
+        assert len(refined.unique()) == regions
+
+
+@pytest.mark.parametrize(("scatter_deg", "kept"), [(1.0, True), (4.0, False)])
+def test_a_face_that_is_large_enough_with_its_border_counts_if_its_normals_agree(scatter_deg, kept):
+    rng = np.random.default_rng(14)
+    points = sheet(rng, 60)
+    inner = np.abs(points[:, 0] - 0.5) < 0.3
+    assert 30 < inner.sum() < 50
+    cloud, order = flat_cloud(points, normals=scattered(rng, 60, scatter_deg))
+    labels = torch.where(torch.from_numpy(inner)[order], 0, UNLABELED)
+    refined = refine_regions(cloud, labels, with_settings(absorb=True, min_size=50))
+    assert int((refined == 0).sum()) >= 50 if kept else bool((refined == UNLABELED).all())
+
+
+def test_a_region_grows_large_enough_by_what_it_absorbs():
+    points = sheet(np.random.default_rng(15), 60)
+    border = np.abs(points[:, 0] - 0.5) > 0.3
+    normals = np.where(border[:, None], [0.5, 0, 0.75**0.5], [0.0, 0, 1.0])
+    points, normals = torch.tensor(points), torch.tensor(normals)
+    curvature, neighbors = torch.from_numpy(border).double(), search_knn(points, 16)
+    plain, absorbing = with_settings(min_size=50), with_settings(min_size=50, absorb=True)
+    assert (grow_regions(points, normals, curvature, neighbors, plain) == UNLABELED).all()
+    assert (grow_regions(points, normals, curvature, neighbors, absorbing) == 0).sum() >= 50
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e3])

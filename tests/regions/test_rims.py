@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from torchrg.neighbors import canonical_order, search_knn
-from torchrg.regions.criteria import GrowingCloud
-from torchrg.regions.rims import RimPlanes, settle_rims
+from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.refine import RimPlanes, settle_rims
 from torchrg.structures import UNLABELED
 
 NOISE = 0.003

@@ -11,9 +11,10 @@ from torchrg.config import DepthConfig
 from torchrg.depth.normals import PixelPlanes
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
+from torchrg.regions.faces import merge_coplanar
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.planes import FittedPlanes
-from torchrg.regions.refine import merge_coplanar, reach_of_planes
+from torchrg.regions.refine import reach_of_planes
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED
 

@@ -96,6 +96,7 @@ class Segments:
 
     Args:
         labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
+        most: Points of a region that are taken, evenly along their rows. Default: all.
 
     Example:
         >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
@@ -105,11 +106,20 @@ class Segments:
         [2.0, 2.0]
     """
 
-    def __init__(self, labels: Tensor) -> None:
+    def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
         self.rows = _ascending(labels)[num_unlabeled:]
         self.counts = counts[1:]
+        if most is not None:
+            ends = self.counts.cumsum(0).tolist()
+            parts = [
+                torch.arange(end - count, end, max(-(-count // most), 1), device=labels.device)
+                for end, count in zip(ends, self.counts.tolist(), strict=True)
+            ]
+            self.rows = self.rows[torch.cat(parts)] if parts else self.rows
+            sizes = [len(part) for part in parts]
+            self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
         self.labels = torch.repeat_interleave(self.counts)
 
     def take(self, values: Tensor) -> Tensor:

@@ -20,7 +20,14 @@ from torchrg.metrics.labels import (
 )
 from torchrg.metrics.normals import NormalScore, score_normals
 from torchrg.metrics.partition import PartitionScore, score_partition
-from torchrg.metrics.protocols import EvopsScore, SegCompCounts, count_segcomp, score_evops
+from torchrg.metrics.protocols import (
+    EvopsScore,
+    SegCompCounts,
+    VoxelScore,
+    count_segcomp,
+    score_evops,
+    score_voxels,
+)
 
 __all__ = [
     "METRICS",
@@ -32,6 +39,7 @@ __all__ = [
     "NormalScore",
     "PartitionScore",
     "SegCompCounts",
+    "VoxelScore",
     "adjusted_rand_index",
     "contingency_table",
     "count_segcomp",
@@ -42,6 +50,7 @@ __all__ = [
     "score_labels",
     "score_normals",
     "score_partition",
+    "score_voxels",
     "segmentation_covering",
 ]
 

@@ -8,18 +8,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import GrowingConfig
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
-from torchrg.regions.bridges import cut_bridges
-from torchrg.regions.criteria import GrowingCloud
 from torchrg.regions.edges import (
     EdgeLists,
-    checked_cloud,
+    GrowingCloud,
     find_coded_edges,
     find_edges,
-    reordered,
+    neighborhood_radii,
 )
+from torchrg.regions.faces import cut_bridges
+from torchrg.regions.planes import LEAST_FITTED
 from torchrg.regions.refine import refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -94,16 +96,20 @@ def grow_regions(
         tensor([0])
     """
     config = GrowingConfig() if config is None else config
-    cloud = checked_cloud(
+    cloud = _checked_cloud(
         config, points, normals, curvature, neighbors, valid, colors, residual_rms
     )
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
-        cloud = reordered(cloud, order)
+        cloud = _reordered(cloud, order)
     heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
-    labels = number_by_size(heads, config.min_size)
+    least = config.min_size
+    if config.absorb:
+        # A region may be large enough only with the points that it absorbs.
+        least = min(least, max(least // 2, LEAST_FITTED))
+    labels = number_by_size(heads, least)
     if config.cut_bridges and bool((labels >= 0).any()):
 
         def grow(part: GrowingCloud, share: float) -> Tensor:
@@ -112,10 +118,94 @@ def grow_regions(
             return number_by_size(found, config.min_size)
 
         parts = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
-        labels = number_by_size(parts, config.min_size)
+        labels = number_by_size(parts, least)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+
+
+def _checked_cloud(
+    config: GrowingConfig,
+    points: Tensor | NDArray[np.floating],
+    normals: Tensor | NDArray[np.floating],
+    curvature: Tensor | NDArray[np.floating],
+    neighbors: Neighbors,
+    valid: Tensor | None,
+    colors: Tensor | NDArray[np.generic] | None,
+    residual_rms: Tensor | NDArray[np.floating] | None,
+) -> GrowingCloud:
+    """Check what the user passed to :func:`grow_regions`, in the order it came in."""
+    caller = "grow_regions"
+    points = as_tensor(caller, "points", points).detach()
+    normals = as_tensor(caller, "normals", normals).detach()
+    curvature = as_tensor(caller, "curvature", curvature).detach()
+    valid = None if valid is None else as_tensor(caller, "valid", valid)
+    colors = None if colors is None else as_tensor(caller, "colors", colors)
+    check_shapes(
+        caller,
+        points=(points, "N 3"),
+        normals=(normals, "N 3"),
+        curvature=(curvature, "N"),
+        neighbors=(neighbors.indices, "N K"),
+        neighbors_valid=(neighbors.valid, "N K"),
+        valid=(valid, "N"),
+        colors=(colors, "N C"),
+    )
+    check_floating(caller, points=points, normals=normals, curvature=curvature)
+    if valid is not None and valid.dtype != torch.bool:
+        raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
+    if neighbors.indices.device != points.device:
+        raise ShapeError(
+            f"{caller}: expected points and neighbors on one device, got {points.device} and "
+            f"{neighbors.indices.device}."
+        )
+    if config.max_color_distance is not None and colors is None:
+        raise ConfigError(
+            f"{caller}: expected colors, which max_color_distance needs, got None; pass them or "
+            "set max_color_distance to None."
+        )
+    reach = None
+    if config.plane_reach is not None:
+        if residual_rms is None:
+            raise ConfigError(
+                f"{caller}: expected residual_rms, which plane_reach needs, got None; pass that of "
+                "the normals or set plane_reach to None."
+            )
+        residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
+        check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
+        check_floating(caller, points=points, residual_rms=residual_rms)
+        # Where the fit is exact nothing is known of the noise.
+        floor = config.coplanarity_floor * neighborhood_radii(points, neighbors)
+        reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
+    finite = normals.isfinite().all(dim=1) & curvature.isfinite()
+    valid = finite if valid is None else finite & valid
+    colors = None if colors is None else _by_column(colors.to(points.dtype))
+    return GrowingCloud(
+        _by_column(points), _by_column(normals), curvature, neighbors, valid, colors, reach
+    )
+
+
+def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
+    """Return the cloud, and the rows its neighbours name, in an order ``(N,)`` of old rows."""
+    row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
+    row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
+    indices = cloud.neighbors.indices[order]
+    indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
+    mask = cloud.neighbors.valid
+    return GrowingCloud(
+        _by_column(cloud.points[order]),
+        _by_column(cloud.normals[order]),
+        cloud.curvature[order],
+        Neighbors(indices, None if mask is None else mask[order]),
+        cloud.valid[order],
+        None if cloud.colors is None else _by_column(cloud.colors[order]),
+        None if cloud.reach is None else cloud.reach[order],
+    )
+
+
+def _by_column(vectors: Tensor) -> Tensor:
+    """Return vectors ``(N, C)`` laid out column by column."""
+    return vectors.T.contiguous().T
 
 
 def _within_share(

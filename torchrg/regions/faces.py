@@ -1,5 +1,6 @@
-"""Faces that growth joined through a few doubtful points, told apart again."""
+"""What is one face: regions that only a bridge joins are split, coplanar ones become one."""
 
+import heapq
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,13 +10,14 @@ from torch import Tensor
 
 from torchrg._parallel import chunks_of
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords
 from torchrg.linalg.moments import Segments
-from torchrg.regions.criteria import GrowingCloud, within_angle
-from torchrg.regions.edges import accept_edges
-from torchrg.regions.planes import fit_planes
-from torchrg.regions.refine import fit_regions, joint_misfits
+from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
+from torchrg.regions.planes import MOST_FITTED, FittedPlanes, fit_planes, fit_regions
 from torchrg.structures import UNLABELED, Neighbors
+
+_LEAST_CONTACTS = 3
+"""Regions that touch in fewer points are not merged: one may be an outlier's."""
 
 _STRICTER = 0.5
 """Share of the limits of angle and distance within which the core of a face holds together."""
@@ -51,12 +53,13 @@ class _Suspects(NamedTuple):
     Attributes:
         rows: Points that may be of another face, ascending: those off the plane where nearly all
             are on it, all others.
-        sound: Points on the plane of a region of which nearly all are, with its direction, shape
-            ``(N,)``, bool.
+        near: Points on the plane of a region of which nearly all are, shape ``(N,)``, bool.
+        sound: Those of them with its direction.
         on_plane: Regions of which nearly all points are on one plane, shape ``(M,)``, bool.
     """
 
     rows: Tensor
+    near: Tensor
     sound: Tensor
     on_plane: Tensor
 
@@ -95,7 +98,7 @@ def cut_bridges(
     perhaps with gaps in their numbers. ``grow`` returns the labels of a cloud within a share of the
     limits.
     """
-    rows, sound, on_plane = _find_suspects(cloud, labels, config)
+    rows, near, sound, on_plane = _find_suspects(cloud, labels, config)
     if len(rows) == 0:
         return labels
     cores = torch.full_like(labels, UNLABELED)
@@ -114,12 +117,17 @@ def cut_bridges(
     cores = torch.unique(cores, return_inverse=True)[1] - int((cores < 0).any())
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
 
-    pairs = torch.unique(torch.stack([labels, cores])[:, cores >= 0], dim=1)
-    split = torch.bincount(pairs[0], minlength=len(others)) > 1
-    flat = ~fit_planes(Segments(cores), cloud.points, cloud.normals).curved
+    owner = torch.full((int(cores.max()) + 1,), UNLABELED, device=labels.device)
+    owner[cores[cores >= 0]] = labels[cores >= 0]
+    split = torch.bincount(owner, minlength=len(others)) > 1
+    flat = ~fit_planes(Segments(cores, most=MOST_FITTED), cloud.points, cloud.normals).curved
     covered = torch.bincount(labels[(cores >= 0) & flat[cores.clamp(min=0)]], minlength=len(others))
     split &= on_plane | (covered >= _LEAST_FLAT * torch.bincount(labels[labels >= 0]))
     free = (labels >= 0) & split[labels.clamp(min=0)]
+    # Of points on the plane only those with its direction tell which cores it meets.
+    plane_of = torch.full_like(others, UNLABELED, dtype=torch.int64)
+    plane_of[labels[sound]] = cores[sound]
+    cores = torch.where(near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
     waiting = (free & (cores < 0)).nonzero().squeeze(1)
     cores = _follow(cores, _find_edges(cloud, labels, config, waiting, chunk_size))
     new = torch.where(cores >= 0, cores + len(others), UNLABELED)
@@ -128,25 +136,25 @@ def cut_bridges(
 
 def _find_suspects(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> _Suspects:
     """Return the doubtful and the sound points of regions with many points off their plane."""
-    fit, floor = fit_regions(cloud, labels, config)
-    segments = Segments(labels)
-    limit = _EXACT_REACH * floor
-    if cloud.reach is not None:
-        usual = segments.median(segments.take(cloud.reach)).double()
-        limit = torch.maximum(torch.where(usual.isfinite(), usual, limit), limit)
-    off = fit.residuals.abs() > segments.spread(limit)
-    num_off = segments.sum(off.double())
-    on_plane = num_off <= _MOST_OFF_PLANE * segments.counts
-    bent = num_off >= config.min_size
-    chosen = (off | ~segments.spread(on_plane)) & segments.spread(bent)
-    rows = segments.rows[chosen].sort().values
-    directions = segments.spread_columns(fit.normal)
-    aligned = sq_chords(segments.take_columns(cloud.normals), directions) <= deg_to_sq_chord(
-        _STRICTER * config.max_angle_deg
+    planes = fit_regions(cloud, labels, config)
+    limit = _EXACT_REACH * planes.floor
+    limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
+    region, has_region = labels.clamp(min=0), labels >= 0
+    off = has_region & (planes.distances(cloud.points, region) > limit[region])
+    num_off = torch.bincount(labels[off], minlength=len(limit))
+    on_plane = num_off <= _MOST_OFF_PLANE * planes.fit.num_points
+    mixed = num_off >= config.min_size
+    doubtful = torch.where(on_plane[region], off, has_region) & mixed[region]
+    rows = doubtful.nonzero().squeeze(1)
+    near = has_region & ~off & (on_plane & mixed)[region]
+    others = near.nonzero().squeeze(1)
+    directions = planes.fit.normal[labels[others]].unbind(dim=1)
+    turn = sq_chords(cloud.normals[others].double().unbind(dim=1), directions)
+    near, sound = (
+        torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
+        for limit in (config.max_angle_deg, _STRICTER * config.max_angle_deg)
     )
-    sound = torch.zeros_like(labels, dtype=torch.bool)
-    sound[segments.rows] = aligned & ~off & segments.spread(on_plane & bent)
-    return _Suspects(rows, sound, on_plane)
+    return _Suspects(rows, near, sound, on_plane)
 
 
 def _are_level(
@@ -219,8 +227,8 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _Edges) -> Tensor:
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(numbers, minlength=len(pairs))
     num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
-    fit = fit_planes(Segments(cores), cloud.points, cloud.normals)
-    joined = joint_misfits(fit, pairs) < _LEAST_MISFIT
+    fit = fit_planes(Segments(cores, most=MOST_FITTED), cloud.points, cloud.normals)
+    joined = _explains_both(fit, pairs)
     joined |= num_open >= _OPEN_SHARE * num_edges
     ends = pairs[joined].T.cpu().numpy()
     ones = np.ones(ends.shape[1], dtype=np.int8)
@@ -243,3 +251,140 @@ def _follow(cores: Tensor, edges: _Edges) -> Tensor:
         cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
         waiting = waiting[~joined]
     return cores
+
+
+def merge_coplanar(
+    labels: Tensor,
+    contacts: tuple[Tensor, Tensor],
+    fit: FittedPlanes,
+    floor: Tensor,
+    noise: Tensor | None = None,
+    *,
+    tolerance: float,
+) -> Tensor:
+    """Merge regions that touch and lie on one plane, the pair that fits best first.
+
+    Two regions are merged when one plane explains both: the root mean square distance of either to
+    the plane through both is at most ``tolerance`` times what it is to its own. Of the smaller one
+    the larger one's noise counts if that is more: what noise breaks off a face is thinner than the
+    face, or curved. Otherwise curved regions have no plane. What is merged is one region from then
+    on.
+
+    ``contacts`` are those of :func:`torchrg.regions.adjacency.count_contacts`; ``floor`` ``(M,)``
+    is the least distance to its own plane that counts for a region, ``noise``
+    ``(M,)`` that of the points around it, 0 where that is not known. A merged region has the
+    smallest label of its parts.
+    """
+    pairs, num_contacts = contacts
+    pairs = pairs[(num_contacts >= _LEAST_CONTACTS) & ~fit.curved[pairs].all(dim=1)]
+    moments = _moments_of(fit, floor, noise)
+    owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
+    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+
+
+class _Moments(NamedTuple):
+    """What merging reads of M regions, in float64.
+
+    Number of points, their mean, about an origin near them, and covariance, the distance from its
+    plane that counts as lying on it (none from that of a curved one), and the noise it lends.
+    """
+
+    weight: Tensor
+    mean: Tensor
+    covariance: Tensor
+    scale: Tensor
+    noise: Tensor
+
+    def at(self, rows: Tensor | slice) -> "_Moments":
+        """Return those of some of the regions."""
+        return _Moments(*(values[rows] for values in self))
+
+
+def _moments_of(fit: FittedPlanes, floor: Tensor, noise: Tensor | None) -> _Moments:
+    own = (fit.normal[:, None] @ fit.covariance @ fit.normal[:, :, None])[:, 0, 0]
+    return _Moments(
+        fit.num_points.double(),
+        fit.center - fit.center[:1],
+        fit.covariance,
+        torch.where(fit.curved, 0.0, torch.maximum(own.clamp(min=0).sqrt(), floor)),
+        torch.zeros_like(own) if noise is None else noise,
+    )
+
+
+def _explains_both(fit: FittedPlanes, pairs: Tensor) -> Tensor:
+    """Tell which pairs of regions one plane explains, by the thickness of the thicker one."""
+    moments = _moments_of(fit, fit.thickness, None)
+    thickness = fit.thickness[pairs].amax(dim=1)
+    first, second = (moments.at(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
+    return _misfit(first, second) < _LEAST_MISFIT
+
+
+def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
+    """Return for each region the smallest of those that it is merged with."""
+    groups = _Moments(*(values.clone() for values in moments))
+    touching: list[set[int]] = [set() for _ in groups.weight]
+    owner, age = list(range(len(touching))), [0] * len(touching)
+    queue: list[tuple[float, int, int, int, int]] = []
+
+    def offer(pairs: Tensor) -> None:
+        first, second = pairs.unbind(dim=1)
+        misfits = _misfit(groups.at(first), groups.at(second)).tolist()
+        for (a, b), misfit in zip(pairs.tolist(), misfits, strict=True):
+            if misfit <= tolerance:
+                heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
+
+    for a, b in pairs.tolist():
+        touching[a].add(b)
+        touching[b].add(a)
+    offer(pairs)
+    while queue:
+        _, a, b, age_a, age_b = heapq.heappop(queue)
+        if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
+            continue
+        both = _joined(groups.at(slice(a, a + 1)), groups.at(slice(b, b + 1)))
+        for values, joined in zip(groups, both, strict=True):
+            values[a] = joined[0]
+        owner[b] = a
+        age[a] += 1
+        touching[a] = {_root(owner, c) for c in touching[a] | touching[b]} - {a}
+        for c in touching[a]:
+            touching[c].add(a)
+        beside = [(min(a, c), max(a, c)) for c in touching[a]]
+        offer(torch.tensor(beside, dtype=torch.int64).view(-1, 2))
+    return [_root(owner, i) for i in range(len(owner))]
+
+
+def _root(owner: list[int], i: int) -> int:
+    """Return the region that region i has become part of."""
+    while owner[i] != i:
+        owner[i] = owner[owner[i]]
+        i = owner[i]
+    return i
+
+
+def _joined(a: _Moments, b: _Moments) -> _Moments:
+    """Return the moments of two sets of regions, taken together one by one."""
+    weight = a.weight + b.weight
+    share_a, share_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
+    mean = share_a * a.mean + share_b * b.mean
+    covariance = torch.zeros_like(a.covariance)
+    for part, share in ((a, share_a), (b, share_b)):
+        shift = part.mean - mean
+        spread = part.covariance + shift[:, :, None] * shift[:, None, :]
+        covariance = covariance + share[:, :, None] * spread
+    noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
+    return _Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale), noise)
+
+
+def _misfit(a: _Moments, b: _Moments) -> Tensor:
+    """Return how far from the joint plane the worse of two regions is, in its own scales."""
+    both = _joined(a, b)
+    normal = eigh3_of_few(both.covariance)[1][:, :, 0]
+    misfits = []
+    for part, other in ((a, b), (b, a)):
+        own = (normal[:, None] @ part.covariance @ normal[:, :, None])[:, 0, 0]
+        shift = ((part.mean - both.mean) * normal).sum(dim=1)
+        rms = (own.clamp(min=0) + shift * shift).sqrt()
+        lent = torch.where(other.weight > part.weight, other.noise, 0.0)
+        misfits.append(torch.where(rms > 0, rms / torch.maximum(part.scale, lent), 0.0))
+    return torch.maximum(*misfits)
