@@ -9,6 +9,7 @@ Pictures and what else a file holds beside points are not kept.
 import re
 import uuid
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -17,8 +18,10 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, narrow_integers
+from torchrg.io.columns import Spelling, flatten_cloud, narrow_integers
+from torchrg.io.fields import Columns
 from torchrg.io.files import DAMAGES, atomic_path, check_promise, refusing
+from torchrg.io.stream import Table
 from torchrg.structures import Cloud
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -44,8 +47,8 @@ _Block = dict[str, NDArray[Any]]
 """Columns of a scan by name."""
 
 
-def read_e57(path: Path, size: int) -> Cloud:
-    """Read all scans of an E57 file.
+def open_e57(path: Path, size: int) -> Table:
+    """Open an E57 file, all scans of it.
 
     Every scan is moved by its pose, and its normals with it. Points marked as invalid are kept as
     not-a-number. Of several scans, ``scan`` is the number of each point's; a field that some scans
@@ -53,11 +56,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     """
     pye57 = _pye57("read")
     _check_pages(path)
-    errors = (pye57.libe57.E57Exception, *DAMAGES)
-    with (
-        refusing(f"{path}: expected an E57 file, got: ", *errors, repair="; fetch it again"),
-        pye57.E57(str(path)) as file,
-    ):
+    with _reading(pye57, path) as file:
         headers = [file.get_header(i) for i in range(file.scan_count)]
         num_points = sum(header.point_count for header in headers)
         # Coordinates that differ at all take a bit.
@@ -65,13 +64,48 @@ def read_e57(path: Path, size: int) -> Cloud:
             path, 0, num_points // 8, f"{num_points:,} points", available=size, at_least=True
         )
         scans = tuple(_scan_of(header) for header in headers)
-        blocks = [
-            _to_world(path, _read_points(pye57, file, header), scan)
-            for header, scan in zip(headers, scans, strict=True)
+        empty = [
+            _to_world(path, {name: np.empty(0, code) for name, code in _letters(pye57, h)}, scan)
+            for h, scan in zip(headers, scans, strict=True)
         ]
-    if not blocks:
+    if not empty:
         raise FormatError(f"{path}: expected at least one scan, got none; fetch the file again.")
-    return assemble_cloud(path, _joined(blocks), header={"scans": scans})
+    dtypes = {
+        name: np.result_type(*(block.get(name, np.uint8) for block in empty))
+        for name in dict.fromkeys(name for block in empty for name in block)
+    }
+
+    def conformed(block: _Block, number: int) -> _Block:
+        count = len(block["x"])
+        columns = {
+            name: block[name].astype(dtype, copy=False) if name in block else np.zeros(count, dtype)
+            for name, dtype in dtypes.items()
+        }
+        if len(scans) > 1:
+            columns["scan"] = np.full(count, number, np.int32)
+        return columns
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        if num_points == 0:
+            yield conformed(empty[0], 0)
+            return
+        with _reading(pye57, path) as file:
+            for number, scan in enumerate(scans):
+                for block in _read_points(pye57, file, file.get_header(number), chunk_size):
+                    yield conformed(_to_world(path, block, scan), number)
+
+    return Table(read, num_points, header={"scans": scans})
+
+
+@contextmanager
+def _reading(pye57: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
+    """Open a file; what is wrong with it is an error that names it."""
+    errors = (pye57.libe57.E57Exception, *DAMAGES)
+    with (
+        refusing(f"{path}: expected an E57 file, got: ", *errors, repair="; fetch it again"),
+        pye57.E57(str(path)) as file,
+    ):
+        yield file
 
 
 def check_e57(path: Path, cloud: Cloud | None) -> None:
@@ -159,18 +193,36 @@ class Scan(NamedTuple):
 
     def to_world(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the scan to the world, shape ``(N, 3)``."""
-        return points @ self.matrix.T + np.array(self.translation) if self.is_moved else points
+        if not self.is_moved:
+            return points
+        turned = _turned(points, self.matrix)
+        turned += np.array(self.translation)
+        return turned
 
     def to_scan(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the world to the scan, shape ``(N, 3)``."""
-        return (points - np.array(self.translation)) @ self.matrix if self.is_moved else points
+        if not self.is_moved:
+            return points
+        return _turned(points - np.array(self.translation), self.matrix.T)
 
     def turn_normals(self, block: _Block, *, back: bool = False) -> None:
         """Turn the normals of a block, if it has any, to the world or back, in their own type."""
         if self.is_moved and all(name in block for name in _NORMALS):
             normals = np.stack([block[name] for name in _NORMALS], axis=1)
-            turned = normals @ (self.matrix if back else self.matrix.T)
+            turned = _turned(normals, self.matrix.T if back else self.matrix)
             block.update(zip(_NORMALS, turned.astype(normals.dtype).T, strict=True))
+
+
+def _turned(points: NDArray[np.floating], matrix: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Return each point times a matrix, the same bits however many points there are.
+
+    BLAS rounds a product in an order that depends on its size.
+    """
+    x, y, z = points.T
+    turned: NDArray[np.floating] = np.empty(points.shape)
+    for i, (a, b, c) in enumerate(matrix):
+        turned[:, i] = x * a + y * b + z * c
+    return turned
 
 
 def _scan_of(header: Any) -> Scan:  # noqa: ANN401
@@ -181,27 +233,37 @@ def _scan_of(header: Any) -> Scan:  # noqa: ANN401
     return Scan(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
 
 
-def _read_points(pye57: Any, file: Any, header: Any) -> _Block:  # noqa: ANN401
-    """Return what the points of a scan hold, by the standard's names; texts are left out."""
+def _read_points(pye57: Any, file: Any, header: Any, chunk_size: int) -> Iterator[_Block]:  # noqa: ANN401
+    """Read what the points of a scan hold, so many at a time, by the standard's names."""
     libe57, count = pye57.libe57, header.point_count
-    prototype = libe57.StructureNode(header.points.prototype())
-    block: _Block = {}
+    if count == 0:
+        return
+    at_once = min(count, chunk_size)
+    block = {name: np.empty(at_once, code) for name, code in _letters(pye57, header)}
     buffers = libe57.VectorSourceDestBuffer()
-    for name in header.point_fields:
-        node = pye57.utils.get_node(prototype, name)
-        if isinstance(node, libe57.StringNode):
-            continue
-        block[name] = np.empty(count, _letter(libe57, node))
-        if count:
-            buffer = libe57.SourceDestBuffer(file.image_file, name, block[name], count, True, True)
-            buffers.append(buffer)
-    if count:
-        reader = header.points.reader(buffers)
-        found = reader.read()
-        reader.close()
-        if found != count:
+    for name, column in block.items():
+        buffers.append(libe57.SourceDestBuffer(file.image_file, name, column, at_once, True, True))
+    reader = header.points.reader(buffers)
+    found = 0
+    while found < count:
+        num_read = reader.read()
+        if num_read == 0:
             raise EOFError(f"{found:,} of {count:,} points")
-    return block
+        found += num_read
+        # The reader fills the same memory again.
+        yield block if num_read == count else {n: c[:num_read].copy() for n, c in block.items()}
+    reader.close()
+
+
+def _letters(pye57: Any, header: Any) -> list[tuple[str, str]]:  # noqa: ANN401
+    """Return the fields of a scan and the letters of NumPy's types for them; texts are left out."""
+    prototype = pye57.libe57.StructureNode(header.points.prototype())
+    nodes = [(name, pye57.utils.get_node(prototype, name)) for name in header.point_fields]
+    return [
+        (name, _letter(pye57.libe57, node))
+        for name, node in nodes
+        if not isinstance(node, pye57.libe57.StringNode)
+    ]
 
 
 def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
@@ -238,21 +300,6 @@ def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(
         [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1
     )
-
-
-def _joined(blocks: Sequence[_Block]) -> _Block:
-    """Put scans one after the other; number them if there are several."""
-    counts = [len(block["x"]) for block in blocks]
-    names = dict.fromkeys(name for block in blocks for name in block)
-    columns = {
-        name: np.concatenate(
-            [b.get(name, np.zeros(n, np.uint8)) for b, n in zip(blocks, counts, strict=True)]
-        )
-        for name in names
-    }
-    if len(blocks) > 1:
-        columns["scan"] = np.repeat(np.arange(len(blocks), dtype=np.int32), counts)
-    return columns
 
 
 def _groups(columns: _Block, scans: Sequence[Scan]) -> Iterator[tuple[Scan, slice]]:

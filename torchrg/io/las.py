@@ -7,6 +7,8 @@ Normals, curvature and labels are extra dimensions named ``NormalX``, ``NormalY`
 import copy
 import math
 import struct
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,11 +17,14 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.fields import WIDEN, Spelling, are_whole, assemble_cloud, flatten_cloud
+from torchrg.io.columns import Spelling, flatten_cloud
+from torchrg.io.fields import WIDEN, Columns, Naming, are_whole
 from torchrg.io.files import DAMAGES, atomic_path, check_promise, first_line, refusing
+from torchrg.io.stream import Table
 from torchrg.structures import Cloud
 
 _POINTS_AT_ONCE = 1 << 20
+"""So that memory grows with the points that are really there, whatever a header promises."""
 _SPELLING = Spelling(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16
 )
@@ -36,8 +41,8 @@ number of points of 64 bits that version 1.4 has beside the old one, which may b
 _DATE_AT, _DATE_BYTES = 90, 4
 
 
-def read_las(path: Path, size: int) -> Cloud:
-    """Read a LAS or LAZ file.
+def open_las(path: Path, size: int) -> Table:
+    """Open a LAS, LAZ or COPC file.
 
     The cloud is float64, with every extra dimension and every standard one that is not zero
     everywhere; colours are uint8 where eight bits hold them, else uint16. The header is kept for
@@ -45,6 +50,37 @@ def read_las(path: Path, size: int) -> Cloud:
     """
     laspy = _laspy("read")
     _check_header(path, size)
+    with _reading(laspy, path) as reader:
+        header = reader.header
+        _check_points(path, header, size)
+    if header.point_count == 0:
+        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+    header.vlrs.extract("LasZipVlr")
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        with _reading(laspy, path) as reader:
+            yield from map(_columns, reader.chunk_iterator(chunk_size))
+
+    standard = set(header.point_format.standard_dimension_names)
+
+    def facts(columns: Columns) -> set[str]:
+        return {name for name in standard if name in columns and columns[name].any()}
+
+    def names(columns: Collection[str], used: Collection[str]) -> dict[str, str]:
+        unused = _unused(columns, standard, used)
+        return {
+            name.removesuffix(_UNFIT) if name.removesuffix(_UNFIT) in unused else name: name
+            for name in columns
+            if name not in unused
+        }
+
+    naming = Naming(facts, names)
+    return Table(read, header.point_count, _POINTS_AT_ONCE, naming, header={"las": header})
+
+
+@contextmanager
+def _reading(laspy: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
+    """Open a reader; what is wrong with the file is an error that names it."""
     message = f"{path}: expected a LAS or LAZ file, got: "
     damages = (laspy.errors.LaspyException, *DAMAGES)
     try:
@@ -53,10 +89,7 @@ def read_las(path: Path, size: int) -> Cloud:
             refusing(message, *damages, repair="; fetch it again"),
             laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
         ):
-            header = reader.header
-            _check_points(path, header, size)
-            # By blocks, so that memory grows with the points that are really there.
-            blocks = [_columns(block) for block in reader.chunk_iterator(_POINTS_AT_ONCE)]
+            yield reader
     except BaseException as error:
         # A panic of lazrs, which is written in Rust, is no Exception and has no importable name.
         if type(error).__name__ != "PanicException":
@@ -64,16 +97,6 @@ def read_las(path: Path, size: int) -> Cloud:
         raise FormatError(
             f"{path}: expected whole compressed points, got: {first_line(error)}; fetch it again."
         ) from error
-    if not blocks:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
-    columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    unused = _unused(header.point_format, columns)
-    named = {
-        name.removesuffix(_UNFIT) if name.removesuffix(_UNFIT) in unused else name: column
-        for name, column in columns.items()
-        if name not in unused
-    }
-    return assemble_cloud(path, named, header={"las": header})
 
 
 def check_las(path: Path, cloud: Cloud | None) -> None:
@@ -228,13 +251,12 @@ def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
     return columns
 
 
-def _unused(point_format: Any, columns: dict[str, NDArray[Any]]) -> set[str]:  # noqa: ANN401
+def _unused(columns: Collection[str], standard: set[str], used: Collection[str]) -> set[str]:
     """Return the standard dimensions that are zero everywhere; the channels of a colour as one."""
-    standard = set(point_format.standard_dimension_names)
-    used = {name for name, column in columns.items() if name not in standard or column.any()}
-    if not used.isdisjoint(_SPELLING.color):
-        used.update(_SPELLING.color)
-    return columns.keys() - used
+    kept = {name for name in columns if name not in standard or name in used}
+    if not kept.isdisjoint(_SPELLING.color):
+        kept.update(_SPELLING.color)
+    return set(columns) - kept
 
 
 def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
