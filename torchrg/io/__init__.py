@@ -1,7 +1,7 @@
 """Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -9,6 +9,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.columns import check_length
 from torchrg.io.e57 import check_e57, count_e57, open_e57, write_e57
 from torchrg.io.fields import checked_coordinates
 from torchrg.io.files import atomic_path, check_file, check_place
@@ -25,6 +26,7 @@ from torchrg.io.npy import (
 from torchrg.io.pcd import count_pcd, open_pcd, write_pcd
 from torchrg.io.ply import count_ply, open_ply, write_ply
 from torchrg.io.stream import (
+    CHUNK_SIZE,
     SILENT,
     CloudStream,
     Table,
@@ -46,9 +48,6 @@ __all__ = [
     "write_cloud",
 ]
 
-CHUNK_SIZE = 1 << 20
-"""Points of a chunk: tens of megabytes, and few enough calls for each that they do not count."""
-
 
 class Format(NamedTuple):
     """How a kind of file is read and written; a new kind is a codec, a row of FORMATS, and a test.
@@ -57,14 +56,15 @@ class Format(NamedTuple):
         open: Reads the header of a file of so many bytes, not 0, and gives a table of its points,
             in chunks. Opening it, or reading the damaged chunk, raises FormatError if the file is
             damaged.
-        write: Writes a cloud. Raises FormatError if the format cannot hold it.
+        write: Writes a cloud, going through its chunks once or several times. Raises FormatError if
+            the format cannot hold it.
         count: Number of points by the header, from path, open file and size; an estimate where the
             header does not say. May raise anything of a damaged file.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
     """
 
     open: Callable[[Path, int], Table]
-    write: Callable[[Path, Cloud], None]
+    write: Callable[[Path, CloudStream], None]
     count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
     check: Callable[[Path, Cloud | None], None] | None = None
 
@@ -163,7 +163,7 @@ def _open(path: Path) -> Table:
 
 def write_cloud(
     path: str | os.PathLike[str],
-    cloud: Cloud,
+    cloud: Cloud | CloudStream,
     segmentation: Segmentation | None = None,
     *,
     superpoints: Superpoints | None = None,
@@ -190,7 +190,10 @@ def write_cloud(
 
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
-        cloud: The cloud.
+        cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
+            same bytes (``.laz``: the same points). Its chunks are gone through two or three times,
+            for ``.npz`` without a segmentation once for each field; tensors of the results may be
+            mapped from files then, as they are taken chunk by chunk, too.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
         superpoints: What :func:`torchrg.make_superpoints` said about them.
         provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
@@ -209,25 +212,53 @@ def write_cloud(
     """
     target = Path(path)
     found = _format_of(target)
-    check_output(target, cloud)
-    cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
+    if isinstance(cloud, Cloud):
+        check_output(target, cloud)
+        points = checked_coordinates(target, cloud.coordinates)
+        stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=CHUNK_SIZE)
+    else:
+        check_output(target)
+        stream = cloud
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
-        if result is not None and len(result.labels) != len(cloud):
+        if result is not None and len(result.labels) != stream.count:
             raise FormatError(
-                f"{target}: expected {what} of {len(cloud)} points, got {len(result.labels)}; pass "
-                "the cloud that was segmented."
+                f"{target}: expected {what} of {stream.count} points, got {len(result.labels)}; "
+                "pass the cloud that was segmented."
             )
     if found.write is write_npz:
-        write_npz(target, cloud, segmentation, provenance, superpoints)
+        own = segmentation is None
+        write_npz(target, _checked(target, stream, own), segmentation, provenance, superpoints)
         return
     if superpoints is not None:
-        cloud = replace(cloud, fields={**cloud.fields, **superpoints.by_level()})
+        stream = stream.with_fields(lambda rows: superpoints.rows(rows).by_level())
     if segmentation is not None:
         names = ("labels", "normals", "curvature")
-        kept = {name: values for name, values in cloud.fields.items() if name not in names}
-        results = {name: getattr(segmentation, name).numpy(force=True) for name in names}
-        cloud = replace(cloud, fields={**kept, **results})
-    found.write(target, cloud)
+        results = {name: getattr(segmentation, name) for name in names}
+        stream = stream.with_fields(
+            lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
+        )
+    found.write(target, _checked(target, stream))
+
+
+def _checked(path: Path, stream: CloudStream, has_fields: bool = True) -> CloudStream:
+    """Check the chunks while they are written, as far as formats do not differ.
+
+    Without ``has_fields`` they are left out.
+    """
+
+    def chunks() -> Iterator[Cloud]:
+        count = 0
+        for chunk in stream:
+            fields = chunk.fields if has_fields else {}
+            for name, values in fields.items():
+                check_length(path, name, values, len(chunk))
+            count += len(chunk)
+            points = checked_coordinates(path, chunk.coordinates)
+            yield replace(chunk, coordinates=points, fields=fields)
+        if count != stream.count:
+            raise FormatError(f"{path}: expected {stream.count} points in chunks, got {count}.")
+
+    return replace(stream, chunks=chunks, measure=lambda: stream.extent)
 
 
 def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:

@@ -1,6 +1,7 @@
 """From a cloud to the columns of a file, by the format's own names and types."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,11 @@ from numpy.typing import NDArray
 from torchrg.errors import FormatError
 from torchrg.io.fields import WIDEN, Columns
 from torchrg.io.files import atomic_path
+from torchrg.io.stream import CloudStream
 from torchrg.structures import Cloud
+
+Limits = tuple[int, int]
+"""Least and largest of whole numbers."""
 
 
 class Spelling(NamedTuple):
@@ -31,19 +36,30 @@ class Spelling(NamedTuple):
     vectors: bool = False
 
 
-def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, NDArray[Any]]:
+def flatten_stream(path: Path, stream: CloudStream, spelling: Spelling) -> Iterator[Columns]:
+    """Spread the chunks of a cloud over columns, which have the same types in all of them."""
+    limits = wide_limits(path, stream, spelling)
+    for chunk in stream:
+        yield flatten_cloud(path, chunk, spelling, limits)
+
+
+def flatten_cloud(
+    path: Path, cloud: Cloud, spelling: Spelling, limits: Mapping[str, Limits] | None = None
+) -> dict[str, NDArray[Any]]:
     """Spread a cloud over columns by the format's names: ``x y z`` first, then its fields.
 
-    Labels are int32 where they fit, colours uint8 (or uint16 if the format holds it), truth values
-    uint8, half precision float32. A field of several columns is ``name_0``, ``name_1`` and so on,
-    unless the format has ``vectors``.
+    Labels are int32 where the limits of the whole cloud say that they fit, colours uint8 (or uint16
+    if the format holds it), truth values uint8, half precision float32. A field of several columns
+    is ``name_0``, ``name_1`` and so on, unless the format has ``vectors``.
     """
     columns: dict[str, NDArray[Any]] = {
         axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")
     }
     for name, values in cloud.fields.items():
-        check_length(path, name, values, len(cloud))
-        for column_name, column in _spread(name, _storable(path, name, values, spelling), spelling):
+        values = _storable(path, name, values, spelling)
+        if name == "labels":
+            values = narrow_integers(values, ("i4",), (limits or {}).get("label"))
+        for column_name, column in _spread(name, values, spelling):
             if column_name in columns:
                 raise FormatError(
                     f"{path}: expected fields of different names, got {column_name!r} twice; "
@@ -78,8 +94,6 @@ def _storable(path: Path, name: str, values: NDArray[Any], spelling: Spelling) -
         return values.astype(np.uint8)
     if values.dtype == np.float16:
         return values.astype(np.float32)
-    if name == "labels":
-        return narrow_integers(values, ("i4",))
     if name != "color" or values.dtype == np.uint8:
         return values
     if values.dtype != np.uint16:
@@ -105,17 +119,43 @@ def _spread(name: str, values: NDArray[Any], spelling: Spelling) -> list[tuple[s
     return [(column_name, values[:, i]) for i, column_name in enumerate(names)]
 
 
-def narrow_integers(values: NDArray[Any], codes: Collection[str]) -> NDArray[Any]:
+def wide_limits(path: Path, stream: CloudStream, spelling: Spelling) -> dict[str, Limits]:
+    """Return the limits of all columns of 64-bit integers of a cloud, by a pass over its chunks."""
+    limits: dict[str, Limits] = {}
+    for chunk in stream:
+        wide = {name: values for name, values in chunk.fields.items() if _is_wide(values.dtype)}
+        if not wide:
+            break
+        merge_limits(limits, flatten_cloud(path, replace(chunk, fields=wide), spelling))
+    return limits
+
+
+def merge_limits(limits: dict[str, Limits], columns: Columns) -> None:
+    """Widen limits by those of the columns of 64-bit integers of a chunk."""
+    for name, column in columns.items():
+        if _is_wide(column.dtype) and column.size:
+            low, high = int(column.min()), int(column.max())
+            known_low, known_high = limits.get(name, (low, high))
+            limits[name] = (min(low, known_low), max(high, known_high))
+
+
+def _is_wide(dtype: np.dtype[Any]) -> bool:
+    """Whether values are integers of 64 bits."""
+    return dtype.kind in "iu" and dtype.itemsize == 8
+
+
+def narrow_integers(
+    values: NDArray[Any], codes: Collection[str], limits: Limits | None
+) -> NDArray[Any]:
     """Return 64-bit integers in the first of some types, as ``("i4", "u4")``, that holds them all.
 
-    What none of them holds, and what is no 64-bit integers, stays as it is.
+    What none of them holds, what has no limits, and what is no 64-bit integers, stays as it is.
     """
-    if values.dtype.kind not in "iu" or values.dtype.itemsize < 8 or values.size == 0:
+    if not _is_wide(values.dtype) or limits is None:
         return values
-    low, high = int(values.min()), int(values.max())
     for code in codes:
-        limits = np.iinfo(code)
-        if limits.min <= low and high <= limits.max:
+        held = np.iinfo(code)
+        if held.min <= limits[0] and limits[1] <= held.max:
             return values.astype(code)
     return values
 
@@ -130,9 +170,12 @@ def to_records(columns: Columns) -> NDArray[Any]:
     return records
 
 
-def write_records(path: Path, lines: list[str], columns: Columns) -> None:
-    """Write a header of lines and the columns as binary records."""
-    records = to_records(columns)
+def write_records(
+    path: Path, header: Callable[[Columns], list[str]], chunks: Iterator[Columns]
+) -> None:
+    """Write lines that follow from the first columns, and all columns as binary records."""
     with atomic_path(path) as beside, beside.open("wb") as stream:
-        stream.write("".join(f"{line}\n" for line in lines).encode())
-        records.tofile(stream)
+        for number, columns in enumerate(chunks):
+            if number == 0:
+                stream.write("".join(f"{line}\n" for line in header(columns)).encode())
+            to_records(columns).tofile(stream)

@@ -10,6 +10,8 @@ import re
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain, groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -18,10 +20,10 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud, narrow_integers
+from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
 from torchrg.io.fields import Columns
 from torchrg.io.files import DAMAGES, atomic_path, check_promise, refusing
-from torchrg.io.stream import Table
+from torchrg.io.stream import CloudStream, Table
 from torchrg.structures import Cloud
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -39,6 +41,7 @@ _EXTENSIONS = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "torchrg": "urn:torchrg:point-fields",
 }
+_ENDS = ("Minimum", "Maximum")
 _PAGE_BYTES = 1024
 """The standard's page, the last four bytes of which are the CRC-32C of the others."""
 _BYTES_PER_POINT = 12
@@ -113,18 +116,16 @@ def check_e57(path: Path, cloud: Cloud | None) -> None:
     _pye57("write")
 
 
-def write_e57(path: Path, cloud: Cloud) -> None:
+def write_e57(path: Path, stream: CloudStream) -> None:
     """Write an E57 file; points that are not finite are marked as invalid.
 
     If the cloud came from an E57 file, its scans are written with their poses, otherwise one is.
     """
     pye57 = _pye57("write")
-    stored = cloud.header.get("scans", ())
-    columns = flatten_cloud(path, cloud, _SPELLING)
-    for name, column in columns.items():
-        columns[name] = column = narrow_integers(column, ("i8",))
-        if column.dtype == np.uint64:
-            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
+    plan = _plan(path, stream)
+    summaries = [_Summary() for _ in plan.groups]
+    for number, block in _scan_blocks(path, stream, plan):
+        summaries[number].add(block)
     errors = (pye57.libe57.E57Exception, ValueError, RuntimeError)
     with (
         refusing(f"{path}: cannot be written: ", *errors),
@@ -133,9 +134,9 @@ def write_e57(path: Path, cloud: Cloud) -> None:
     ):
         for prefix, uri in _EXTENSIONS.items():
             file.image_file.extensionsAdd(prefix, uri)
-        for scan, rows in _groups(columns, stored):
-            block = {name: column[rows] for name, column in columns.items()}
-            _write_points(pye57.libe57, file, scan, _to_scan(block, scan))
+        for number, blocks in groupby(_scan_blocks(path, stream, plan), key=itemgetter(0)):
+            scan, summary = plan.groups[number].scan, summaries[number]
+            _write_points(pye57.libe57, file, scan, summary, (block for _, block in blocks))
 
 
 def count_e57(path: Path, stream: BinaryIO, size: int) -> int:
@@ -302,66 +303,157 @@ def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _groups(columns: _Block, scans: Sequence[Scan]) -> Iterator[tuple[Scan, slice]]:
-    """Give the rows of each scan, and take ``scan`` out if it says no more than they do."""
-    count = len(columns["x"])
-    number = columns.get("scan")
-    if len(scans) > 1 and number is not None and (np.diff(number) >= 0).all():
-        bounds = np.searchsorted(number, np.arange(len(scans) + 1))
-        if bounds[0] == 0 and bounds[-1] == count:
+class _Group(NamedTuple):
+    """Points that become a scan: which, and how many."""
+
+    scan: Scan
+    count: int  # type: ignore[assignment]
+
+
+class _Plan(NamedTuple):
+    """What has to be known of all points before they are cut into scans.
+
+    If the scans say where points belong, the field ``scan`` says no more and is left out.
+    """
+
+    groups: list[_Group]
+    limits: dict[str, Limits]
+    names_scan: bool
+
+
+def _plan(path: Path, stream: CloudStream) -> _Plan:
+    """Look at all points; they are those of the cloud's scans if ``scan`` numbers them in order."""
+    scans = stream.header.get("scans", ())
+    limits: dict[str, Limits] = {}
+    counts, is_numbered, last, total = np.zeros(len(scans), np.int64), len(scans) > 1, 0, 0
+    for chunk in stream:
+        columns = flatten_cloud(path, chunk, _SPELLING)
+        merge_limits(limits, columns)
+        total += len(chunk)
+        number = columns.get("scan")
+        if is_numbered and number is not None:
+            bounds = np.searchsorted(number, np.arange(len(scans) + 1))
+            counts += np.diff(bounds)
+            is_sorted = number[0] >= last and (number[1:] >= number[:-1]).all()
+            is_numbered = bool(is_sorted and bounds[0] == 0 and bounds[-1] == len(chunk))
+            last = number[-1]
+        else:
+            is_numbered = False
+    for name, (_, high) in limits.items():
+        if high >= 2**63:
+            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
+    groups = [_Group(scans[0] if len(scans) == 1 else Scan(), total)]
+    if is_numbered:
+        groups = [_Group(scan, int(count)) for scan, count in zip(scans, counts, strict=True)]
+    return _Plan(groups, limits, is_numbered)
+
+
+def _scan_blocks(path: Path, stream: CloudStream, plan: _Plan) -> Iterator[tuple[int, _Block]]:
+    """Give the columns of each chunk in the frame of its scan, cut where the next scan begins."""
+    number, left = 0, plan.groups[0].count
+    for chunk in stream:
+        columns = flatten_cloud(path, chunk, _SPELLING, plan.limits)
+        if plan.names_scan:
             del columns["scan"]
-            for scan, start, stop in zip(scans, bounds, bounds[1:], strict=False):
-                if start < stop:
-                    yield scan, slice(start, stop)
-            return
-    yield scans[0] if len(scans) == 1 else Scan(), slice(0, count)
+        start = 0
+        while start < len(chunk):
+            while left == 0:
+                number += 1
+                left = plan.groups[number].count
+            stop = min(start + left, len(chunk))
+            block = {name: column[start:stop] for name, column in columns.items()}
+            yield number, _to_scan(block, plan.groups[number].scan)
+            left -= stop - start
+            start = stop
 
 
 def _to_scan(block: _Block, scan: Scan) -> _Block:
     """Move points back to the frame of their scan, and give the fields the standard's names."""
     points = scan.to_scan(np.stack([block.pop(axis) for axis in "xyz"], axis=1))
     scan.turn_normals(block, back=True)
-    named: _Block = {}
     finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        points = np.where(finite[:, None], points, 0)
-        # 2: there is nothing meaningful in the coordinates.
-        named[_STATE] = np.where(finite, 0, 2)
+    # 2: there is nothing meaningful in the coordinates.
+    named: _Block = {_STATE: np.where(finite, 0, 2)}
     for name, column in block.items():
         word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
         named[name if name in _STANDARD else f"torchrg:{word}"] = column
+    points = np.where(finite[:, None], points, 0)
     return {**dict(zip(_AXES, points.T, strict=True)), **named}
 
 
-def _write_points(libe57: Any, file: Any, scan: Scan, block: _Block) -> None:  # noqa: ANN401
+class _Summary:
+    """What has to be known of all points of a scan before the first is written.
+
+    Attributes:
+        longest: Points of its longest block.
+        limits: Least and largest values of whole numbers, of an intensity that is finite, and of
+            coordinates that are not marked as invalid.
+    """
+
+    def __init__(self) -> None:
+        self.longest = 0
+        self.limits: dict[str, tuple[Any, Any]] = {}
+
+    def add(self, block: _Block) -> None:
+        """Look at a block."""
+        self.longest = max(self.longest, len(block[_STATE]))
+        there = block[_STATE] == 0
+        for name, column in block.items():
+            if name in _AXES:
+                column = column[there]
+            elif name == "intensity":
+                column = column[np.isfinite(column)]
+            elif column.dtype.kind == "f":
+                continue
+            if column.size:
+                low, high = column.min(), column.max()
+                known_low, known_high = self.limits.get(name, (low, high))
+                self.limits[name] = (min(low, known_low), max(high, known_high))
+
+
+def _write_points(
+    libe57: Any,  # noqa: ANN401
+    file: Any,  # noqa: ANN401
+    scan: Scan,
+    summary: _Summary,
+    blocks: Iterator[_Block],
+) -> None:
     """Add a scan to a file, its columns by the standard's names and in its own frame."""
-    image, count = file.image_file, len(block[_AXES[0]])
+    image, first = file.image_file, next(blocks)
+    is_marked = summary.limits[_STATE] != (0, 0)
+    names = [name for name in first if name != _STATE or is_marked]
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
     # libe57 keeps the addresses of the columns, so they have to live until it is done.
-    kept = []
-    for name, column in block.items():
-        if column.dtype.kind == "f":
-            precision = libe57.E57_DOUBLE if column.dtype.itemsize > 4 else libe57.E57_SINGLE
+    kept: _Block = {}
+    for name in names:
+        dtype = first[name].dtype
+        if dtype.kind == "f":
+            precision = libe57.E57_DOUBLE if dtype.itemsize > 4 else libe57.E57_SINGLE
             prototype.set(name, libe57.FloatNode(image, 0.0, precision))
-            kept.append(np.ascontiguousarray(column))
+            kept[name] = np.empty(summary.longest, dtype)
         else:
-            low, high = int(column.min()), int(column.max())
+            low, high = map(int, summary.limits[name])
             prototype.set(name, libe57.IntegerNode(image, low, low, high))
-            kept.append(np.ascontiguousarray(column, dtype="q"))
-        buffers.append(libe57.SourceDestBuffer(image, name, kept[-1], count, True, True))
-    node = _tree(libe57, image, _facts(scan, block))
+            kept[name] = np.empty(summary.longest, "q")
+        buffer = libe57.SourceDestBuffer(image, name, kept[name], summary.longest, True, True)
+        buffers.append(buffer)
+    node = _tree(libe57, image, _facts(scan, names, summary))
     points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
     node.set("points", points)
     file.data3d.append(node)
     writer = points.writer(buffers)
-    writer.write(count)
+    for block in chain([first], blocks):
+        count = len(block[_STATE])
+        for name, column in kept.items():
+            column[:count] = block[name]
+        writer.write(count)
     writer.close()
 
 
-def _facts(scan: Scan, block: _Block) -> dict[str, Any]:
+def _facts(scan: Scan, names: Sequence[str], summary: _Summary) -> dict[str, Any]:
     """Return what is said about a scan as a whole: identity, pose, limits."""
-    there = block.get(_STATE, np.zeros(len(block[_AXES[0]]))) == 0
+    nothing = (0.0, 0.0)
     facts: dict[str, Any] = {
         "guid": f"{{{uuid.uuid4()}}}",
         "name": scan.name,
@@ -370,22 +462,21 @@ def _facts(scan: Scan, block: _Block) -> dict[str, Any]:
             "translation": dict(zip("xyz", map(float, scan.translation), strict=True)),
         },
         "cartesianBounds": {
-            f"{axis[-1].lower()}{end}": float(limit(block[axis][there])) if there.any() else 0.0
+            f"{axis[-1].lower()}{end}": float(limit)
             for axis in _AXES
-            for end, limit in (("Minimum", np.min), ("Maximum", np.max))
+            for end, limit in zip(_ENDS, summary.limits.get(axis, nothing), strict=True)
         },
     }
-    if "intensity" in block:
-        known = block["intensity"][np.isfinite(block["intensity"])]
+    if "intensity" in names:
         facts["intensityLimits"] = {
-            "intensityMinimum": float(known.min()) if known.size else 0.0,
-            "intensityMaximum": float(known.max()) if known.size else 0.0,
+            f"intensity{end}": float(limit)
+            for end, limit in zip(_ENDS, summary.limits.get("intensity", nothing), strict=True)
         }
-    if all(name in block for name in _COLOR):
+    if all(name in names for name in _COLOR):
         facts["colorLimits"] = {
             f"{name}{end}": value
             for name in _COLOR
-            for end, value in (("Minimum", 0), ("Maximum", 255))
+            for end, value in zip(_ENDS, (0, 255), strict=True)
         }
     return facts
 

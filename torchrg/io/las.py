@@ -10,17 +10,17 @@ import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud
+from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
 from torchrg.io.fields import WIDEN, Columns, Naming, are_whole
 from torchrg.io.files import DAMAGES, atomic_path, check_promise, first_line, refusing
-from torchrg.io.stream import Table
+from torchrg.io.stream import CloudStream, Table
 from torchrg.structures import Cloud
 
 _POINTS_AT_ONCE = 1 << 20
@@ -32,6 +32,8 @@ _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 """By point format without colour, the one that adds it."""
 _FIRST_LAYERED_FORMAT = 6
 """Point formats from here on are compressed field by field."""
+_RANGE_BITS = 0b110
+"""Options of an extra dimension: its least value is said, and its largest."""
 _UNFIT = "_value"
 """Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
 _LARGEST_INTEGER = 2**31 - 1
@@ -103,42 +105,107 @@ def check_las(path: Path, cloud: Cloud | None) -> None:
     """Check that laspy is installed, and that all points of a cloud that is known are finite."""
     _laspy("write")
     if cloud is not None and not cloud.finite.all():
-        raise FormatError(
-            f"{path}: expected finite coordinates, as LAS has no others, got "
-            f"{int((~cloud.finite).sum())} points that are not (first: "
-            f"{int(np.argmin(cloud.finite))}); write .npz, .ply or .pcd."
-        )
+        _refuse_points(path, int((~cloud.finite).sum()), int(np.argmin(cloud.finite)))
 
 
-def write_las(path: Path, cloud: Cloud) -> None:
+def _refuse_points(path: Path, count: int, first: int) -> NoReturn:
+    """Raise the error that some points are not finite."""
+    raise FormatError(
+        f"{path}: expected finite coordinates, as LAS has no others, got {count} points that are "
+        f"not (first: {first}); write .npz, .ply or .pcd."
+    )
+
+
+def write_las(path: Path, stream: CloudStream) -> None:
     """Write a LAS file, or a LAZ file if the suffix says so.
 
     If the cloud came from a LAS file, scale, offset, reference system and point format are kept;
     otherwise the scale is the smallest power of ten that the grid of 32 bits allows.
     """
     laspy = _laspy("write")
-    columns = flatten_cloud(path, cloud, _SPELLING)
-    header, has_date = _header(
-        laspy, cloud, colored=all(name in columns for name in _SPELLING.color)
-    )
-    named = _fitted(path, header.point_format, columns)
+    plan = _plan(path, laspy, stream)
+    errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
+    with (
+        refusing(f"{path}: cannot be written: ", *errors),
+        atomic_path(path) as beside,
+    ):
+        with laspy.open(beside, mode="w", header=plan.header) as writer:
+            for chunk in stream:
+                record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=plan.header)
+                data = laspy.LasData(plan.header, record)
+                data.x, data.y, data.z = chunk.coordinates.T.astype(np.float64)
+                columns = flatten_cloud(path, chunk, _SPELLING, plan.limits)
+                for name, column in _fitted(path, columns, plan.unfit).items():
+                    data[name] = column
+                writer.write_points(data.points)
+            if plan.header.version.minor >= 4 and plan.header.evlrs is not None:
+                writer.write_evlrs(plan.header.evlrs)
+        if not plan.has_date:
+            _erase_date(beside)
+
+
+class _Plan(NamedTuple):
+    """What has to be known of all points before the first is written.
+
+    The header holds the extra dimensions; ``unfit`` are the columns that the standard dimension of
+    their name cannot hold; without a date, that of the day is erased.
+    """
+
+    header: Any
+    has_date: bool
+    unfit: set[str]
+    limits: dict[str, Limits]
+
+
+def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
+    """Look at all points."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    unfit, limits = set[str](), dict[str, Limits]()
+    num_before, num_lost, first_lost = 0, 0, 0
+    for number, chunk in enumerate(stream):
+        columns = flatten_cloud(path, chunk, _SPELLING)
+        if number == 0:
+            colored = all(name in columns for name in _SPELLING.color)
+            header, has_date = _header(laspy, stream, colored=colored)
+        merge_limits(limits, columns)
+        fitted = _fitted(path, columns, set())
+        unfit |= {
+            name
+            for name in fitted.keys() & set(header.point_format.dimension_names)
+            if not _holds(header.point_format.dimension_by_name(name), fitted[name])
+        }
+        if not chunk.finite.all():
+            first_lost = first_lost if num_lost else num_before + int(np.argmin(chunk.finite))
+            num_lost += int((~chunk.finite).sum())
+        num_before += len(chunk)
+        low = np.minimum(low, chunk.coordinates.min(axis=0))
+        high = np.maximum(high, chunk.coordinates.max(axis=0))
+    if num_lost:
+        _refuse_points(path, num_lost, first_lost)
+    if "las" not in stream.header:
+        middle = np.rint((low + high) / 2)
+        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
+        header.offsets = middle
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
+    columns = flatten_cloud(path, chunk, _SPELLING, limits)
     header.add_extra_dims(
         [
             laspy.ExtraBytesParams(name, column.dtype.str[1:])
-            for name, column in named.items()
+            for name, column in _fitted(path, columns, unfit).items()
             if name not in header.point_format.dimension_names
         ]
     )
-    errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
-    with refusing(f"{path}: cannot be written: ", *errors):
-        data = laspy.LasData(header)
-        data.x, data.y, data.z = cloud.coordinates.T.astype(np.float64)
-        for name, column in named.items():
-            data[name] = column
-        with atomic_path(path) as beside:
-            data.write(beside)
-            if not has_date:
-                _erase_date(beside)
+    _claim_no_ranges(header)
+    return _Plan(header, has_date, unfit, limits)
+
+
+def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401
+    """Say nothing of the range of extra dimensions, for which laspy 2.7.0 takes a first value."""
+    for record in header.vlrs.get("ExtraBytesVlr"):
+        for described in record.extra_bytes_structs:
+            # Without a type the same byte is the number of bytes.
+            if described.data_type != 0:
+                described.options &= ~_RANGE_BITS
 
 
 def count_las(path: Path, stream: BinaryIO, size: int) -> int:
@@ -259,17 +326,11 @@ def _unused(columns: Collection[str], standard: set[str], used: Collection[str])
     return set(columns) - kept
 
 
-def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
+def _header(laspy: Any, stream: CloudStream, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
     """Return the header the cloud came with, or a new one, and whether it has a date."""
-    stored = cloud.header.get("las")
+    stored = stream.header.get("las")
     if stored is None:
-        header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
-        low, high = cloud.coordinates.min(axis=0), cloud.coordinates.max(axis=0)
-        middle = np.rint((low.astype(np.float64) + high) / 2)
-        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
-        header.offsets = middle
-        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
-        return header, False
+        return laspy.LasHeader(version="1.4", point_format=7 if colored else 6), False
     number = stored.point_format.id
     number = _WITH_COLOR.get(number, number) if colored else number
     least = laspy.LasHeader(point_format=number).version
@@ -278,11 +339,7 @@ def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # 
     return header, stored.creation_date is not None
 
 
-def _fitted(
-    path: Path,
-    point_format: Any,  # noqa: ANN401
-    columns: dict[str, NDArray[Any]],
-) -> dict[str, NDArray[Any]]:
+def _fitted(path: Path, columns: Columns, unfit: Collection[str]) -> dict[str, NDArray[Any]]:
     """Return all columns but x, y, z; those that a standard dimension cannot hold renamed."""
     fitted = {}
     for name, column in columns.items():
@@ -290,8 +347,7 @@ def _fitted(
             continue
         if name in _SPELLING.color and column.dtype == np.uint8:
             column = column.astype(np.uint16) * WIDEN
-        known = name in point_format.dimension_names
-        if known and not _holds(point_format.dimension_by_name(name), column):
+        if name in unfit:
             name = f"{name}{_UNFIT}"
         if name in ("X", "Y", "Z") or len(name.encode()) > 32:
             raise FormatError(

@@ -7,6 +7,7 @@ that begin with ``plane_``. See :func:`torchrg.io.write_cloud` for all names of 
 a structured array with named fields ``x``, ``y``, ``z``.
 """
 
+import io
 import json
 import math
 import tokenize
@@ -25,13 +26,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, check_length, flatten_cloud, to_records
+from torchrg.io.columns import Spelling, flatten_cloud, to_records, wide_limits
 from torchrg.io.fields import Columns, check_coordinates, naming_of, number_columns
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
-from torchrg.io.stream import Table, slices
-from torchrg.structures import PLANE_KINDS, Cloud, Segmentation, Superpoints
+from torchrg.io.stream import CHUNK_SIZE, CloudStream, Table, slices
+from torchrg.structures import PLANE_KINDS, Planes, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
+_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 _NOT_PER_POINT = "plane_"
 _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
@@ -63,13 +65,19 @@ def open_npy(path: Path, size: int) -> Table:
     return Table(read, num_points, naming=naming)
 
 
-def write_npy(path: Path, cloud: Cloud) -> None:
+def write_npy(path: Path, stream: CloudStream) -> None:
     """Write coordinates of shape (N, 3), or with fields a structured array named as in PLY."""
-    values: NDArray[Any] = cloud.coordinates
-    if cloud.fields:
-        values = to_records(flatten_cloud(path, cloud, Spelling()))
-    with atomic_path(path) as beside, beside.open("wb") as stream:
-        npy_format.write_array(stream, values, allow_pickle=False)
+    with atomic_path(path) as beside, beside.open("wb") as file:
+        _write_array(file, stream.count, _bare_or_records(path, stream))
+
+
+def _bare_or_records(path: Path, stream: CloudStream) -> Iterator[NDArray[Any]]:
+    """Give the coordinates of each chunk, or its columns as records if it has fields."""
+    spelling = Spelling()
+    limits = wide_limits(path, stream, spelling)
+    for chunk in stream:
+        columns = flatten_cloud(path, chunk, spelling, limits)
+        yield to_records(columns) if chunk.fields else chunk.coordinates
 
 
 def count_npy(path: Path, stream: IO[bytes], size: int) -> int:
@@ -116,40 +124,85 @@ def open_npz(path: Path, size: int) -> Table:
 
 def write_npz(
     path: Path,
-    cloud: Cloud,
+    stream: CloudStream,
     segmentation: Segmentation | None = None,
     provenance: Mapping[str, Any] | None = None,
     superpoints: Superpoints | None = None,
 ) -> None:
     """Write ``points`` and every field under its name, or the arrays of a result, and provenance.
 
-    Equal arrays give equal bytes, whenever and wherever.
+    Equal arrays give equal bytes, whenever and wherever. As one array comes after the other, the
+    chunks are gone through once for each field.
     """
+    arrays: dict[str, NDArray[Any] | Callable[[], Iterator[NDArray[Any]]]] = {
+        "points": lambda: (chunk.coordinates for chunk in stream)
+    }
     if segmentation is None:
-        for name, values in cloud.fields.items():
-            check_length(path, name, values, len(cloud))
+        for name, values in next(iter(stream)).fields.items():
             if name in _COORDINATES:
                 raise FormatError(
                     f"{path}: expected fields beside points, got {name!r}; rename it."
                 )
-        arrays = {"points": cloud.coordinates, **cloud.fields}
+            if values.dtype.hasobject:
+                raise FormatError(
+                    f"{path}: expected numbers or text in {name}, got Python objects; leave it out."
+                )
+            arrays[name] = partial(_field, stream, name)
     else:
-        arrays = _result(cloud, segmentation)
+        for name in _RESULTS:
+            arrays[name] = partial(_cut, getattr(segmentation, name))
+        arrays |= _table(stream.origin, segmentation.planes)
     if superpoints is not None:
-        arrays |= superpoints.by_level()
+        for name in superpoints.rows(slice(0)).by_level():
+            arrays[name] = partial(_level, superpoints, name)
         arrays["plane_of_superpoint"] = superpoints.plane.numpy(force=True)
     if provenance is not None:
         arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
-    for name, values in arrays.items():
-        if values.dtype.hasobject:
-            raise FormatError(
-                f"{path}: expected numbers or text in {name}, got Python objects; leave it out."
-            )
     with atomic_path(path) as beside, zipfile.ZipFile(beside, "w", allowZip64=True) as archive:
-        for name, values in arrays.items():
+        for name, content in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy", _EARLIEST_ZIP_TIME)
-            with archive.open(member, "w", force_zip64=True) as stream:
-                npy_format.write_array(stream, np.asarray(values, order="C"), allow_pickle=False)
+            with archive.open(member, "w", force_zip64=True) as file:
+                if callable(content):
+                    _write_array(file, stream.count, content())
+                else:
+                    npy_format.write_array(file, np.asarray(content, order="C"), allow_pickle=False)
+
+
+def _field(stream: CloudStream, name: str) -> Iterator[NDArray[Any]]:
+    """Give a field of each chunk."""
+    return (chunk.fields[name] for chunk in stream)
+
+
+def _cut(values: Tensor) -> Iterator[NDArray[Any]]:
+    """Give the rows of a tensor in chunks."""
+    return (values[rows].numpy(force=True) for rows in slices(len(values), CHUNK_SIZE))
+
+
+def _level(superpoints: Superpoints, name: str) -> Iterator[NDArray[Any]]:
+    """Give a level of superpoints in chunks."""
+    for rows in slices(len(superpoints.labels), CHUNK_SIZE):
+        yield superpoints.rows(rows).by_level()[name]
+
+
+def _write_array(file: IO[bytes], num_rows: int, chunks: Iterator[NDArray[Any]]) -> None:
+    """Write an array of so many rows in NumPy's format, a few of them at a time."""
+    for number, values in enumerate(chunks):
+        if number == 0:
+            file.write(_header_of(values[:0], num_rows))
+        file.write(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
+
+
+def _header_of(empty: NDArray[Any], num_rows: int) -> bytes:
+    """Return the header of an array of so many rows from an array of none.
+
+    NumPy keeps room in it for the number to grow, so the length is the same for both.
+    """
+    with io.BytesIO() as memory:
+        npy_format.write_array(memory, empty, allow_pickle=False)
+        before, mark, after = memory.getvalue().rpartition(b"'shape': (0,")
+    digits = str(num_rows).encode()
+    room = b" " * (len(digits) - 1)
+    return before + mark[:-2] + digits + b"," + after.removesuffix(room + b"\n") + b"\n"
 
 
 def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
@@ -160,24 +213,20 @@ def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
             return count_npy(path, member, size)
 
 
-def _result(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a result, planes in the coordinates of the cloud itself.
+def _table(origin: NDArray[np.float64], planes: Planes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a table of planes about an origin, in the coordinates of the cloud.
 
-    What the table of planes does not have is left out.
+    What the table does not have is left out.
     """
 
     def moved(places: Tensor) -> NDArray[np.float64]:
-        return places.numpy(force=True).astype(np.float64) + cloud.origin
+        return places.numpy(force=True).astype(np.float64) + origin
 
-    per_point = segmentation._asdict()
-    planes, _ = per_point.pop("planes"), per_point.pop("points")
     table = planes._asdict()
     kind, outline, adjacency = (table.pop(name) for name in ("kind", "outline", "adjacency"))
-    arrays = {"points": cloud.coordinates}
-    arrays |= {name: values.numpy(force=True) for name, values in per_point.items()}
-    arrays |= {f"plane_{name}": values.numpy(force=True) for name, values in table.items()}
+    arrays = {f"plane_{name}": values.numpy(force=True) for name, values in table.items()}
     arrays["plane_offset"] = (
-        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ cloud.origin
+        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ origin
     )
     arrays |= {f"plane_{name}": moved(table[name]) for name in ("centroid", "center")}
     if kind is not None:

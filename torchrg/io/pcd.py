@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud, write_records
+from torchrg.io.columns import Spelling, flatten_stream, write_records
 from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
-from torchrg.io.stream import Table, slices
+from torchrg.io.stream import CloudStream, Table, slices
 from torchrg.io.text import LINES_AT_ONCE, read_ascii
-from torchrg.structures import Cloud
 
 _LONGEST_HEADER = 1 << 16
 _LARGEST_RECORD = 1 << 20
@@ -66,36 +65,38 @@ def open_pcd(path: Path, size: int) -> Table:
     )
 
 
-def write_pcd(path: Path, cloud: Cloud) -> None:
+def write_pcd(path: Path, stream: CloudStream) -> None:
     """Write a binary file; equal clouds give equal bytes.
 
     Coordinates keep their precision, colours are packed as PCL does, an organised cloud keeps its
     width and height. (Open3D's older reader, and PCL's own point types, take float32 coordinates
     only; ``open3d.t.io`` takes both.)
     """
-    height, width = cloud.grid_shape or (1, len(cloud))
-    if height * width != len(cloud):
+    height, width = stream.grid_shape or (1, stream.count)
+    if height * width != stream.count:
         raise FormatError(
-            f"{path}: expected a grid of {len(cloud)} points, got {height} rows of {width}; "
+            f"{path}: expected a grid of {stream.count} points, got {height} rows of {width}; "
             "set grid_shape to None."
         )
-    columns = _packed(flatten_cloud(path, cloud, _SPELLING))
-    values = columns.values()
-    viewpoint = cloud.header.get("viewpoint", _DEFAULT_VIEWPOINT)
-    lines = [
-        "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
-        f"FIELDS {' '.join(columns)}",
-        f"SIZE {' '.join(str(column.dtype.itemsize) for column in values)}",
-        f"TYPE {' '.join(column.dtype.kind.upper() for column in values)}",
-        f"COUNT {' '.join(str(int(np.prod(column.shape[1:]))) for column in values)}",
-        f"WIDTH {width}",
-        f"HEIGHT {height}",
-        f"VIEWPOINT {' '.join(f'{value:.17g}' for value in viewpoint)}",
-        f"POINTS {width * height}",
-        "DATA binary",
-    ]
-    write_records(path, lines, columns)
+    viewpoint = stream.header.get("viewpoint", _DEFAULT_VIEWPOINT)
+
+    def header(columns: Columns) -> list[str]:
+        values = columns.values()
+        return [
+            "# .PCD v0.7 - Point Cloud Data file format",
+            "VERSION 0.7",
+            f"FIELDS {' '.join(columns)}",
+            f"SIZE {' '.join(str(column.dtype.itemsize) for column in values)}",
+            f"TYPE {' '.join(column.dtype.kind.upper() for column in values)}",
+            f"COUNT {' '.join(str(int(np.prod(column.shape[1:]))) for column in values)}",
+            f"WIDTH {width}",
+            f"HEIGHT {height}",
+            f"VIEWPOINT {' '.join(f'{value:.17g}' for value in viewpoint)}",
+            f"POINTS {width * height}",
+            "DATA binary",
+        ]
+
+    write_records(path, header, map(_packed, flatten_stream(path, stream, _SPELLING)))
 
 
 def count_pcd(path: Path, stream: BinaryIO, size: int) -> int:
@@ -326,7 +327,7 @@ def _unpacked(name: str, values: NDArray[Any]) -> _Fields:
     return unpacked | ({"alpha": quadruples[:, 3].copy()} if name.lower() == "rgba" else {})
 
 
-def _packed(columns: _Fields) -> _Fields:
+def _packed(columns: Columns) -> _Fields:
     """Pack the channels of a colour as PCL does, and give normals the type of the coordinates."""
     packed: _Fields = {}
     has_color = all(name in columns for name in _SPELLING.color)

@@ -14,12 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud, narrow_integers, write_records
+from torchrg.io.columns import (
+    Limits,
+    Spelling,
+    flatten_cloud,
+    narrow_integers,
+    wide_limits,
+    write_records,
+)
 from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
-from torchrg.io.stream import Table, slices
+from torchrg.io.stream import CloudStream, Table, slices
 from torchrg.io.text import LINES_AT_ONCE, read_ascii
-from torchrg.structures import Cloud
 
 _TYPES = {
     "char": "i1",
@@ -68,25 +74,34 @@ def open_ply(path: Path, size: int) -> Table:
     return Table(read, header.elements[-1].num_records, at_once)
 
 
-def write_ply(path: Path, cloud: Cloud) -> None:
+def write_ply(path: Path, stream: CloudStream) -> None:
     """Write a little-endian file; coordinates keep their precision, equal clouds give equal bytes.
 
     64-bit integers become 32-bit ones, or ``double`` where that holds them.
     """
-    columns = {
-        name: _storable(path, name, column)
-        for name, column in flatten_cloud(path, cloud, Spelling()).items()
-    }
+    spelling = Spelling()
+    limits = wide_limits(path, stream, spelling)
     words = {code: word for word, code in _TYPES.items()}
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment written by torchrg",
-        f"element vertex {len(cloud)}",
-        *(f"property {words[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
-        "end_header",
-    ]
-    write_records(path, lines, columns)
+
+    def header(columns: Columns) -> list[str]:
+        return [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment written by torchrg",
+            f"element vertex {stream.count}",
+            *(f"property {words[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
+            "end_header",
+        ]
+
+    chunks = (flatten_cloud(path, chunk, spelling, limits) for chunk in stream)
+    write_records(
+        path,
+        header,
+        (
+            {name: _storable(path, name, c, limits.get(name)) for name, c in columns.items()}
+            for columns in chunks
+        ),
+    )
 
 
 def count_ply(path: Path, stream: BinaryIO, size: int) -> int:
@@ -95,11 +110,11 @@ def count_ply(path: Path, stream: BinaryIO, size: int) -> int:
     return {element.name: element.num_records for element in elements}["vertex"]
 
 
-def _storable(path: Path, name: str, column: NDArray[Any]) -> NDArray[Any]:
-    """Return a column in a type that PLY has."""
-    column = narrow_integers(column, ("i4", "u4"))
-    if column.dtype.kind in "iu" and column.dtype.itemsize == 8:
-        if max(abs(int(column.min())), abs(int(column.max()))) > 2**53:
+def _storable(path: Path, name: str, column: NDArray[Any], limits: Limits | None) -> NDArray[Any]:
+    """Return a column in a type that PLY has and that holds its limits."""
+    column = narrow_integers(column, ("i4", "u4"), limits)
+    if limits is not None and column.dtype.kind in "iu" and column.dtype.itemsize == 8:
+        if max(map(abs, limits)) > 2**53:
             raise FormatError(
                 f"{path}: expected field {name} within 2^53, got 64-bit integers beyond; "
                 "leave it out or write .npz."

@@ -19,6 +19,8 @@ from torchrg.errors import FormatError
 from torchrg.io.fields import Columns, Naming, Span, assemble_cloud, color_spans
 from torchrg.structures import Cloud, origin_of_box
 
+CHUNK_SIZE = 1 << 20
+"""Points of a chunk: tens of megabytes, and few enough calls for each that they do not count."""
 SILENT: dict[str, Any] = {"over": "ignore", "invalid": "ignore"}
 """Files may hold any bits as numbers: values that overflow or signal are kept, not reported."""
 
@@ -99,6 +101,7 @@ class CloudStream:
         grid_shape: That of the whole cloud.
         source: The file, for messages.
         header: That of the cloud, and of each chunk.
+        measure: Gives the extent where it is known already; None to look at all chunks for it.
 
     Example:
         >>> cloud = Cloud(np.arange(30.0).reshape(10, 3))
@@ -111,6 +114,7 @@ class CloudStream:
     grid_shape: tuple[int, int] | None = None
     source: str = ""
     header: Mapping[str, Any] = field(default_factory=dict)
+    measure: Callable[[], "Extent"] | None = None
 
     @classmethod
     def of(cls, cloud: Cloud, *, chunk_size: int) -> "CloudStream":
@@ -129,12 +133,46 @@ class CloudStream:
     @cached_property
     def extent(self) -> "Extent":
         """Number of points and box of the finite ones; found by one pass over the chunks."""
-        return reduce(Extent.__or__, map(Extent.of, self))
+        return self.measure() if self.measure else reduce(Extent.__or__, map(Extent.of, self))
+
+    @property
+    def count(self) -> int:
+        """Number of points; where the file does not say, found by one pass over the chunks."""
+        return self.extent.num_points if self.num_points is None else self.num_points
 
     @property
     def origin(self) -> NDArray[np.float64]:
         """Origin of the whole cloud, as :attr:`torchrg.Cloud.origin`, shape ``(3,)``."""
         return origin_of_box(self.extent.low, self.extent.high)
+
+    def each(self, change: Callable[[Cloud, slice], Cloud]) -> "CloudStream":
+        """Change each chunk, of which the rows in the whole cloud are told, but not its points."""
+
+        def changed() -> Iterator[Cloud]:
+            start = 0
+            for chunk in self:
+                yield change(chunk, slice(start, start + len(chunk)))
+                start += len(chunk)
+
+        return replace(self, chunks=changed, measure=lambda: self.extent)
+
+    def with_fields(self, give: Callable[[slice], Columns]) -> "CloudStream":
+        """Add fields, given for the rows of each chunk; they take the place of older ones.
+
+        Example:
+            >>> stream = CloudStream.of(Cloud(np.eye(3)), chunk_size=2)
+            >>> labels = np.array([0, 0, -1])
+            >>> labelled = stream.with_fields(lambda rows: {"labels": labels[rows]})
+            >>> [chunk.fields["labels"].tolist() for chunk in labelled]
+            [[0, 0], [-1]]
+        """
+
+        def joined(chunk: Cloud, rows: slice) -> Cloud:
+            new = give(rows)
+            kept = {name: values for name, values in chunk.fields.items() if name not in new}
+            return replace(chunk, fields={**kept, **new})
+
+        return self.each(joined)
 
 
 class Extent(NamedTuple):

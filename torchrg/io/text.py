@@ -18,8 +18,7 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import Spelling, flatten_cloud
 from torchrg.io.fields import Columns, naming_of, number_columns
 from torchrg.io.files import atomic_path, check_promise
-from torchrg.io.stream import Table
-from torchrg.structures import Cloud
+from torchrg.io.stream import CloudStream, Table
 
 LINES_AT_ONCE = 65_536
 """Lines that are parsed or formatted together; bounds memory."""
@@ -61,13 +60,15 @@ def _open_lines(path: Path) -> TextIO:
     return path.open(encoding="utf-8-sig", errors="replace")
 
 
-def write_text(path: Path, cloud: Cloud) -> None:
+def write_text(path: Path, stream: CloudStream) -> None:
     """Write points as text that reads back to the same values, names of fields in a comment."""
-    columns = flatten_cloud(path, cloud, Spelling())
-    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
-        if cloud.fields:
-            stream.write(f"# {' '.join(columns)}\n")
-        stream.writelines(_format_table(columns.values()))
+    spelling = Spelling()
+    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
+        for number, chunk in enumerate(stream):
+            columns = flatten_cloud(path, chunk, spelling)
+            if number == 0 and chunk.fields:
+                file.write(f"# {' '.join(columns)}\n")
+            file.writelines(_format_table(columns.values()))
 
 
 def count_text(path: Path, stream: BinaryIO, size: int) -> int:
