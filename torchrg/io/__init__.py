@@ -14,6 +14,7 @@ from torchrg.io.e57 import check_e57, count_e57, open_e57, write_e57
 from torchrg.io.fields import checked_coordinates
 from torchrg.io.files import atomic_path, check_file, check_place
 from torchrg.io.las import check_las, count_las, open_las, write_las
+from torchrg.io.merge import merge_streams
 from torchrg.io.npy import (
     ARCHIVE_DAMAGES,
     count_npy,
@@ -43,6 +44,7 @@ __all__ = [
     "atomic_path",
     "check_output",
     "estimate_points",
+    "merge_streams",
     "read_cloud",
     "stream_cloud",
     "write_cloud",

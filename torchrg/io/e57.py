@@ -373,11 +373,12 @@ def _to_scan(block: _Block, scan: Scan) -> _Block:
     scan.turn_normals(block, back=True)
     finite = np.isfinite(points).all(axis=1)
     # 2: there is nothing meaningful in the coordinates.
-    named: _Block = {_STATE: np.where(finite, 0, 2)}
+    named: _Block = {_STATE: np.where(finite, np.uint8(0), np.uint8(2))}
     for name, column in block.items():
         word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
         named[name if name in _STANDARD else f"torchrg:{word}"] = column
-    points = np.where(finite[:, None], points, 0)
+    if not finite.all():
+        points = np.where(finite[:, None], points, 0)
     return {**dict(zip(_AXES, points.T, strict=True)), **named}
 
 

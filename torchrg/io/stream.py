@@ -117,7 +117,7 @@ class CloudStream:
     measure: Callable[[], "Extent"] | None = None
 
     @classmethod
-    def of(cls, cloud: Cloud, *, chunk_size: int) -> "CloudStream":
+    def of(cls, cloud: Cloud, *, chunk_size: int = CHUNK_SIZE) -> "CloudStream":
         """Cut a cloud into chunks, which are views of it."""
 
         def cut() -> Iterator[Cloud]:
@@ -129,6 +129,14 @@ class CloudStream:
 
     def __iter__(self) -> Iterator[Cloud]:
         return self.chunks()
+
+    def read(self) -> Cloud:
+        """Return all chunks as one cloud in memory."""
+        chunks = list(self)
+        columns = join_columns([{**chunk.fields, "": chunk.coordinates} for chunk in chunks])
+        fields = dict(columns)
+        points = fields.pop("")
+        return Cloud(points, fields, self.grid_shape, self.source, self.header)
 
     @cached_property
     def extent(self) -> "Extent":
