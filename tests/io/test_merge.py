@@ -101,11 +101,23 @@ def test_las_tiles_keep_a_header_whose_grid_holds_them(tmp_path):
     far = las_tile(tmp_path / "far.las", 2.5e7)
     stream, notes = merge_streams([tiles[0], far])
     assert "las" not in stream.header
-    assert notes == [
-        f"the header of {tmp_path}/0.las is not kept: its grid does not reach all points"
-    ]
+    why = "its grid does not reach all points"
+    assert notes == [f"the header of {tmp_path}/0.las is not kept: {why}"]
     other = las_tile(tmp_path / "other.las", 0.0, point_format=6)
     assert "point formats differ" in merge_streams([tiles[0], other]).notes[-1]
+
+
+def test_dimensions_that_are_zero_in_one_las_file_are_kept(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    first = las_tile(tmp_path / "a.las", 0.0)
+    data = laspy.read(tmp_path / "a.las")
+    data.user_data[:], data.green[3] = 0, 257
+    data.write(tmp_path / "b.las")
+    stream, notes = merge_streams([first, stream_cloud(tmp_path / "b.las", chunk_size=4)])
+    found = stream.read().fields
+    assert notes == []
+    assert found["user_data"].tolist() == [3] * 9 + [0] * 9
+    assert found["color"].sum(axis=0).tolist() == [0, 1, 0]
 
 
 def test_coordinate_systems_that_differ_are_refused(tmp_path):
@@ -125,10 +137,9 @@ def test_scans_of_several_e57_files_are_numbered_on(tmp_path, make_cloud):
 
     number = np.repeat(np.arange(2, dtype=np.int32), 10)
     two = {"scans": (Scan("a"), Scan("b"))}
+    one = {"scans": (Scan("c"),)}
     write_cloud(tmp_path / "a.e57", Cloud(make_cloud(20).coordinates, {"scan": number}, header=two))
-    write_cloud(
-        tmp_path / "b.e57", Cloud(make_cloud(5).coordinates, header={"scans": (Scan("c"),)})
-    )
+    write_cloud(tmp_path / "b.e57", Cloud(make_cloud(5).coordinates, header=one))
     paths = [tmp_path / "a.e57", tmp_path / "b.e57", tmp_path / "b.e57"]
     stream, notes = merge_streams([stream_cloud(path, chunk_size=7) for path in paths])
     assert notes == []

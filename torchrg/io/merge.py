@@ -34,7 +34,7 @@ class Merged(NamedTuple):
 
 
 class _Kept(NamedTuple):
-    """The type that coordinates have in the merged cloud; types and shapes of rows of its fields."""
+    """The types of the merged cloud: of coordinates, and of fields with the shape of a row."""
 
     coordinates: np.dtype[Any]
     fields: dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
@@ -56,10 +56,11 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
 
     Convention:
         A field is kept if every cloud has it with as many columns, numbers all or text all, or is a
-        LAS file in which it is zero and therefore left out; it has the type that holds all of them, colours of 8 bits become such of 16 where another cloud has
-        these. Coordinates are float64 if any are. Of LAS files the header of the first is kept with
-        the finest scale, if their point formats are the same and its grid reaches all points; of
-        E57 files all scans are, numbered on in ``scan``.
+        LAS file in which it is zero and therefore left out; it has the type that holds all of them,
+        and colours of 8 bits become such of 16 where another cloud has these. Coordinates are
+        float64 if any are. Of LAS files the header of the first is kept with the finest scale, if
+        their point formats are the same and its grid reaches all points; of E57 files all scans
+        are, numbered on in ``scan``.
 
     Args:
         streams: The clouds, at least one; their coordinates are taken to be of one frame and unit.
