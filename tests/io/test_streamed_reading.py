@@ -1,6 +1,7 @@
 """Chunks put one after the other are what reading the whole file gives."""
 
 import random
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,22 +78,24 @@ def test_one_row_decides_the_names_of_all(tmp_path, kind, at, row, fields):
 
 
 @pytest.mark.parametrize(
-    ("code", "last", "depth", "first"),
+    ("code", "value", "last", "depth", "kept"),
     [
-        ("f4", 1.0, np.uint8, 128),
-        ("f4", 2.0, np.uint8, 0),
-        ("u2", 65535, np.uint8, 2),
-        ("u2", 65534, np.uint16, 514),
-        ("f8", np.nan, np.uint8, 128),
+        ("f4", 0.5, 1.0, np.uint8, 128),
+        ("f4", 0.5, 2.0, np.uint8, 0),
+        ("u2", 514, 65535, np.uint8, 2),
+        ("u2", 514, 65534, np.uint16, 514),
+        ("u2", 200, 65535, np.uint16, 200),
+        ("i4", 200, 255, np.uint8, 200),
+        ("f8", 0.5, np.nan, np.uint8, 128),
     ],
 )
-def test_one_colour_decides_the_depth_of_all(tmp_path, code, last, depth, first):
-    color = np.full((NUM_POINTS, 3), 0.5 if code[0] == "f" else 514).astype(code)
+def test_one_colour_decides_the_depth_of_all(tmp_path, code, value, last, depth, kept):
+    color = np.full((NUM_POINTS, 3), value).astype(code)
     color[-1] = last
     np.savez(tmp_path / "a.npz", points=np.zeros((NUM_POINTS, 3)), color=color)
     whole = assert_streams_as_read(tmp_path / "a.npz")
     assert whole.fields["color"].dtype == depth
-    assert whole.fields["color"][0, 0] == first
+    assert whole.fields["color"][0, 0] == kept
 
 
 def test_colours_out_of_range_are_the_same_error(tmp_path):
@@ -117,6 +120,46 @@ def test_las_dimension_that_one_point_uses_is_a_field_of_all(tmp_path):
         assert {"user_data", "color"} == whole.fields.keys()
 
 
+def write_copc(path, monkeypatch):
+    """Write what COPC adds to LAZ: chunks of any size, the octree's records, no order of points."""
+    laspy, lazrs = pytest.importorskip("laspy"), pytest.importorskip("lazrs")
+    from laspy._compression import lazrsbackend
+
+    def with_any_chunks(*arguments):
+        return lazrs.LazVlr.new_for_compression(*arguments, use_variable_size_chunks=True)
+
+    variable = SimpleNamespace(new_for_compression=with_any_chunks)
+    packer = SimpleNamespace(**{**vars(lazrs), "LazVlr": variable})
+    monkeypatch.setattr(lazrsbackend, "lazrs", packer)
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales = [0.001] * 3
+    header.vlrs.append(laspy.VLR("copc", 1, "", bytes(160)))
+    records = laspy.vlrs.vlrlist.VLRList([laspy.VLR("copc", 1000, "", bytes(32))])
+    rng = np.random.default_rng(0)
+    with laspy.open(
+        path, "w", header=header, do_compress=True, laz_backend=laspy.LazBackend.Lazrs
+    ) as writer:
+        for count in (5, 1, 40, NUM_POINTS - 46):
+            points = laspy.ScaleAwarePointRecord.zeros(count, header=header)
+            points.x, points.y, points.z = rng.random((3, count))
+            points.red[:] = 257
+            writer.write_points(points)
+            writer.point_writer.compressor.finish_current_chunk()
+        writer.write_evlrs(records)
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("kind", [".las", ".laz"])
+def test_copc_is_read_and_written_as_what_laspy_can(tmp_path, monkeypatch, kind):
+    path = tmp_path / "a.copc.laz"
+    write_copc(path, monkeypatch)
+    whole = assert_streams_as_read(path)
+    np.testing.assert_array_equal(whole.coordinates, pytest.importorskip("laspy").read(path).xyz)
+    assert list(whole.fields) == ["color"]
+    write_cloud(tmp_path / f"b{kind}", stream_cloud(path, chunk_size=7))
+    np.testing.assert_array_equal(read_cloud(tmp_path / f"b{kind}").coordinates, whole.coordinates)
+
+
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_in_columns_and_arrays_left_out(tmp_path, save):
     rng = np.random.default_rng(0)
@@ -127,6 +170,19 @@ def test_arrays_in_columns_and_arrays_left_out(tmp_path, save):
     whole = assert_streams_as_read(path)
     np.testing.assert_array_equal(whole.coordinates, points)
     np.testing.assert_array_equal(whole.fields["wave"], wave)
+
+
+@pytest.mark.parametrize("name", ["plane_area", "points"])
+def test_checksums_count_for_arrays_left_out_and_for_those_in_columns(tmp_path, name):
+    # Longer than what is read together with their headers.
+    points = np.asfortranarray(np.random.default_rng(0).random((2000, 3)))
+    arrays = {"points": points, "plane_area": np.arange(1.0, 2000.0)}
+    np.savez(tmp_path / "a.npz", **arrays)
+    data, found = (tmp_path / "a.npz").read_bytes(), arrays[name].T.tobytes()[-8:]
+    (tmp_path / "a.npz").write_bytes(data.replace(found, bytes(8)))
+    for read in (read_cloud, lambda path: list(stream_cloud(path, chunk_size=700))):
+        with pytest.raises(FormatError, match=rf"a\.npz: '{name}\.npy': Bad CRC-32"):
+            read(tmp_path / "a.npz")
 
 
 def test_npy_arrays_of_any_order_and_names(tmp_path):

@@ -1,6 +1,7 @@
 """A cloud written chunk by chunk leaves the bytes that writing it at once leaves."""
 
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +38,17 @@ def test_chunks_leave_the_same_bytes(tmp_path, make_cloud, kind):
     needs(kind)
     assert_same_bytes(tmp_path, kind, make_cloud(dtype="f8", origin=(5e5, 4e6, 1)))
     assert_same_bytes(tmp_path, kind, Cloud(make_cloud().coordinates))
+
+
+@pytest.mark.parametrize("num_points", [1, 60, 1000])
+def test_arrays_are_as_numpy_writes_them(tmp_path, num_points):
+    points = np.random.default_rng(0).random((num_points, 3))
+    stream = CloudStream.of(Cloud(points, {"tag": np.full(num_points, "ä")}), chunk_size=7)
+    write_cloud(tmp_path / "a.npz", stream)
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        for name, values in (("points", points), ("tag", np.full(num_points, "ä"))):
+            np.save(tmp_path / "b.npy", values)
+            assert archive.read(f"{name}.npy") == (tmp_path / "b.npy").read_bytes()
 
 
 @pytest.mark.parametrize("kind", NO_E57)

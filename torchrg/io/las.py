@@ -32,6 +32,8 @@ _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 """By point format without colour, the one that adds it."""
 _FIRST_LAYERED_FORMAT = 6
 """Point formats from here on are compressed field by field."""
+_PACKING = ("laszip encoded", "copc")
+"""Whose records say how the points lie in the file."""
 _RANGE_BITS = 0b110
 """Options of an extra dimension: its least value is said, and its largest."""
 _UNFIT = "_value"
@@ -57,7 +59,9 @@ def open_las(path: Path, size: int) -> Table:
         _check_points(path, header, size)
     if header.point_count == 0:
         raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
-    header.vlrs.extract("LasZipVlr")
+    # How the points are packed is not about the points, and laspy cannot write an octree.
+    for records in (header.vlrs, header.evlrs or []):
+        records[:] = [r for r in records if r.user_id not in _PACKING]
 
     def read(chunk_size: int) -> Iterator[Columns]:
         with _reading(laspy, path) as reader:
@@ -294,7 +298,8 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
     num_layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point_format.id]
     num_layers += point_format.num_extra_bytes
     start = header.offset_to_point_data + 8
-    for num_bytes in chunks:
+    # Writers that end a chunk themselves leave an empty one behind the last.
+    for num_bytes in filter(None, chunks):
         # A whole point and the number of points come first.
         place = start + point_format.size + 4
         stream.seek(place)
