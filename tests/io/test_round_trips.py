@@ -324,7 +324,7 @@ def test_unreadable_files_are_one_line(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     (tmp_path / "a.ply").write_bytes(b"ply")
-    monkeypatch.setitem(torchrg.io.FORMATS, ".ply", FORMATS[".ply"]._replace(read=refuse))
+    monkeypatch.setitem(torchrg.io.FORMATS, ".ply", FORMATS[".ply"]._replace(open=refuse))
     with pytest.raises(FormatError, match=r"a\.ply: cannot be read: Permission denied\."):
         read_cloud(tmp_path / "a.ply")
 

@@ -1,38 +1,52 @@
 """Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from torchrg.errors import FormatError
-from torchrg.io.e57 import check_e57, count_e57, read_e57, write_e57
+from torchrg.errors import ConfigError, FormatError
+from torchrg.io.columns import check_length
+from torchrg.io.e57 import check_e57, count_e57, open_e57, write_e57
 from torchrg.io.fields import checked_coordinates
 from torchrg.io.files import atomic_path, check_file, check_place
-from torchrg.io.las import check_las, count_las, read_las, write_las
+from torchrg.io.las import check_las, count_las, open_las, write_las
+from torchrg.io.merge import merge_streams
 from torchrg.io.npy import (
     ARCHIVE_DAMAGES,
     count_npy,
     count_npz,
-    read_npy,
-    read_npz,
+    open_npy,
+    open_npz,
     write_npy,
     write_npz,
 )
-from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
-from torchrg.io.ply import count_ply, read_ply, write_ply
-from torchrg.io.text import count_text, read_text, write_text
+from torchrg.io.pcd import count_pcd, open_pcd, write_pcd
+from torchrg.io.ply import count_ply, open_ply, write_ply
+from torchrg.io.stream import (
+    CHUNK_SIZE,
+    SILENT,
+    CloudStream,
+    Table,
+    read_table,
+    reporting_unreadable,
+    stream_table,
+)
+from torchrg.io.text import count_text, open_text, write_text
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
     "FORMATS",
+    "CloudStream",
     "atomic_path",
     "check_output",
     "estimate_points",
+    "merge_streams",
     "read_cloud",
+    "stream_cloud",
     "write_cloud",
 ]
 
@@ -41,29 +55,32 @@ class Format(NamedTuple):
     """How a kind of file is read and written; a new kind is a codec, a row of FORMATS, and a test.
 
     Attributes:
-        read: Reads a file of so many bytes, not 0. Raises FormatError if it is damaged.
-        write: Writes a cloud. Raises FormatError if the format cannot hold it.
+        open: Reads the header of a file of so many bytes, not 0, and gives a table of its points,
+            in chunks. Opening it, or reading the damaged chunk, raises FormatError if the file is
+            damaged.
+        write: Writes a cloud, going through its chunks once or several times. Raises FormatError if
+            the format cannot hold it.
         count: Number of points by the header, from path, open file and size; an estimate where the
             header does not say. May raise anything of a damaged file.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
     """
 
-    read: Callable[[Path, int], Cloud]
-    write: Callable[[Path, Cloud], None]
+    open: Callable[[Path, int], Table]
+    write: Callable[[Path, CloudStream], None]
     count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
     check: Callable[[Path, Cloud | None], None] | None = None
 
 
 FORMATS: dict[str, Format] = {
-    ".npz": Format(read_npz, write_npz, count_npz),
-    ".npy": Format(read_npy, write_npy, count_npy),
-    ".ply": Format(read_ply, write_ply, count_ply),
-    ".pcd": Format(read_pcd, write_pcd, count_pcd),
-    ".las": Format(read_las, write_las, count_las, check_las),
-    ".laz": Format(read_las, write_las, count_las, check_las),
-    ".e57": Format(read_e57, write_e57, count_e57, check_e57),
-    ".xyz": Format(read_text, write_text, count_text),
-    ".txt": Format(read_text, write_text, count_text),
+    ".npz": Format(open_npz, write_npz, count_npz),
+    ".npy": Format(open_npy, write_npy, count_npy),
+    ".ply": Format(open_ply, write_ply, count_ply),
+    ".pcd": Format(open_pcd, write_pcd, count_pcd),
+    ".las": Format(open_las, write_las, count_las, check_las),
+    ".laz": Format(open_las, write_las, count_las, check_las),
+    ".e57": Format(open_e57, write_e57, count_e57, check_e57),
+    ".xyz": Format(open_text, write_text, count_text),
+    ".txt": Format(open_text, write_text, count_text),
 }
 """What is known of each format, by suffix."""
 
@@ -97,19 +114,58 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
     source = Path(path)
-    try:
-        size = check_file(source)
-        found = _format_of(source)
-        # Files may hold any bits as numbers: values that overflow or signal are kept, not reported.
-        with np.errstate(over="ignore", invalid="ignore"):
-            return found.read(source, size)
-    except OSError as error:
-        raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
+    with reporting_unreadable(source):
+        return read_table(source, _open(source))
+
+
+def stream_cloud(path: str | os.PathLike[str], *, chunk_size: int = CHUNK_SIZE) -> CloudStream:
+    r"""Read a point cloud in chunks, for clouds larger than memory; the suffix says how.
+
+    Convention:
+        The chunks put one after the other are what :func:`read_cloud` gives, bit for bit. What
+        depends on all points (the range of floating-point or 16-bit colours, which dimensions of a
+        LAS file are empty, the names of six or seven columns without names) is found in a pass over
+        the file before the first chunk. Memory is that of a few chunks, but for
+        ``binary_compressed`` PCD files, which hold all points in one lump and are unpacked whole.
+
+    Args:
+        path: A file with a suffix of :data:`FORMATS`, in any case.
+        chunk_size: Most points of a chunk, at least 1. Chunks may be smaller.
+
+    Returns:
+        The chunks, read anew each time they are iterated.
+
+    Raises:
+        FormatError: As :func:`read_cloud`, with the same message; damaged points are reported at
+            the latest when they are reached.
+        ConfigError: If ``chunk_size`` is less than 1.
+        MissingDependencyError: If the format needs an optional package.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "corner.xyz"
+        ...     _ = path.write_text("0 0 0\n1 0 0\n0 1 0\n")
+        ...     [chunk.coordinates.tolist() for chunk in stream_cloud(path, chunk_size=2)]
+        [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]]
+    """
+    if chunk_size < 1:
+        raise ConfigError(f"stream_cloud: expected chunk_size of at least 1, got {chunk_size}.")
+    source = Path(path)
+    with reporting_unreadable(source):
+        return stream_table(source, _open(source), chunk_size)
+
+
+def _open(path: Path) -> Table:
+    """Open a file by its suffix."""
+    size = check_file(path)
+    with np.errstate(**SILENT):
+        return _format_of(path).open(path, size)
 
 
 def write_cloud(
     path: str | os.PathLike[str],
-    cloud: Cloud,
+    cloud: Cloud | CloudStream,
     segmentation: Segmentation | None = None,
     *,
     superpoints: Superpoints | None = None,
@@ -136,7 +192,10 @@ def write_cloud(
 
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
-        cloud: The cloud.
+        cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
+            same bytes (``.laz``: the same points). Its chunks are gone through two or three times,
+            for ``.npz`` without a segmentation once for each field; tensors of the results may be
+            mapped from files then, as they are taken chunk by chunk, too.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
         superpoints: What :func:`torchrg.make_superpoints` said about them.
         provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
@@ -155,25 +214,53 @@ def write_cloud(
     """
     target = Path(path)
     found = _format_of(target)
-    check_output(target, cloud)
-    cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
+    if isinstance(cloud, Cloud):
+        check_output(target, cloud)
+        points = checked_coordinates(target, cloud.coordinates)
+        stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=CHUNK_SIZE)
+    else:
+        check_output(target)
+        stream = cloud
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
-        if result is not None and len(result.labels) != len(cloud):
+        if result is not None and len(result.labels) != stream.count:
             raise FormatError(
-                f"{target}: expected {what} of {len(cloud)} points, got {len(result.labels)}; pass "
-                "the cloud that was segmented."
+                f"{target}: expected {what} of {stream.count} points, got {len(result.labels)}; "
+                "pass the cloud that was segmented."
             )
     if found.write is write_npz:
-        write_npz(target, cloud, segmentation, provenance, superpoints)
+        own = segmentation is None
+        write_npz(target, _checked(target, stream, own), segmentation, provenance, superpoints)
         return
     if superpoints is not None:
-        cloud = replace(cloud, fields={**cloud.fields, **superpoints.by_level()})
+        stream = stream.with_fields(lambda rows: superpoints.rows(rows).by_level())
     if segmentation is not None:
         names = ("labels", "normals", "curvature")
-        kept = {name: values for name, values in cloud.fields.items() if name not in names}
-        results = {name: getattr(segmentation, name).numpy(force=True) for name in names}
-        cloud = replace(cloud, fields={**kept, **results})
-    found.write(target, cloud)
+        results = {name: getattr(segmentation, name) for name in names}
+        stream = stream.with_fields(
+            lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
+        )
+    found.write(target, _checked(target, stream))
+
+
+def _checked(path: Path, stream: CloudStream, has_fields: bool = True) -> CloudStream:
+    """Check the chunks while they are written, as far as formats do not differ.
+
+    Without ``has_fields`` they are left out.
+    """
+
+    def chunks() -> Iterator[Cloud]:
+        count = 0
+        for chunk in stream:
+            fields = chunk.fields if has_fields else {}
+            for name, values in fields.items():
+                check_length(path, name, values, len(chunk))
+            count += len(chunk)
+            points = checked_coordinates(path, chunk.coordinates)
+            yield replace(chunk, coordinates=points, fields=fields)
+        if count != stream.count:
+            raise FormatError(f"{path}: expected {stream.count} points in chunks, got {count}.")
+
+    return replace(stream, chunks=chunks, measure=lambda: stream.extent)
 
 
 def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:

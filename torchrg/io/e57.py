@@ -9,6 +9,9 @@ Pictures and what else a file holds beside points are not kept.
 import re
 import uuid
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import chain, groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -17,8 +20,10 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, narrow_integers
+from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
+from torchrg.io.fields import Columns
 from torchrg.io.files import DAMAGES, atomic_path, check_promise, refusing
+from torchrg.io.stream import CloudStream, Table
 from torchrg.structures import Cloud
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -36,6 +41,7 @@ _EXTENSIONS = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "torchrg": "urn:torchrg:point-fields",
 }
+_ENDS = ("Minimum", "Maximum")
 _PAGE_BYTES = 1024
 """The standard's page, the last four bytes of which are the CRC-32C of the others."""
 _BYTES_PER_POINT = 12
@@ -44,8 +50,8 @@ _Block = dict[str, NDArray[Any]]
 """Columns of a scan by name."""
 
 
-def read_e57(path: Path, size: int) -> Cloud:
-    """Read all scans of an E57 file.
+def open_e57(path: Path, size: int) -> Table:
+    """Open an E57 file, all scans of it.
 
     Every scan is moved by its pose, and its normals with it. Points marked as invalid are kept as
     not-a-number. Of several scans, ``scan`` is the number of each point's; a field that some scans
@@ -53,11 +59,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     """
     pye57 = _pye57("read")
     _check_pages(path)
-    errors = (pye57.libe57.E57Exception, *DAMAGES)
-    with (
-        refusing(f"{path}: expected an E57 file, got: ", *errors, repair="; fetch it again"),
-        pye57.E57(str(path)) as file,
-    ):
+    with _reading(pye57, path) as file:
         headers = [file.get_header(i) for i in range(file.scan_count)]
         num_points = sum(header.point_count for header in headers)
         # Coordinates that differ at all take a bit.
@@ -65,13 +67,48 @@ def read_e57(path: Path, size: int) -> Cloud:
             path, 0, num_points // 8, f"{num_points:,} points", available=size, at_least=True
         )
         scans = tuple(_scan_of(header) for header in headers)
-        blocks = [
-            _to_world(path, _read_points(pye57, file, header), scan)
-            for header, scan in zip(headers, scans, strict=True)
+        empty = [
+            _to_world(path, {name: np.empty(0, code) for name, code in _letters(pye57, h)}, scan)
+            for h, scan in zip(headers, scans, strict=True)
         ]
-    if not blocks:
+    if not empty:
         raise FormatError(f"{path}: expected at least one scan, got none; fetch the file again.")
-    return assemble_cloud(path, _joined(blocks), header={"scans": scans})
+    dtypes = {
+        name: np.result_type(*(block.get(name, np.uint8) for block in empty))
+        for name in dict.fromkeys(name for block in empty for name in block)
+    }
+
+    def conformed(block: _Block, number: int) -> _Block:
+        count = len(block["x"])
+        columns = {
+            name: block[name].astype(dtype, copy=False) if name in block else np.zeros(count, dtype)
+            for name, dtype in dtypes.items()
+        }
+        if len(scans) > 1:
+            columns["scan"] = np.full(count, number, np.int32)
+        return columns
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        if num_points == 0:
+            yield conformed(empty[0], 0)
+            return
+        with _reading(pye57, path) as file:
+            for number, scan in enumerate(scans):
+                for block in _read_points(pye57, file, file.get_header(number), chunk_size):
+                    yield conformed(_to_world(path, block, scan), number)
+
+    return Table(read, num_points, header={"scans": scans})
+
+
+@contextmanager
+def _reading(pye57: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
+    """Open a file; what is wrong with it is an error that names it."""
+    errors = (pye57.libe57.E57Exception, *DAMAGES)
+    with (
+        refusing(f"{path}: expected an E57 file, got: ", *errors, repair="; fetch it again"),
+        pye57.E57(str(path)) as file,
+    ):
+        yield file
 
 
 def check_e57(path: Path, cloud: Cloud | None) -> None:
@@ -79,18 +116,16 @@ def check_e57(path: Path, cloud: Cloud | None) -> None:
     _pye57("write")
 
 
-def write_e57(path: Path, cloud: Cloud) -> None:
+def write_e57(path: Path, stream: CloudStream) -> None:
     """Write an E57 file; points that are not finite are marked as invalid.
 
     If the cloud came from an E57 file, its scans are written with their poses, otherwise one is.
     """
     pye57 = _pye57("write")
-    stored = cloud.header.get("scans", ())
-    columns = flatten_cloud(path, cloud, _SPELLING)
-    for name, column in columns.items():
-        columns[name] = column = narrow_integers(column, ("i8",))
-        if column.dtype == np.uint64:
-            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
+    plan = _plan(path, stream)
+    summaries = [_Summary() for _ in plan.groups]
+    for number, block in _scan_blocks(path, stream, plan):
+        summaries[number].add(block)
     errors = (pye57.libe57.E57Exception, ValueError, RuntimeError)
     with (
         refusing(f"{path}: cannot be written: ", *errors),
@@ -99,9 +134,9 @@ def write_e57(path: Path, cloud: Cloud) -> None:
     ):
         for prefix, uri in _EXTENSIONS.items():
             file.image_file.extensionsAdd(prefix, uri)
-        for scan, rows in _groups(columns, stored):
-            block = {name: column[rows] for name, column in columns.items()}
-            _write_points(pye57.libe57, file, scan, _to_scan(block, scan))
+        for number, blocks in groupby(_scan_blocks(path, stream, plan), key=itemgetter(0)):
+            scan, summary = plan.groups[number].scan, summaries[number]
+            _write_points(pye57.libe57, file, scan, summary, (block for _, block in blocks))
 
 
 def count_e57(path: Path, stream: BinaryIO, size: int) -> int:
@@ -159,18 +194,36 @@ class Scan(NamedTuple):
 
     def to_world(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the scan to the world, shape ``(N, 3)``."""
-        return points @ self.matrix.T + np.array(self.translation) if self.is_moved else points
+        if not self.is_moved:
+            return points
+        turned = _turned(points, self.matrix)
+        turned += np.array(self.translation)
+        return turned
 
     def to_scan(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Move points of the world to the scan, shape ``(N, 3)``."""
-        return (points - np.array(self.translation)) @ self.matrix if self.is_moved else points
+        if not self.is_moved:
+            return points
+        return _turned(points - np.array(self.translation), self.matrix.T)
 
     def turn_normals(self, block: _Block, *, back: bool = False) -> None:
         """Turn the normals of a block, if it has any, to the world or back, in their own type."""
         if self.is_moved and all(name in block for name in _NORMALS):
             normals = np.stack([block[name] for name in _NORMALS], axis=1)
-            turned = normals @ (self.matrix if back else self.matrix.T)
+            turned = _turned(normals, self.matrix.T if back else self.matrix)
             block.update(zip(_NORMALS, turned.astype(normals.dtype).T, strict=True))
+
+
+def _turned(points: NDArray[np.floating], matrix: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Return each point times a matrix, the same bits however many points there are.
+
+    BLAS rounds a product in an order that depends on its size.
+    """
+    x, y, z = points.T
+    turned: NDArray[np.floating] = np.empty(points.shape)
+    for i, (a, b, c) in enumerate(matrix):
+        turned[:, i] = x * a + y * b + z * c
+    return turned
 
 
 def _scan_of(header: Any) -> Scan:  # noqa: ANN401
@@ -181,27 +234,37 @@ def _scan_of(header: Any) -> Scan:  # noqa: ANN401
     return Scan(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
 
 
-def _read_points(pye57: Any, file: Any, header: Any) -> _Block:  # noqa: ANN401
-    """Return what the points of a scan hold, by the standard's names; texts are left out."""
+def _read_points(pye57: Any, file: Any, header: Any, chunk_size: int) -> Iterator[_Block]:  # noqa: ANN401
+    """Read what the points of a scan hold, so many at a time, by the standard's names."""
     libe57, count = pye57.libe57, header.point_count
-    prototype = libe57.StructureNode(header.points.prototype())
-    block: _Block = {}
+    if count == 0:
+        return
+    at_once = min(count, chunk_size)
+    block = {name: np.empty(at_once, code) for name, code in _letters(pye57, header)}
     buffers = libe57.VectorSourceDestBuffer()
-    for name in header.point_fields:
-        node = pye57.utils.get_node(prototype, name)
-        if isinstance(node, libe57.StringNode):
-            continue
-        block[name] = np.empty(count, _letter(libe57, node))
-        if count:
-            buffer = libe57.SourceDestBuffer(file.image_file, name, block[name], count, True, True)
-            buffers.append(buffer)
-    if count:
-        reader = header.points.reader(buffers)
-        found = reader.read()
-        reader.close()
-        if found != count:
+    for name, column in block.items():
+        buffers.append(libe57.SourceDestBuffer(file.image_file, name, column, at_once, True, True))
+    reader = header.points.reader(buffers)
+    found = 0
+    while found < count:
+        num_read = reader.read()
+        if num_read == 0:
             raise EOFError(f"{found:,} of {count:,} points")
-    return block
+        found += num_read
+        # The reader fills the same memory again.
+        yield block if num_read == count else {n: c[:num_read].copy() for n, c in block.items()}
+    reader.close()
+
+
+def _letters(pye57: Any, header: Any) -> list[tuple[str, str]]:  # noqa: ANN401
+    """Return the fields of a scan and the letters of NumPy's types for them; texts are left out."""
+    prototype = pye57.libe57.StructureNode(header.points.prototype())
+    nodes = [(name, pye57.utils.get_node(prototype, name)) for name in header.point_fields]
+    return [
+        (name, _letter(pye57.libe57, node))
+        for name, node in nodes
+        if not isinstance(node, pye57.libe57.StringNode)
+    ]
 
 
 def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
@@ -240,81 +303,158 @@ def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _joined(blocks: Sequence[_Block]) -> _Block:
-    """Put scans one after the other; number them if there are several."""
-    counts = [len(block["x"]) for block in blocks]
-    names = dict.fromkeys(name for block in blocks for name in block)
-    columns = {
-        name: np.concatenate(
-            [b.get(name, np.zeros(n, np.uint8)) for b, n in zip(blocks, counts, strict=True)]
-        )
-        for name in names
-    }
-    if len(blocks) > 1:
-        columns["scan"] = np.repeat(np.arange(len(blocks), dtype=np.int32), counts)
-    return columns
+class _Group(NamedTuple):
+    """Points that become a scan: which, and how many."""
+
+    scan: Scan
+    count: int  # type: ignore[assignment]
 
 
-def _groups(columns: _Block, scans: Sequence[Scan]) -> Iterator[tuple[Scan, slice]]:
-    """Give the rows of each scan, and take ``scan`` out if it says no more than they do."""
-    count = len(columns["x"])
-    number = columns.get("scan")
-    if len(scans) > 1 and number is not None and (np.diff(number) >= 0).all():
-        bounds = np.searchsorted(number, np.arange(len(scans) + 1))
-        if bounds[0] == 0 and bounds[-1] == count:
+class _Plan(NamedTuple):
+    """What has to be known of all points before they are cut into scans.
+
+    If the scans say where points belong, the field ``scan`` says no more and is left out.
+    """
+
+    groups: list[_Group]
+    limits: dict[str, Limits]
+    names_scan: bool
+
+
+def _plan(path: Path, stream: CloudStream) -> _Plan:
+    """Look at all points; they are those of the cloud's scans if ``scan`` numbers them in order."""
+    scans = stream.header.get("scans", ())
+    limits: dict[str, Limits] = {}
+    counts, is_numbered, last, total = np.zeros(len(scans), np.int64), len(scans) > 1, 0, 0
+    for chunk in stream:
+        columns = flatten_cloud(path, chunk, _SPELLING)
+        merge_limits(limits, columns)
+        total += len(chunk)
+        number = columns.get("scan")
+        if is_numbered and number is not None:
+            bounds = np.searchsorted(number, np.arange(len(scans) + 1))
+            counts += np.diff(bounds)
+            is_sorted = number[0] >= last and (number[1:] >= number[:-1]).all()
+            is_numbered = bool(is_sorted and bounds[0] == 0 and bounds[-1] == len(chunk))
+            last = number[-1]
+        else:
+            is_numbered = False
+    for name, (_, high) in limits.items():
+        if high >= 2**63:
+            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
+    groups = [_Group(scans[0] if len(scans) == 1 else Scan(), total)]
+    if is_numbered:
+        groups = [_Group(scan, int(count)) for scan, count in zip(scans, counts, strict=True)]
+    return _Plan(groups, limits, is_numbered)
+
+
+def _scan_blocks(path: Path, stream: CloudStream, plan: _Plan) -> Iterator[tuple[int, _Block]]:
+    """Give the columns of each chunk in the frame of its scan, cut where the next scan begins."""
+    number, left = 0, plan.groups[0].count
+    for chunk in stream:
+        columns = flatten_cloud(path, chunk, _SPELLING, plan.limits)
+        if plan.names_scan:
             del columns["scan"]
-            for scan, start, stop in zip(scans, bounds, bounds[1:], strict=False):
-                if start < stop:
-                    yield scan, slice(start, stop)
-            return
-    yield scans[0] if len(scans) == 1 else Scan(), slice(0, count)
+        start = 0
+        while start < len(chunk):
+            while left == 0:
+                number += 1
+                left = plan.groups[number].count
+            stop = min(start + left, len(chunk))
+            block = {name: column[start:stop] for name, column in columns.items()}
+            yield number, _to_scan(block, plan.groups[number].scan)
+            left -= stop - start
+            start = stop
 
 
 def _to_scan(block: _Block, scan: Scan) -> _Block:
     """Move points back to the frame of their scan, and give the fields the standard's names."""
     points = scan.to_scan(np.stack([block.pop(axis) for axis in "xyz"], axis=1))
     scan.turn_normals(block, back=True)
-    named: _Block = {}
     finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        points = np.where(finite[:, None], points, 0)
-        # 2: there is nothing meaningful in the coordinates.
-        named[_STATE] = np.where(finite, 0, 2)
+    # 2: there is nothing meaningful in the coordinates.
+    named: _Block = {_STATE: np.where(finite, np.uint8(0), np.uint8(2))}
     for name, column in block.items():
         word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
         named[name if name in _STANDARD else f"torchrg:{word}"] = column
+    if not finite.all():
+        points = np.where(finite[:, None], points, 0)
     return {**dict(zip(_AXES, points.T, strict=True)), **named}
 
 
-def _write_points(libe57: Any, file: Any, scan: Scan, block: _Block) -> None:  # noqa: ANN401
+class _Summary:
+    """What has to be known of all points of a scan before the first is written.
+
+    Attributes:
+        longest: Points of its longest block.
+        limits: Least and largest values of whole numbers, of an intensity that is finite, and of
+            coordinates that are not marked as invalid.
+    """
+
+    def __init__(self) -> None:
+        self.longest = 0
+        self.limits: dict[str, tuple[Any, Any]] = {}
+
+    def add(self, block: _Block) -> None:
+        """Look at a block."""
+        self.longest = max(self.longest, len(block[_STATE]))
+        there = block[_STATE] == 0
+        for name, column in block.items():
+            if name in _AXES:
+                column = column[there]
+            elif name == "intensity":
+                column = column[np.isfinite(column)]
+            elif column.dtype.kind == "f":
+                continue
+            if column.size:
+                low, high = column.min(), column.max()
+                known_low, known_high = self.limits.get(name, (low, high))
+                self.limits[name] = (min(low, known_low), max(high, known_high))
+
+
+def _write_points(
+    libe57: Any,  # noqa: ANN401
+    file: Any,  # noqa: ANN401
+    scan: Scan,
+    summary: _Summary,
+    blocks: Iterator[_Block],
+) -> None:
     """Add a scan to a file, its columns by the standard's names and in its own frame."""
-    image, count = file.image_file, len(block[_AXES[0]])
+    image, first = file.image_file, next(blocks)
+    is_marked = summary.limits[_STATE] != (0, 0)
+    names = [name for name in first if name != _STATE or is_marked]
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
     # libe57 keeps the addresses of the columns, so they have to live until it is done.
-    kept = []
-    for name, column in block.items():
-        if column.dtype.kind == "f":
-            precision = libe57.E57_DOUBLE if column.dtype.itemsize > 4 else libe57.E57_SINGLE
+    kept: _Block = {}
+    for name in names:
+        dtype = first[name].dtype
+        if dtype.kind == "f":
+            precision = libe57.E57_DOUBLE if dtype.itemsize > 4 else libe57.E57_SINGLE
             prototype.set(name, libe57.FloatNode(image, 0.0, precision))
-            kept.append(np.ascontiguousarray(column))
+            kept[name] = np.empty(summary.longest, dtype)
         else:
-            low, high = int(column.min()), int(column.max())
+            low, high = map(int, summary.limits[name])
             prototype.set(name, libe57.IntegerNode(image, low, low, high))
-            kept.append(np.ascontiguousarray(column, dtype="q"))
-        buffers.append(libe57.SourceDestBuffer(image, name, kept[-1], count, True, True))
-    node = _tree(libe57, image, _facts(scan, block))
+            kept[name] = np.empty(summary.longest, "q")
+        buffer = libe57.SourceDestBuffer(image, name, kept[name], summary.longest, True, True)
+        buffers.append(buffer)
+    node = _tree(libe57, image, _facts(scan, names, summary))
     points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
     node.set("points", points)
     file.data3d.append(node)
     writer = points.writer(buffers)
-    writer.write(count)
+    for block in chain([first], blocks):
+        count = len(block[_STATE])
+        for name, column in kept.items():
+            column[:count] = block[name]
+        writer.write(count)
     writer.close()
 
 
-def _facts(scan: Scan, block: _Block) -> dict[str, Any]:
+def _facts(scan: Scan, names: Sequence[str], summary: _Summary) -> dict[str, Any]:
     """Return what is said about a scan as a whole: identity, pose, limits."""
-    there = block.get(_STATE, np.zeros(len(block[_AXES[0]]))) == 0
+    nothing = (0.0, 0.0)
     facts: dict[str, Any] = {
         "guid": f"{{{uuid.uuid4()}}}",
         "name": scan.name,
@@ -323,22 +463,21 @@ def _facts(scan: Scan, block: _Block) -> dict[str, Any]:
             "translation": dict(zip("xyz", map(float, scan.translation), strict=True)),
         },
         "cartesianBounds": {
-            f"{axis[-1].lower()}{end}": float(limit(block[axis][there])) if there.any() else 0.0
+            f"{axis[-1].lower()}{end}": float(limit)
             for axis in _AXES
-            for end, limit in (("Minimum", np.min), ("Maximum", np.max))
+            for end, limit in zip(_ENDS, summary.limits.get(axis, nothing), strict=True)
         },
     }
-    if "intensity" in block:
-        known = block["intensity"][np.isfinite(block["intensity"])]
+    if "intensity" in names:
         facts["intensityLimits"] = {
-            "intensityMinimum": float(known.min()) if known.size else 0.0,
-            "intensityMaximum": float(known.max()) if known.size else 0.0,
+            f"intensity{end}": float(limit)
+            for end, limit in zip(_ENDS, summary.limits.get("intensity", nothing), strict=True)
         }
-    if all(name in block for name in _COLOR):
+    if all(name in names for name in _COLOR):
         facts["colorLimits"] = {
             f"{name}{end}": value
             for name in _COLOR
-            for end, value in (("Minimum", 0), ("Maximum", 255))
+            for end, value in zip(_ENDS, (0, 255), strict=True)
         }
     return facts
 

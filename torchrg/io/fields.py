@@ -8,7 +8,9 @@ else keeps its name.
 """
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.files import atomic_path
 from torchrg.structures import UNLABELED, Cloud
 
 Columns = Mapping[str, NDArray[Any]]
@@ -44,47 +45,98 @@ _TRIPLES = {
     ("r", "g", "b"): "color",
 }
 """torchrg's names by those of three columns, in lower case."""
+_MAY_BE_COLOR = re.compile(
+    r"(scalar_)?((diffuse_)?(red|green|blue)|[rgb]|rgb|colors?)(_[0-9]+|_value)*|column_[456]",
+    re.IGNORECASE,
+)
+"""Names of columns that may turn out to be colours, ``column_4`` to ``column_6`` without names."""
+_GUESSED_WIDTHS = (6, 7)
+"""Columns of a table without names whose meaning the values tell."""
 _UNIT_TOLERANCE = 2e-3
 """Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
 WIDEN = 257
 """65535 / 255: what eight bits become in sixteen, and back without loss."""
 
 
+class Span(NamedTuple):
+    """What the values of a column are between: all that the type of a colour depends on.
+
+    Attributes:
+        low: Least value; of floating-point columns the least once not-a-number is zero.
+        high: Largest value, likewise.
+        fine: Whether some value is no multiple of :data:`WIDEN`, so that 8 bits do not hold it.
+    """
+
+    low: Any
+    high: Any
+    fine: bool
+
+    @classmethod
+    def of(cls, values: NDArray[Any]) -> "Span":
+        """Return the span of some values, of which there may be none."""
+        if values.size == 0:
+            return cls(0, 0, False)
+        if values.dtype.kind == "f":
+            values = np.nan_to_num(values)
+            return cls(values.min(), values.max(), False)
+        low, high = values.min(), values.max()
+        return cls(low, high, bool(high > 0 if high <= 255 else (values % WIDEN).any()))
+
+    def __or__(self, other: "Span") -> "Span":
+        """Return the span of the values of both."""
+        fine = self.fine or other.fine
+        return Span(min(self.low, other.low), max(self.high, other.high), fine)
+
+
+def color_spans(columns: Columns) -> dict[str, Span]:
+    """Return the spans of all columns by the file's names that may be colours, or parts of them."""
+    return {
+        name: Span.of(values)
+        for name, values in columns.items()
+        if _MAY_BE_COLOR.fullmatch(name) and values.dtype.kind in "biuf"
+    }
+
+
 def assemble_cloud(
     path: Path,
     columns: Columns,
     *,
+    coordinates: str | None = None,
+    spans: Mapping[str, Span] | None = None,
     grid_shape: tuple[int, int] | None = None,
     header: Mapping[str, Any] | None = None,
 ) -> Cloud:
-    """Build a cloud from columns by the file's own names, ``x``, ``y`` and ``z`` among them."""
+    """Build a cloud from columns by the file's own names.
+
+    ``x``, ``y`` and ``z`` are among them unless ``coordinates`` names the column that holds all
+    three. If the columns are a chunk of a file, ``spans`` are those of the whole file.
+    """
     rest = dict(columns)
-    exact = all(axis in rest for axis in "xyz")
-    names = [axis if exact else axis.upper() for axis in "xyz"]
-    if not all(name in rest for name in names):
-        found = ", ".join(map(ascii, rest)) or "none"
-        raise FormatError(f"{path}: expected fields x, y, z, got {found}; rename or add them.")
-    axes = [rest.pop(name) for name in names]
-    if any(axis.ndim != 1 for axis in axes):
-        raise FormatError(f"{path}: expected one number a point in each of x, y, z.")
-    return cloud_of(path, _stacked(axes), rest, grid_shape=grid_shape, header=header)
-
-
-def cloud_of(
-    path: Path,
-    coordinates: NDArray[Any],
-    columns: Columns,
-    *,
-    grid_shape: tuple[int, int] | None = None,
-    header: Mapping[str, Any] | None = None,
-) -> Cloud:
-    """Build a cloud from coordinates and further columns by the file's own names."""
-    coordinates = checked_coordinates(path, coordinates)
-    fields = _grouped(columns)
-    for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
-        if name in fields:
-            fields[name] = check(path, fields[name])
-    return Cloud(coordinates, fields, grid_shape, source=str(path), header=header or {})
+    if coordinates is None:
+        exact = all(axis in rest for axis in "xyz")
+        names = [axis if exact else axis.upper() for axis in "xyz"]
+        if not all(name in rest for name in names):
+            found = ", ".join(map(ascii, rest)) or "none"
+            raise FormatError(f"{path}: expected fields x, y, z, got {found}; rename or add them.")
+        axes = [rest.pop(name) for name in names]
+        if any(axis.ndim != 1 for axis in axes):
+            raise FormatError(f"{path}: expected one number a point in each of x, y, z.")
+        places = _stacked(axes)
+    else:
+        places = rest.pop(coordinates)
+    points = checked_coordinates(path, places)
+    sources = _sources(rest)
+    fields = {name: _joined([rest[part] for part in parts]) for name, parts in sources.items()}
+    if "labels" in fields:
+        fields["labels"] = _labels(path, fields["labels"])
+    if "normals" in fields:
+        fields["normals"] = _normals(path, fields["normals"])
+    if "color" in fields:
+        if spans is None and fields["color"].dtype != np.uint8:
+            spans = color_spans({part: columns[part] for part in sources["color"]})
+        known = (spans or {}).get
+        fields["color"] = _color(path, fields["color"], [*map(known, sources["color"])])
+    return Cloud(points, fields, grid_shape, source=str(path), header=header or {})
 
 
 def checked_coordinates(path: Path, coordinates: NDArray[Any]) -> NDArray[np.floating]:
@@ -93,46 +145,94 @@ def checked_coordinates(path: Path, coordinates: NDArray[Any]) -> NDArray[np.flo
     Whole numbers of at most 16 bits and half precision become float32, which holds them exactly;
     other numbers become float64.
     """
+    check_coordinates(path, coordinates.shape, coordinates.dtype)
     dtype = coordinates.dtype
-    if coordinates.ndim != 2 or coordinates.shape[1] != 3:
+    single = dtype.itemsize <= (4 if dtype.kind == "f" else 2)
+    return np.ascontiguousarray(coordinates, dtype=np.float32 if single else np.float64)
+
+
+def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    """Check that an array of this shape and type can be coordinates."""
+    if len(shape) != 2 or shape[1] != 3:
         raise FormatError(
-            f"{path}: expected coordinates of shape (N, 3), got {coordinates.shape}; reshape them."
+            f"{path}: expected coordinates of shape (N, 3), got {shape}; reshape them."
         )
     if dtype.kind not in "fiu":
         raise FormatError(
             f"{path}: expected real numbers as coordinates, got {dtype}; convert them to float64."
         )
-    if len(coordinates) == 0:
+    if shape[0] == 0:
         raise FormatError(
             f"{path}: expected at least one point, got none; check where it comes from."
         )
-    single = dtype.itemsize <= (4 if dtype.kind == "f" else 2)
-    return np.ascontiguousarray(coordinates, dtype=np.float32 if single else np.float64)
 
 
-def name_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Name the columns of a table without names, shape ``(N, C)`` with at least three columns.
+class Naming(NamedTuple):
+    """Names that depend on the values of all points, and which columns are kept.
 
-    Three columns are x y z. A fourth alone is ``intensity``. Six are x y z and a colour (whole
-    numbers 0 to 255) or a unit normal; seven are the same and a whole number, ``label``. Columns
-    that fit none of this are kept as ``column_4``, ``column_5`` and so on.
+    Attributes:
+        facts: What a chunk of columns shows.
+        names: Columns by the names they get, from the columns of the file and the facts that any
+            of the chunks showed.
+    """
 
-    Example:
-        >>> list(name_columns(np.array([[0.5, 0.5, 0.5, 255.0, 128.0, 0.0]])))
-        ['x', 'y', 'z', 'red', 'green', 'blue']
+    facts: Callable[[Columns], set[str]]
+    names: Callable[[Collection[str], Collection[str]], dict[str, str]]
+
+
+def number_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table without names, shape ``(N, C)`` with at least three columns.
+
+    The first three are ``x y z``, a fourth alone is ``intensity``, others are ``column_4``,
+    ``column_5`` and so on; where there are six or seven, :func:`name_numbered` knows better.
     """
     names = ["x", "y", "z", *(f"column_{i}" for i in range(4, values.shape[1] + 1))]
-    if values.shape[1] == 4:
+    if len(names) == 4:
         names[3] = "intensity"
-    if values.shape[1] in (6, 7):
-        three = values[:, 3:6]
-        if _are_unit(three):
-            names[3:6] = ["nx", "ny", "nz"]
-        elif are_whole(three) and three.min() >= 0 and three.max() <= 255:
-            names[3:6] = ["red", "green", "blue"]
-        if values.shape[1] == 7 and names[3] != "column_4" and are_whole(values[:, 6]):
-            names[6] = "label"
     return {name: values[:, i] for i, name in enumerate(names)}
+
+
+def naming_of(num_columns: int) -> Naming | None:
+    """Return how a table without names, of so many columns, gets better ones."""
+    return Naming(numbered_facts, name_numbered) if num_columns in _GUESSED_WIDTHS else None
+
+
+def name_numbered(columns: Collection[str], facts: Collection[str]) -> dict[str, str]:
+    """Name the six or seven columns of a table of which :func:`numbered_facts` are known.
+
+    Three are x y z, the next three a colour (whole numbers 0 to 255) or a unit normal, and a
+    seventh of whole numbers beside them is ``label``. What fits none of this keeps its name.
+
+    Example:
+        >>> columns = number_columns(np.array([[0.5, 0.5, 0.5, 255.0, 128.0, 0.0]]))
+        >>> list(name_numbered(columns, numbered_facts(columns)))
+        ['x', 'y', 'z', 'red', 'green', 'blue']
+    """
+    old, names = list(columns), list(columns)
+    if "has lengths" in facts and "not unit" not in facts:
+        names[3:6] = ["nx", "ny", "nz"]
+    elif "not bytes" not in facts:
+        names[3:6] = ["red", "green", "blue"]
+    if len(names) == 7 and names[3] != "column_4" and "no label" not in facts:
+        names[6] = "label"
+    return dict(zip(names, old, strict=True))
+
+
+def numbered_facts(columns: Columns) -> set[str]:
+    """Return what the columns of a table without names show that the further ones are not."""
+    values = list(columns.values())
+    three = np.stack(values[3:6], axis=1)
+    squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
+    # Unit vectors may be zero or not numbers where there is none.
+    lengths = squares[np.isfinite(squares) & (squares != 0)]
+    facts = {"has lengths"} if len(lengths) else set()
+    if (np.abs(lengths - 1) >= _UNIT_TOLERANCE).any():
+        facts.add("not unit")
+    if three.size and not (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
+        facts.add("not bytes")
+    if len(columns) == 7 and not are_whole(values[6]):
+        facts.add("no label")
+    return facts
 
 
 def are_whole(values: NDArray[Any]) -> bool:
@@ -142,31 +242,36 @@ def are_whole(values: NDArray[Any]) -> bool:
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
-def _are_unit(rows: NDArray[Any]) -> bool:
-    """Whether rows are unit vectors, or zero or not numbers where there is none."""
-    squares = np.square(rows.astype(np.float64)).sum(axis=1)
-    rest = squares[np.isfinite(squares) & (squares != 0)]
-    return len(rest) > 0 and bool((np.abs(rest - 1) < _UNIT_TOLERANCE).all())
+def _sources(columns: Columns) -> dict[str, list[str]]:
+    """Return the columns that each field is made of; the first of two equal names wins it.
 
-
-def _grouped(columns: Columns) -> dict[str, NDArray[Any]]:
-    """Join triples and numbered columns, and rename; the first of two equal names wins it."""
+    Triples and numbered columns are joined, the others renamed. Shapes and types decide, no values.
+    """
     plain = {_plain(name): name for name in columns if columns[name].ndim == 1}
-    rest, fields = dict(columns), {}
+    rest, fields = dict(columns), dict[str, list[str]]()
     for parts, target in _TRIPLES.items():
         if target not in fields and all(part in plain for part in parts):
-            fields[target] = _stacked([rest.pop(plain[part]) for part in parts])
+            fields[target] = [plain[part] for part in parts]
+            for part in fields[target]:
+                del rest[part]
     for name, members in _numbered(rest).items():
         if name not in fields and name not in rest:
-            fields[name] = _stacked([rest.pop(member) for member in members])
+            fields[name] = members
+            for member in members:
+                del rest[member]
     for name, values in rest.items():
-        fields[_free_name(name, values, fields)] = np.ascontiguousarray(
-            values, dtype=values.dtype.newbyteorder("=")
-        )
+        fields[_free_name(name, values, fields)] = [name]
     return fields
 
 
-def _free_name(name: str, values: NDArray[Any], taken: Columns) -> str:
+def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    """Return several single columns as one field, or one column as it is, in native byte order."""
+    if len(parts) > 1:
+        return _stacked(parts)
+    return np.ascontiguousarray(parts[0], dtype=parts[0].dtype.newbyteorder("="))
+
+
+def _free_name(name: str, values: NDArray[Any], taken: Collection[str]) -> str:
     """Return torchrg's name for a column if its shape fits and no other has it yet."""
     target = _ALIASES.get(_plain(name), name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
@@ -231,27 +336,31 @@ def _normals(path: Path, normals: NDArray[Any]) -> NDArray[np.floating]:
     return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
 
 
-def _color(path: Path, color: NDArray[Any]) -> NDArray[Any]:
+def _color(path: Path, color: NDArray[Any], spans: Iterable[Span | None]) -> NDArray[Any]:
     """Return colours as uint8 0..255, shape ``(N, 3)``; uint16 where 8 bits do not hold them.
 
-    Floating-point colours are 0..1 if none is larger, otherwise 0..255.
+    Floating-point colours are 0..1 if none is larger, otherwise 0..255. The spans are those of its
+    parts over the whole file.
     """
     _check_triples(path, "color", color)
     if color.dtype == np.uint8 or color.size == 0:
         return color.astype(np.uint8)
+    low, high, fine = reduce(or_, (span for span in spans if span is not None))
     is_float = color.dtype.kind == "f"
-    values = np.nan_to_num(color, copy=True) if is_float else color
-    low, high = values.min(), values.max()
     if low < 0 or high > (255 if is_float else 65535):
         raise FormatError(
             f"{path}: expected color in 0..255, got {low} to {high}; rename or remove that field."
         )
     if is_float:
-        values = np.rint(values * 255 if high <= 1 else values)
-    if is_float or high <= 255:
-        return values.astype(np.uint8)
-    quotient, remainder = np.divmod(values.astype(np.uint16), np.uint16(WIDEN))
-    return values.astype(np.uint16) if remainder.any() else quotient.astype(np.uint8)
+        known = np.nan_to_num(color)
+        rounded: NDArray[Any] = np.rint(known * 255 if high <= 1 else known)
+        return rounded.astype(np.uint8)
+    if high <= 255:
+        return color.astype(np.uint8)
+    if fine:
+        return color.astype(np.uint16)
+    narrow: NDArray[Any] = color // WIDEN
+    return narrow.astype(np.uint8)
 
 
 def _check_triples(path: Path, name: str, values: NDArray[Any]) -> None:
@@ -261,128 +370,3 @@ def _check_triples(path: Path, name: str, values: NDArray[Any]) -> None:
             f"{path}: expected {name} to be three numbers a point, got shape {values.shape} "
             f"of {values.dtype}; rename or remove that field."
         )
-
-
-class Spelling(NamedTuple):
-    """How a format spells torchrg's names.
-
-    Attributes:
-        normals: Names of the three components.
-        color: Names of the three channels.
-        curvature: Name of the curvature.
-        color_bits: Width of a channel, 8 or 16; colours of 16 bits are rounded to 8, not widened.
-        vectors: Whether other fields of several columns stay one, shape ``(N, C)``.
-    """
-
-    normals: tuple[str, str, str] = ("nx", "ny", "nz")
-    color: tuple[str, str, str] = ("red", "green", "blue")
-    curvature: str = "curvature"
-    color_bits: int = 8
-    vectors: bool = False
-
-
-def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, NDArray[Any]]:
-    """Spread a cloud over columns by the format's names: ``x y z`` first, then its fields.
-
-    Labels are int32 where they fit, colours uint8 (or uint16 if the format holds it), truth values
-    uint8, half precision float32. A field of several columns is ``name_0``, ``name_1`` and so on,
-    unless the format has ``vectors``.
-    """
-    columns: dict[str, NDArray[Any]] = {
-        axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")
-    }
-    for name, values in cloud.fields.items():
-        check_length(path, name, values, len(cloud))
-        for column_name, column in _spread(name, _storable(path, name, values, spelling), spelling):
-            if column_name in columns:
-                raise FormatError(
-                    f"{path}: expected fields of different names, got {column_name!r} twice; "
-                    "rename one."
-                )
-            columns[column_name] = column
-    return columns
-
-
-def check_length(path: Path, name: str, values: NDArray[Any], num_points: int) -> None:
-    """Check that a field has a value for each point."""
-    if values.shape[:1] != (num_points,):
-        raise FormatError(
-            f"{path}: expected field {name} of shape ({num_points}, ...), got {values.shape}; "
-            "give one row a point."
-        )
-
-
-def _storable(path: Path, name: str, values: NDArray[Any], spelling: Spelling) -> NDArray[Any]:
-    """Return a field as real numbers that files hold."""
-    if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
-        raise FormatError(
-            f"{path}: expected field {name} to be real numbers of at most 64 bits, got "
-            f"{values.dtype}; leave it out or write .npz."
-        )
-    if values.ndim > 2 or 0 in values.shape[1:]:
-        raise FormatError(
-            f"{path}: expected field {name} of shape (N,) or (N, C), got {values.shape}; "
-            "leave it out or write .npz."
-        )
-    if values.dtype.kind == "b":
-        return values.astype(np.uint8)
-    if values.dtype == np.float16:
-        return values.astype(np.float32)
-    if name == "labels":
-        return narrow_integers(values, ("i4",))
-    if name != "color" or values.dtype == np.uint8:
-        return values
-    if values.dtype != np.uint16:
-        raise FormatError(
-            f"{path}: expected field color of uint8 or uint16, got {values.dtype}; convert it."
-        )
-    return values if spelling.color_bits == 16 else np.rint(values / WIDEN).astype(np.uint8)
-
-
-def _spread(name: str, values: NDArray[Any], spelling: Spelling) -> list[tuple[str, NDArray[Any]]]:
-    """Cut a field into named columns."""
-    word = "_".join(name.split()) or "field"
-    if values.shape[1:] in ((), (1,)):
-        single = {"labels": "label", "curvature": spelling.curvature}.get(name, word)
-        return [(single, values.reshape(-1))]
-    triples = {"normals": spelling.normals, "color": spelling.color}
-    if name in triples and values.shape[1] == 3:
-        names: tuple[str, ...] = triples[name]
-    elif spelling.vectors:
-        return [(word, values)]
-    else:
-        names = tuple(f"{word}_{i}" for i in range(values.shape[1]))
-    return [(column_name, values[:, i]) for i, column_name in enumerate(names)]
-
-
-def narrow_integers(values: NDArray[Any], codes: Collection[str]) -> NDArray[Any]:
-    """Return 64-bit integers in the first of some types, as ``("i4", "u4")``, that holds them all.
-
-    What none of them holds, and what is no 64-bit integers, stays as it is.
-    """
-    if values.dtype.kind not in "iu" or values.dtype.itemsize < 8 or values.size == 0:
-        return values
-    low, high = int(values.min()), int(values.max())
-    for code in codes:
-        limits = np.iinfo(code)
-        if limits.min <= low and high <= limits.max:
-            return values.astype(code)
-    return values
-
-
-def to_records(columns: Columns) -> NDArray[Any]:
-    """Return columns as one structured array, little-endian, shape ``(N,)``."""
-    length = len(next(iter(columns.values())))
-    parts = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in columns.items()]
-    records = np.empty(length, parts)
-    for name, column in columns.items():
-        records[name] = column
-    return records
-
-
-def write_records(path: Path, lines: list[str], columns: Columns) -> None:
-    """Write a header of lines and the columns as binary records."""
-    records = to_records(columns)
-    with atomic_path(path) as beside, beside.open("wb") as stream:
-        stream.write("".join(f"{line}\n" for line in lines).encode())
-        records.tofile(stream)

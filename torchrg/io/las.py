@@ -7,19 +7,24 @@ Normals, curvature and labels are extra dimensions named ``NormalX``, ``NormalY`
 import copy
 import math
 import struct
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.fields import WIDEN, Spelling, are_whole, assemble_cloud, flatten_cloud
+from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
+from torchrg.io.fields import WIDEN, Columns, Naming, are_whole
 from torchrg.io.files import DAMAGES, atomic_path, check_promise, first_line, refusing
+from torchrg.io.stream import CloudStream, Table
 from torchrg.structures import Cloud
 
 _POINTS_AT_ONCE = 1 << 20
+"""So that memory grows with the points that are really there, whatever a header promises."""
 _SPELLING = Spelling(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16
 )
@@ -27,6 +32,10 @@ _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 """By point format without colour, the one that adds it."""
 _FIRST_LAYERED_FORMAT = 6
 """Point formats from here on are compressed field by field."""
+_PACKING = ("laszip encoded", "copc")
+"""Whose records say how the points lie in the file."""
+_RANGE_BITS = 0b110
+"""Options of an extra dimension: its least value is said, and its largest."""
 _UNFIT = "_value"
 """Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
 _LARGEST_INTEGER = 2**31 - 1
@@ -36,8 +45,8 @@ number of points of 64 bits that version 1.4 has beside the old one, which may b
 _DATE_AT, _DATE_BYTES = 90, 4
 
 
-def read_las(path: Path, size: int) -> Cloud:
-    """Read a LAS or LAZ file.
+def open_las(path: Path, size: int) -> Table:
+    """Open a LAS, LAZ or COPC file.
 
     The cloud is float64, with every extra dimension and every standard one that is not zero
     everywhere; colours are uint8 where eight bits hold them, else uint16. The header is kept for
@@ -45,6 +54,39 @@ def read_las(path: Path, size: int) -> Cloud:
     """
     laspy = _laspy("read")
     _check_header(path, size)
+    with _reading(laspy, path) as reader:
+        header = reader.header
+        _check_points(path, header, size)
+    if header.point_count == 0:
+        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+    # How the points are packed is not about the points, and laspy cannot write an octree.
+    for records in (header.vlrs, header.evlrs or []):
+        records[:] = [r for r in records if r.user_id not in _PACKING]
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        with _reading(laspy, path) as reader:
+            yield from map(_columns, reader.chunk_iterator(chunk_size))
+
+    standard = set(header.point_format.standard_dimension_names)
+
+    def facts(columns: Columns) -> set[str]:
+        return {name for name in standard if name in columns and columns[name].any()}
+
+    def names(columns: Collection[str], used: Collection[str]) -> dict[str, str]:
+        unused = _unused(columns, standard, used)
+        return {
+            name.removesuffix(_UNFIT) if name.removesuffix(_UNFIT) in unused else name: name
+            for name in columns
+            if name not in unused
+        }
+
+    naming = Naming(facts, names)
+    return Table(read, header.point_count, _POINTS_AT_ONCE, naming, header={"las": header})
+
+
+@contextmanager
+def _reading(laspy: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
+    """Open a reader; what is wrong with the file is an error that names it."""
     message = f"{path}: expected a LAS or LAZ file, got: "
     damages = (laspy.errors.LaspyException, *DAMAGES)
     try:
@@ -53,10 +95,7 @@ def read_las(path: Path, size: int) -> Cloud:
             refusing(message, *damages, repair="; fetch it again"),
             laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
         ):
-            header = reader.header
-            _check_points(path, header, size)
-            # By blocks, so that memory grows with the points that are really there.
-            blocks = [_columns(block) for block in reader.chunk_iterator(_POINTS_AT_ONCE)]
+            yield reader
     except BaseException as error:
         # A panic of lazrs, which is written in Rust, is no Exception and has no importable name.
         if type(error).__name__ != "PanicException":
@@ -64,58 +103,113 @@ def read_las(path: Path, size: int) -> Cloud:
         raise FormatError(
             f"{path}: expected whole compressed points, got: {first_line(error)}; fetch it again."
         ) from error
-    if not blocks:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
-    columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    unused = _unused(header.point_format, columns)
-    named = {
-        name.removesuffix(_UNFIT) if name.removesuffix(_UNFIT) in unused else name: column
-        for name, column in columns.items()
-        if name not in unused
-    }
-    return assemble_cloud(path, named, header={"las": header})
 
 
 def check_las(path: Path, cloud: Cloud | None) -> None:
     """Check that laspy is installed, and that all points of a cloud that is known are finite."""
     _laspy("write")
     if cloud is not None and not cloud.finite.all():
-        raise FormatError(
-            f"{path}: expected finite coordinates, as LAS has no others, got "
-            f"{int((~cloud.finite).sum())} points that are not (first: "
-            f"{int(np.argmin(cloud.finite))}); write .npz, .ply or .pcd."
-        )
+        _refuse_points(path, int((~cloud.finite).sum()), int(np.argmin(cloud.finite)))
 
 
-def write_las(path: Path, cloud: Cloud) -> None:
+def _refuse_points(path: Path, count: int, first: int) -> NoReturn:
+    """Raise the error that some points are not finite."""
+    raise FormatError(
+        f"{path}: expected finite coordinates, as LAS has no others, got {count} points that are "
+        f"not (first: {first}); write .npz, .ply or .pcd."
+    )
+
+
+def write_las(path: Path, stream: CloudStream) -> None:
     """Write a LAS file, or a LAZ file if the suffix says so.
 
     If the cloud came from a LAS file, scale, offset, reference system and point format are kept;
     otherwise the scale is the smallest power of ten that the grid of 32 bits allows.
     """
     laspy = _laspy("write")
-    columns = flatten_cloud(path, cloud, _SPELLING)
-    header, has_date = _header(
-        laspy, cloud, colored=all(name in columns for name in _SPELLING.color)
-    )
-    named = _fitted(path, header.point_format, columns)
+    plan = _plan(path, laspy, stream)
+    errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
+    with (
+        refusing(f"{path}: cannot be written: ", *errors),
+        atomic_path(path) as beside,
+    ):
+        with laspy.open(beside, mode="w", header=plan.header) as writer:
+            for chunk in stream:
+                record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=plan.header)
+                data = laspy.LasData(plan.header, record)
+                data.x, data.y, data.z = chunk.coordinates.T.astype(np.float64)
+                columns = flatten_cloud(path, chunk, _SPELLING, plan.limits)
+                for name, column in _fitted(path, columns, plan.unfit).items():
+                    data[name] = column
+                writer.write_points(data.points)
+            if plan.header.version.minor >= 4 and plan.header.evlrs is not None:
+                writer.write_evlrs(plan.header.evlrs)
+        if not plan.has_date:
+            _erase_date(beside)
+
+
+class _Plan(NamedTuple):
+    """What has to be known of all points before the first is written.
+
+    The header holds the extra dimensions; ``unfit`` are the columns that the standard dimension of
+    their name cannot hold; without a date, that of the day is erased.
+    """
+
+    header: Any
+    has_date: bool
+    unfit: set[str]
+    limits: dict[str, Limits]
+
+
+def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
+    """Look at all points."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    unfit, limits = set[str](), dict[str, Limits]()
+    num_before, num_lost, first_lost = 0, 0, 0
+    for number, chunk in enumerate(stream):
+        columns = flatten_cloud(path, chunk, _SPELLING)
+        if number == 0:
+            colored = all(name in columns for name in _SPELLING.color)
+            header, has_date = _header(laspy, stream, colored=colored)
+        merge_limits(limits, columns)
+        fitted = _fitted(path, columns, set())
+        unfit |= {
+            name
+            for name in fitted.keys() & set(header.point_format.dimension_names)
+            if not _holds(header.point_format.dimension_by_name(name), fitted[name])
+        }
+        if not chunk.finite.all():
+            first_lost = first_lost if num_lost else num_before + int(np.argmin(chunk.finite))
+            num_lost += int((~chunk.finite).sum())
+        num_before += len(chunk)
+        low = np.minimum(low, chunk.coordinates.min(axis=0))
+        high = np.maximum(high, chunk.coordinates.max(axis=0))
+    if num_lost:
+        _refuse_points(path, num_lost, first_lost)
+    if "las" not in stream.header:
+        middle = np.rint((low + high) / 2)
+        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
+        header.offsets = middle
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
+    columns = flatten_cloud(path, chunk, _SPELLING, limits)
     header.add_extra_dims(
         [
             laspy.ExtraBytesParams(name, column.dtype.str[1:])
-            for name, column in named.items()
+            for name, column in _fitted(path, columns, unfit).items()
             if name not in header.point_format.dimension_names
         ]
     )
-    errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
-    with refusing(f"{path}: cannot be written: ", *errors):
-        data = laspy.LasData(header)
-        data.x, data.y, data.z = cloud.coordinates.T.astype(np.float64)
-        for name, column in named.items():
-            data[name] = column
-        with atomic_path(path) as beside:
-            data.write(beside)
-            if not has_date:
-                _erase_date(beside)
+    _claim_no_ranges(header)
+    return _Plan(header, has_date, unfit, limits)
+
+
+def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401
+    """Say nothing of the range of extra dimensions, for which laspy 2.7.0 takes a first value."""
+    for record in header.vlrs.get("ExtraBytesVlr"):
+        for described in record.extra_bytes_structs:
+            # Without a type the same byte is the number of bytes.
+            if described.data_type != 0:
+                described.options &= ~_RANGE_BITS
 
 
 def count_las(path: Path, stream: BinaryIO, size: int) -> int:
@@ -204,7 +298,8 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
     num_layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point_format.id]
     num_layers += point_format.num_extra_bytes
     start = header.offset_to_point_data + 8
-    for num_bytes in chunks:
+    # Writers that end a chunk themselves leave an empty one behind the last.
+    for num_bytes in filter(None, chunks):
         # A whole point and the number of points come first.
         place = start + point_format.size + 4
         stream.seek(place)
@@ -228,26 +323,19 @@ def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
     return columns
 
 
-def _unused(point_format: Any, columns: dict[str, NDArray[Any]]) -> set[str]:  # noqa: ANN401
+def _unused(columns: Collection[str], standard: set[str], used: Collection[str]) -> set[str]:
     """Return the standard dimensions that are zero everywhere; the channels of a colour as one."""
-    standard = set(point_format.standard_dimension_names)
-    used = {name for name, column in columns.items() if name not in standard or column.any()}
-    if not used.isdisjoint(_SPELLING.color):
-        used.update(_SPELLING.color)
-    return columns.keys() - used
+    kept = {name for name in columns if name not in standard or name in used}
+    if not kept.isdisjoint(_SPELLING.color):
+        kept.update(_SPELLING.color)
+    return set(columns) - kept
 
 
-def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
+def _header(laspy: Any, stream: CloudStream, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
     """Return the header the cloud came with, or a new one, and whether it has a date."""
-    stored = cloud.header.get("las")
+    stored = stream.header.get("las")
     if stored is None:
-        header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
-        low, high = cloud.coordinates.min(axis=0), cloud.coordinates.max(axis=0)
-        middle = np.rint((low.astype(np.float64) + high) / 2)
-        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
-        header.offsets = middle
-        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
-        return header, False
+        return laspy.LasHeader(version="1.4", point_format=7 if colored else 6), False
     number = stored.point_format.id
     number = _WITH_COLOR.get(number, number) if colored else number
     least = laspy.LasHeader(point_format=number).version
@@ -256,11 +344,7 @@ def _header(laspy: Any, cloud: Cloud, *, colored: bool) -> tuple[Any, bool]:  # 
     return header, stored.creation_date is not None
 
 
-def _fitted(
-    path: Path,
-    point_format: Any,  # noqa: ANN401
-    columns: dict[str, NDArray[Any]],
-) -> dict[str, NDArray[Any]]:
+def _fitted(path: Path, columns: Columns, unfit: Collection[str]) -> dict[str, NDArray[Any]]:
     """Return all columns but x, y, z; those that a standard dimension cannot hold renamed."""
     fitted = {}
     for name, column in columns.items():
@@ -268,8 +352,7 @@ def _fitted(
             continue
         if name in _SPELLING.color and column.dtype == np.uint8:
             column = column.astype(np.uint16) * WIDEN
-        known = name in point_format.dimension_names
-        if known and not _holds(point_format.dimension_by_name(name), column):
+        if name in unfit:
             name = f"{name}{_UNFIT}"
         if name in ("X", "Y", "Z") or len(name.encode()) > 32:
             raise FormatError(

@@ -3,18 +3,21 @@
 ``.npz``: ``points`` (or ``coord``), shape (N, 3), and any arrays of N rows, which become fields.
 Arrays of another length are left out, and so is what a result says about its planes, under names
 that begin with ``plane_``. See :func:`torchrg.io.write_cloud` for all names of a result.
-``.npy``: an array (N, 3) or wider, see :func:`torchrg.io.fields.name_columns` for its columns, or
+``.npy``: an array (N, 3) or wider, see :func:`torchrg.io.fields.name_numbered` for its columns, or
 a structured array with named fields ``x``, ``y``, ``z``.
 """
 
+import io
 import json
 import math
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -23,118 +26,183 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import (
-    Spelling,
-    assemble_cloud,
-    check_length,
-    cloud_of,
-    flatten_cloud,
-    name_columns,
-    to_records,
-)
+from torchrg.io.columns import Spelling, flatten_cloud, to_records, wide_limits
+from torchrg.io.fields import Columns, check_coordinates, naming_of, number_columns
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
-from torchrg.structures import PLANE_KINDS, Cloud, Segmentation, Superpoints
+from torchrg.io.stream import CHUNK_SIZE, CloudStream, Table, slices
+from torchrg.structures import PLANE_KINDS, Planes, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
+_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 _NOT_PER_POINT = "plane_"
 _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
+_BYTES_AT_ONCE = 1 << 20
+"""How much is unpacked together."""
 _EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 
 
-def read_npy(path: Path, size: int) -> Cloud:
-    """Read a ``.npy`` file."""
+def open_npy(path: Path, size: int) -> Table:
+    """Open a ``.npy`` file."""
     with path.open("rb") as stream:
-        values = _read_array(path, stream, size, content="the array")
-    if values.dtype.names is not None:
-        flat = values.reshape(-1)
-        return assemble_cloud(path, {name: flat[name] for name in values.dtype.names})
-    if values.ndim != 2 or values.shape[1] < 3:
+        layout = _read_header(path, stream, size, content="the array")
+    names = layout.dtype.names
+    if names is None and (len(layout.shape) != 2 or layout.shape[1] < 3):
         raise FormatError(
-            f"{path}: expected an array of shape (N, 3) or wider, got {values.shape}; reshape it."
+            f"{path}: expected an array of shape (N, 3) or wider, got {layout.shape}; reshape it."
         )
-    return assemble_cloud(path, name_columns(values))
+    if names is not None and not layout.is_fortran:
+        layout = layout._replace(shape=(math.prod(layout.shape),))
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        for rows in _read_rows(lambda: path.open("rb"), layout, chunk_size):
+            flat = rows.reshape(-1)
+            yield number_columns(rows) if names is None else {name: flat[name] for name in names}
+
+    naming = naming_of(layout.shape[1]) if names is None else None
+    num_points = layout.num_rows if names is None else math.prod(layout.shape)
+    return Table(read, num_points, naming=naming)
 
 
-def write_npy(path: Path, cloud: Cloud) -> None:
+def write_npy(path: Path, stream: CloudStream) -> None:
     """Write coordinates of shape (N, 3), or with fields a structured array named as in PLY."""
-    values: NDArray[Any] = cloud.coordinates
-    if cloud.fields:
-        values = to_records(flatten_cloud(path, cloud, Spelling()))
-    with atomic_path(path) as beside, beside.open("wb") as stream:
-        npy_format.write_array(stream, values, allow_pickle=False)
+    with atomic_path(path) as beside, beside.open("wb") as file:
+        _write_array(file, stream.count, _bare_or_records(path, stream))
+
+
+def _bare_or_records(path: Path, stream: CloudStream) -> Iterator[NDArray[Any]]:
+    """Give the coordinates of each chunk, or its columns as records if it has fields."""
+    spelling = Spelling()
+    limits = wide_limits(path, stream, spelling)
+    for chunk in stream:
+        columns = flatten_cloud(path, chunk, spelling, limits)
+        yield to_records(columns) if chunk.fields else chunk.coordinates
 
 
 def count_npy(path: Path, stream: IO[bytes], size: int) -> int:
     """Return the number of rows of an array."""
-    shape, _ = _read_shape(stream)
-    return shape[0] if shape else 0
+    layout = _read_layout(stream)
+    return layout.shape[0] if layout.shape else 0
 
 
-def read_npz(path: Path, size: int) -> Cloud:
-    """Read a ``.npz`` file."""
-    message = f"{path}: expected an archive of NumPy arrays, got: "
-    with (
-        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch or write it again"),
-        zipfile.ZipFile(path) as archive,
-    ):
-        arrays = {
-            member.filename.removesuffix(".npy"): _read_member(path, archive, member, size)
+def open_npz(path: Path, size: int) -> Table:
+    """Open a ``.npz`` file."""
+    with _open_archive(path) as archive:
+        layouts = {
+            member.filename.removesuffix(".npy"): _check_member(path, archive, member, size)
             for member in archive.infolist()
             if member.filename.endswith(".npy")
         }
-    name = next((name for name in _COORDINATES if name in arrays), None)
-    if name is None:
-        found = ", ".join(map(repr, arrays)) or "none"
+    coordinates = next((name for name in _COORDINATES if name in layouts), None)
+    if coordinates is None:
+        found = ", ".join(map(repr, layouts)) or "none"
         raise FormatError(
             f"{path}: expected an array points (or coord), got {found}; rename the coordinates."
         )
-    coordinates = arrays.pop(name)
-    fields = {
-        name: values
-        for name, values in arrays.items()
-        if values.shape[:1] == coordinates.shape[:1] and not name.startswith(_NOT_PER_POINT)
-    }
-    return cloud_of(path, coordinates, fields)
+    shape = layouts[coordinates].shape
+    check_coordinates(path, shape, layouts[coordinates].dtype)
+    kept = [
+        name
+        for name, layout in layouts.items()
+        if layout.shape[:1] == shape[:1] and not name.startswith(_NOT_PER_POINT)
+    ]
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        with _open_archive(path) as archive:
+            for name, layout in layouts.items():
+                # What is left out is read, too, so that damage in it is found; and so is what will
+                # be read from several places, as a checksum needs all bytes in their order.
+                if name not in kept or layout.is_cut_across(chunk_size):
+                    _check_bytes(path, archive, name)
+            arrays = [_read_member(path, archive, name, layouts[name], chunk_size) for name in kept]
+            for rows in zip(*arrays, strict=True):
+                yield dict(zip(kept, rows, strict=True))
+
+    return Table(read, shape[0], coordinates=coordinates)
 
 
 def write_npz(
     path: Path,
-    cloud: Cloud,
+    stream: CloudStream,
     segmentation: Segmentation | None = None,
     provenance: Mapping[str, Any] | None = None,
     superpoints: Superpoints | None = None,
 ) -> None:
     """Write ``points`` and every field under its name, or the arrays of a result, and provenance.
 
-    Equal arrays give equal bytes, whenever and wherever.
+    Equal arrays give equal bytes, whenever and wherever. As one array comes after the other, the
+    chunks are gone through once for each field.
     """
+    arrays: dict[str, NDArray[Any] | Callable[[], Iterator[NDArray[Any]]]] = {
+        "points": lambda: (chunk.coordinates for chunk in stream)
+    }
     if segmentation is None:
-        for name, values in cloud.fields.items():
-            check_length(path, name, values, len(cloud))
+        for name, values in next(iter(stream)).fields.items():
             if name in _COORDINATES:
                 raise FormatError(
                     f"{path}: expected fields beside points, got {name!r}; rename it."
                 )
-        arrays = {"points": cloud.coordinates, **cloud.fields}
+            if values.dtype.hasobject:
+                raise FormatError(
+                    f"{path}: expected numbers or text in {name}, got Python objects; leave it out."
+                )
+            arrays[name] = partial(_field, stream, name)
     else:
-        arrays = _result(cloud, segmentation)
+        for name in _RESULTS:
+            arrays[name] = partial(_cut, getattr(segmentation, name))
+        arrays |= _table(stream.origin, segmentation.planes)
     if superpoints is not None:
-        arrays |= superpoints.by_level()
+        for name in superpoints.rows(slice(0)).by_level():
+            arrays[name] = partial(_level, superpoints, name)
         arrays["plane_of_superpoint"] = superpoints.plane.numpy(force=True)
     if provenance is not None:
         arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
-    for name, values in arrays.items():
-        if values.dtype.hasobject:
-            raise FormatError(
-                f"{path}: expected numbers or text in {name}, got Python objects; leave it out."
-            )
     with atomic_path(path) as beside, zipfile.ZipFile(beside, "w", allowZip64=True) as archive:
-        for name, values in arrays.items():
+        for name, content in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy", _EARLIEST_ZIP_TIME)
-            with archive.open(member, "w", force_zip64=True) as stream:
-                npy_format.write_array(stream, np.asarray(values, order="C"), allow_pickle=False)
+            with archive.open(member, "w", force_zip64=True) as file:
+                if callable(content):
+                    _write_array(file, stream.count, content())
+                else:
+                    npy_format.write_array(file, np.asarray(content, order="C"), allow_pickle=False)
+
+
+def _field(stream: CloudStream, name: str) -> Iterator[NDArray[Any]]:
+    """Give a field of each chunk."""
+    return (chunk.fields[name] for chunk in stream)
+
+
+def _cut(values: Tensor) -> Iterator[NDArray[Any]]:
+    """Give the rows of a tensor in chunks."""
+    return (values[rows].numpy(force=True) for rows in slices(len(values), CHUNK_SIZE))
+
+
+def _level(superpoints: Superpoints, name: str) -> Iterator[NDArray[Any]]:
+    """Give a level of superpoints in chunks."""
+    for rows in slices(len(superpoints.labels), CHUNK_SIZE):
+        yield superpoints.rows(rows).by_level()[name]
+
+
+def _write_array(file: IO[bytes], num_rows: int, chunks: Iterator[NDArray[Any]]) -> None:
+    """Write an array of so many rows in NumPy's format, a few of them at a time."""
+    for number, values in enumerate(chunks):
+        if number == 0:
+            file.write(_header_of(values[:0], num_rows))
+        file.write(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
+
+
+def _header_of(empty: NDArray[Any], num_rows: int) -> bytes:
+    """Return the header of an array of so many rows from an array of none.
+
+    NumPy keeps room in it for the number to grow, so the length is the same for both.
+    """
+    with io.BytesIO() as memory:
+        npy_format.write_array(memory, empty, allow_pickle=False)
+        before, mark, after = memory.getvalue().rpartition(b"'shape': (0,")
+    digits = str(num_rows).encode()
+    room = b" " * (len(digits) - 1)
+    return before + mark[:-2] + digits + b"," + after.removesuffix(room + b"\n") + b"\n"
 
 
 def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
@@ -145,24 +213,20 @@ def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
             return count_npy(path, member, size)
 
 
-def _result(cloud: Cloud, segmentation: Segmentation) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a result, planes in the coordinates of the cloud itself.
+def _table(origin: NDArray[np.float64], planes: Planes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a table of planes about an origin, in the coordinates of the cloud.
 
-    What the table of planes does not have is left out.
+    What the table does not have is left out.
     """
 
     def moved(places: Tensor) -> NDArray[np.float64]:
-        return places.numpy(force=True).astype(np.float64) + cloud.origin
+        return places.numpy(force=True).astype(np.float64) + origin
 
-    per_point = segmentation._asdict()
-    planes, _ = per_point.pop("planes"), per_point.pop("points")
     table = planes._asdict()
     kind, outline, adjacency = (table.pop(name) for name in ("kind", "outline", "adjacency"))
-    arrays = {"points": cloud.coordinates}
-    arrays |= {name: values.numpy(force=True) for name, values in per_point.items()}
-    arrays |= {f"plane_{name}": values.numpy(force=True) for name, values in table.items()}
+    arrays = {f"plane_{name}": values.numpy(force=True) for name, values in table.items()}
     arrays["plane_offset"] = (
-        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ cloud.origin
+        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ origin
     )
     arrays |= {f"plane_{name}": moved(table[name]) for name in ("centroid", "center")}
     if kind is not None:
@@ -182,16 +246,59 @@ def map_array(path: Path) -> NDArray[Any]:
     """Map the array of a ``.npy`` file into memory, copy-on-write: no change reaches the file."""
     size = check_file(path)
     with path.open("rb") as stream:
-        shape = _read_header(path, stream, size, content="the array")
+        shape = _read_header(path, stream, size, content="the array").shape
     # There is nothing to map in an empty array, and trying fails.
     values = np.load(path, mmap_mode=None if 0 in shape else "c", allow_pickle=False)
     return np.asarray(values)
 
 
-def _read_member(
+class _Layout(NamedTuple):
+    """What the header of an array says, and at which byte its values begin.
+
+    In Fortran's order the first index runs fastest, so that columns are whole and not rows.
+    """
+
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype[Any]
+    start: int
+
+    @property
+    def num_rows(self) -> int:
+        """Length of the array; one of a bare number."""
+        return self.shape[0] if self.shape else 1
+
+    @property
+    def row_shape(self) -> tuple[int, ...]:
+        """Shape of a row."""
+        return self.shape[1:]
+
+    def is_cut_across(self, chunk_size: int) -> bool:
+        """Whether chunks of so many rows are not whole in the file."""
+        return self.is_fortran and len(self.shape) > 1 and chunk_size < self.num_rows
+
+
+@contextmanager
+def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive; errors name it."""
+    message = f"{path}: expected an archive of NumPy arrays, got: "
+    with (
+        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch or write it again"),
+        zipfile.ZipFile(path) as archive,
+    ):
+        yield archive
+
+
+def _refusing_member(path: Path, name: str) -> AbstractContextManager[None]:
+    """Raise what reading a member raises as an error that names it."""
+    message = f"{path}: {f'{name}.npy'!r}: "
+    return refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again")
+
+
+def _check_member(
     path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, size: int
-) -> NDArray[Any]:
-    """Read one array of an archive."""
+) -> _Layout:
+    """Return the layout of an array of an archive, of which there are as many bytes as needed."""
     if member.compress_type not in _LARGEST_RATIO:
         raise FormatError(
             f"{path}: expected {member.filename!r} stored or deflated, got compression "
@@ -200,27 +307,62 @@ def _read_member(
     content = repr(member.filename)
     most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
     check_promise(path, member.header_offset, member.file_size, content, available=most)
-    with (
-        refusing(f"{path}: {content}: ", *ARCHIVE_DAMAGES, repair="; fetch the file again"),
-        archive.open(member) as stream,
-    ):
-        return _read_array(path, stream, member.file_size, content=content)
+    name = member.filename.removesuffix(".npy")
+    with _refusing_member(path, name), archive.open(member) as stream:
+        return _read_header(path, stream, member.file_size, content=content)
 
 
-def _read_array(path: Path, stream: IO[bytes], size: int, *, content: str) -> NDArray[Any]:
-    """Read an array of NumPy's format of which ``size`` bytes are there."""
-    _read_header(path, stream, size, content=content)
-    stream.seek(0)
-    values: NDArray[Any] = npy_format.read_array(stream, allow_pickle=False)
-    return values
+def _check_bytes(path: Path, archive: zipfile.ZipFile, name: str) -> None:
+    """Read a member to its end, where its checksum is compared."""
+    with _refusing_member(path, name), archive.open(f"{name}.npy") as stream:
+        while stream.read(_BYTES_AT_ONCE):
+            pass
 
 
-def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> tuple[int, ...]:
-    """Read the header of an array, check it against the file, and return the shape."""
+def _read_member(
+    path: Path, archive: zipfile.ZipFile, name: str, layout: _Layout, chunk_size: int
+) -> Iterator[NDArray[Any]]:
+    """Read one array of an archive, so many rows at a time."""
+    with _refusing_member(path, name):
+        yield from _read_rows(partial(archive.open, f"{name}.npy"), layout, chunk_size)
+
+
+def _read_rows(
+    open_stream: Callable[[], IO[bytes]], layout: _Layout, chunk_size: int
+) -> Iterator[NDArray[Any]]:
+    """Read an array so many rows at a time; what does not lie in rows, from several places."""
+    width = max(math.prod(layout.row_shape), 1) if layout.is_cut_across(chunk_size) else 1
+    column_bytes = layout.num_rows * layout.dtype.itemsize
+    with ExitStack() as stack:
+        streams = [stack.enter_context(open_stream()) for _ in range(width)]
+        for i, stream in enumerate(streams):
+            stream.seek(layout.start + i * column_bytes)
+        for rows in slices(layout.num_rows, chunk_size):
+            shape = (rows.stop - rows.start, *layout.row_shape) if layout.shape else ()
+            values = np.empty(shape, layout.dtype, "F" if layout.is_fortran else "C")
+            memory = values.reshape(-1, order="A").view(np.uint8).reshape(width, -1)
+            for stream, part in zip(streams, memory, strict=True):
+                _fill(stream, part.data)
+            yield values
+
+
+def _fill(stream: IO[bytes], memory: memoryview) -> None:
+    """Read as many bytes as a piece of memory has."""
+    done = 0
+    while done < len(memory):
+        got = stream.readinto(memory[done : done + _BYTES_AT_ONCE])  # type: ignore[attr-defined]
+        if not got:
+            raise EOFError(f"EOF: reading array data, expected {len(memory)} bytes got {done}")
+        done += got
+
+
+def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> _Layout:
+    """Read the header of an array and check it against the ``size`` bytes that are there."""
     message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
     repair = "; write it again with numpy.save or numpy.savez"
     with refusing(message, *DAMAGES, SyntaxError, tokenize.TokenError, repair=repair):
-        shape, dtype = _read_shape(stream)
+        layout = _read_layout(stream)
+    shape, _, dtype, start = layout
     if dtype.hasobject:
         raise FormatError(
             f"{path}: expected numbers or text in {content}, got pickled Python objects, which are "
@@ -231,17 +373,19 @@ def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> t
             f"{path}: byte 0: expected a shape and a type in {content}, got {shape} of {dtype}; "
             "write it again."
         )
-    start, promised = stream.tell(), math.prod(shape) * dtype.itemsize
+    promised = math.prod(shape) * dtype.itemsize
     check_promise(path, start, promised, f"{content} of shape {shape}", available=size - start)
-    return shape
+    return layout
 
 
-def _read_shape(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read shape and type of an array, and leave the stream at the first value."""
+def _read_layout(stream: IO[bytes]) -> _Layout:
+    """Read what the header of an array says."""
     version = npy_format.read_magic(stream)
-    # Versions 2 and 3 differ in the encoding of field names only, which sizes do not need.
     read = npy_format.read_array_header_1_0
     if version != (1, 0):
         read = npy_format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    return tuple(shape), dtype
+    shape, is_fortran, dtype = read(stream)
+    if version == (3, 0) and dtype.names is not None:
+        # Version 3 is version 2 with another encoding of field names.
+        dtype.names = tuple(name.encode("latin-1").decode("utf-8") for name in dtype.names)
+    return _Layout(tuple(shape), is_fortran, dtype, stream.tell())

@@ -6,6 +6,7 @@ needs every header line in place, and writes ASCII with ten decimals.
 """
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -13,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, write_records
+from torchrg.io.columns import Spelling, flatten_stream, write_records
+from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
-from torchrg.io.text import read_ascii
-from torchrg.structures import Cloud
+from torchrg.io.stream import CloudStream, Table, slices
+from torchrg.io.text import LINES_AT_ONCE, read_ascii
 
 _LONGEST_HEADER = 1 << 16
 _LARGEST_RECORD = 1 << 20
@@ -33,57 +35,68 @@ _LARGEST_LZF_RATIO = 88
 _Fields = dict[str, NDArray[Any]]
 
 
-def read_pcd(path: Path, size: int) -> Cloud:
-    """Read a PCD file.
+def open_pcd(path: Path, size: int) -> Table:
+    """Open a PCD file.
 
     Packed colours become ``color``, and the fourth channel of ``rgba`` becomes ``alpha``. An
-    organised cloud has its ``grid_shape``, and the viewpoint is kept for writing.
+    organised cloud has its ``grid_shape``, and the viewpoint is kept for writing. A compressed file
+    holds its fields one after the other in one lump, so its first chunk takes the memory of all.
     """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
-        read = {"ascii": _read_text, "binary": _read_binary}.get(header.encoding, _read_compressed)
-        stored = read(path, stream, header, size)
-    columns: _Fields = {}
-    for name in header.field_names:
-        columns |= _unpacked(name, stored[name])
-    return assemble_cloud(
-        path,
-        columns,
+    read_stored = {"ascii": _read_text, "binary": _read_binary}.get(
+        header.encoding, _read_compressed
+    )
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        with path.open("rb") as stream:
+            for stored in read_stored(path, stream, header, size, chunk_size):
+                columns: _Fields = {}
+                for name in header.field_names:
+                    columns |= _unpacked(name, stored[name])
+                yield columns
+
+    return Table(
+        read,
+        header.num_points,
+        LINES_AT_ONCE if header.encoding == "ascii" else None,
         grid_shape=(header.height, header.width) if header.height > 1 else None,
         header={"viewpoint": header.viewpoint},
     )
 
 
-def write_pcd(path: Path, cloud: Cloud) -> None:
+def write_pcd(path: Path, stream: CloudStream) -> None:
     """Write a binary file; equal clouds give equal bytes.
 
     Coordinates keep their precision, colours are packed as PCL does, an organised cloud keeps its
     width and height. (Open3D's older reader, and PCL's own point types, take float32 coordinates
     only; ``open3d.t.io`` takes both.)
     """
-    height, width = cloud.grid_shape or (1, len(cloud))
-    if height * width != len(cloud):
+    height, width = stream.grid_shape or (1, stream.count)
+    if height * width != stream.count:
         raise FormatError(
-            f"{path}: expected a grid of {len(cloud)} points, got {height} rows of {width}; "
+            f"{path}: expected a grid of {stream.count} points, got {height} rows of {width}; "
             "set grid_shape to None."
         )
-    columns = _packed(flatten_cloud(path, cloud, _SPELLING))
-    values = columns.values()
-    viewpoint = cloud.header.get("viewpoint", _DEFAULT_VIEWPOINT)
-    lines = [
-        "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
-        f"FIELDS {' '.join(columns)}",
-        f"SIZE {' '.join(str(column.dtype.itemsize) for column in values)}",
-        f"TYPE {' '.join(column.dtype.kind.upper() for column in values)}",
-        f"COUNT {' '.join(str(int(np.prod(column.shape[1:]))) for column in values)}",
-        f"WIDTH {width}",
-        f"HEIGHT {height}",
-        f"VIEWPOINT {' '.join(f'{value:.17g}' for value in viewpoint)}",
-        f"POINTS {width * height}",
-        "DATA binary",
-    ]
-    write_records(path, lines, columns)
+    viewpoint = stream.header.get("viewpoint", _DEFAULT_VIEWPOINT)
+
+    def header(columns: Columns) -> list[str]:
+        values = columns.values()
+        return [
+            "# .PCD v0.7 - Point Cloud Data file format",
+            "VERSION 0.7",
+            f"FIELDS {' '.join(columns)}",
+            f"SIZE {' '.join(str(column.dtype.itemsize) for column in values)}",
+            f"TYPE {' '.join(column.dtype.kind.upper() for column in values)}",
+            f"COUNT {' '.join(str(int(np.prod(column.shape[1:]))) for column in values)}",
+            f"WIDTH {width}",
+            f"HEIGHT {height}",
+            f"VIEWPOINT {' '.join(f'{value:.17g}' for value in viewpoint)}",
+            f"POINTS {width * height}",
+            "DATA binary",
+        ]
+
+    write_records(path, header, map(_packed, flatten_stream(path, stream, _SPELLING)))
 
 
 def count_pcd(path: Path, stream: BinaryIO, size: int) -> int:
@@ -228,7 +241,9 @@ def _record_type(entries: _Entries) -> np.dtype[np.void]:
     return np.dtype(parts)
 
 
-def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDArray[np.void]:
+def _read_text(
+    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
+) -> Iterator[NDArray[np.void]]:
     """Read the points of an ASCII file."""
     # Padding has no type of its own; in ASCII it is COUNT words to skip.
     parts = [
@@ -239,6 +254,8 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDAr
         path,
         stream,
         np.dtype(parts),
+        chunk_size,
+        start=header.num_bytes,
         num_rows=header.num_points,
         size=size,
         num_lines=header.num_lines,
@@ -246,14 +263,20 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDAr
     )
 
 
-def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDArray[np.void]:
+def _read_binary(
+    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
+) -> Iterator[NDArray[np.void]]:
     """Read the points of a binary file."""
     promised, content = header.num_points * header.dtype.itemsize, f"{header.num_points:,} points"
     check_promise(path, header.num_bytes, promised, content, available=size - header.num_bytes)
-    return np.fromfile(stream, header.dtype, count=header.num_points)
+    stream.seek(header.num_bytes)
+    for rows in slices(header.num_points, chunk_size):
+        yield np.fromfile(stream, header.dtype, count=rows.stop - rows.start)
 
 
-def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -> _Fields:
+def _read_compressed(
+    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
+) -> Iterator[_Fields]:
     """Read the fields of a compressed file: one field after the other, in one block of LZF."""
     import lzf
 
@@ -263,6 +286,7 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     padded = header.num_points * header.dtype.itemsize
     start = header.num_bytes
     check_promise(path, start, 8, "two block sizes", available=size - start)
+    stream.seek(start)
     packed_size, full_size = struct.unpack("<II", stream.read(8))
     content = f"a block of {header.num_points:,} points"
     start += 8
@@ -288,7 +312,8 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
         values = np.frombuffer(block, dtype.base, count, offset)
         fields[name] = values.reshape(header.num_points, *dtype.shape)
         offset += values.nbytes
-    return fields
+    for rows in slices(header.num_points, chunk_size):
+        yield {name: values[rows] for name, values in fields.items()}
 
 
 def _unpacked(name: str, values: NDArray[Any]) -> _Fields:
@@ -302,7 +327,7 @@ def _unpacked(name: str, values: NDArray[Any]) -> _Fields:
     return unpacked | ({"alpha": quadruples[:, 3].copy()} if name.lower() == "rgba" else {})
 
 
-def _packed(columns: _Fields) -> _Fields:
+def _packed(columns: Columns) -> _Fields:
     """Pack the channels of a colour as PCL does, and give normals the type of the coordinates."""
     packed: _Fields = {}
     has_color = all(name in columns for name in _SPELLING.color)

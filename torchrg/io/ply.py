@@ -6,6 +6,7 @@ and face, and takes the memory a header promises; trimesh writes float32 and dro
 """
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -13,16 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import (
+from torchrg.io.columns import (
+    Limits,
     Spelling,
-    assemble_cloud,
     flatten_cloud,
     narrow_integers,
+    wide_limits,
     write_records,
 )
+from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
-from torchrg.io.text import read_ascii
-from torchrg.structures import Cloud
+from torchrg.io.stream import CloudStream, Table, slices
+from torchrg.io.text import LINES_AT_ONCE, read_ascii
 
 _TYPES = {
     "char": "i1",
@@ -47,43 +50,58 @@ _LENGTH, _LIST = " length", " list"
 """What a list is called in records. Names in a PLY file have no spaces, so these meet none."""
 
 
-def read_ply(path: Path, size: int) -> Cloud:
-    """Read every property of the element ``vertex``; other elements are left out."""
+def open_ply(path: Path, size: int) -> Table:
+    """Open a PLY file: every property of the element ``vertex``; other elements are left out."""
     with path.open("rb") as stream:
         header = _read_header(path, stream)
-        elements = [element for element in header.elements if element.properties]
-        names = [element.name for element in elements]
-        if "vertex" not in names:
-            raise FormatError(
-                f"{path}: expected an element vertex with properties, got elements "
-                f"{', '.join(names) or 'none'}; write the points as vertices."
-            )
-        needed = elements[: names.index("vertex") + 1]
-        read = _read_binary if header.byte_order else _read_text
-        records = read(path, stream, header._replace(elements=needed), size)
-    names = [name for name in records.dtype.names or () if not name.endswith(_LENGTH)]
-    return assemble_cloud(path, {name.removesuffix(_LIST): records[name] for name in names})
+    elements = [element for element in header.elements if element.properties]
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise FormatError(
+            f"{path}: expected an element vertex with properties, got elements "
+            f"{', '.join(names) or 'none'}; write the points as vertices."
+        )
+    header = header._replace(elements=elements[: names.index("vertex") + 1])
+    read_records = _read_binary if header.byte_order else _read_text
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        with path.open("rb") as stream:
+            for records in read_records(path, stream, header, size, chunk_size):
+                names = [name for name in records.dtype.names or () if not name.endswith(_LENGTH)]
+                yield {name.removesuffix(_LIST): records[name] for name in names}
+
+    at_once = None if header.byte_order else LINES_AT_ONCE
+    return Table(read, header.elements[-1].num_records, at_once)
 
 
-def write_ply(path: Path, cloud: Cloud) -> None:
+def write_ply(path: Path, stream: CloudStream) -> None:
     """Write a little-endian file; coordinates keep their precision, equal clouds give equal bytes.
 
     64-bit integers become 32-bit ones, or ``double`` where that holds them.
     """
-    columns = {
-        name: _storable(path, name, column)
-        for name, column in flatten_cloud(path, cloud, Spelling()).items()
-    }
+    spelling = Spelling()
+    limits = wide_limits(path, stream, spelling)
     words = {code: word for word, code in _TYPES.items()}
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment written by torchrg",
-        f"element vertex {len(cloud)}",
-        *(f"property {words[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
-        "end_header",
-    ]
-    write_records(path, lines, columns)
+
+    def header(columns: Columns) -> list[str]:
+        return [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment written by torchrg",
+            f"element vertex {stream.count}",
+            *(f"property {words[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
+            "end_header",
+        ]
+
+    chunks = (flatten_cloud(path, chunk, spelling, limits) for chunk in stream)
+    write_records(
+        path,
+        header,
+        (
+            {name: _storable(path, name, c, limits.get(name)) for name, c in columns.items()}
+            for columns in chunks
+        ),
+    )
 
 
 def count_ply(path: Path, stream: BinaryIO, size: int) -> int:
@@ -92,11 +110,11 @@ def count_ply(path: Path, stream: BinaryIO, size: int) -> int:
     return {element.name: element.num_records for element in elements}["vertex"]
 
 
-def _storable(path: Path, name: str, column: NDArray[Any]) -> NDArray[Any]:
-    """Return a column in a type that PLY has."""
-    column = narrow_integers(column, ("i4", "u4"))
-    if column.dtype.kind in "iu" and column.dtype.itemsize == 8:
-        if max(abs(int(column.min())), abs(int(column.max()))) > 2**53:
+def _storable(path: Path, name: str, column: NDArray[Any], limits: Limits | None) -> NDArray[Any]:
+    """Return a column in a type that PLY has and that holds its limits."""
+    column = narrow_integers(column, ("i4", "u4"), limits)
+    if limits is not None and column.dtype.kind in "iu" and column.dtype.itemsize == 8:
+        if max(map(abs, limits)) > 2**53:
             raise FormatError(
                 f"{path}: expected field {name} within 2^53, got 64-bit integers beyond; "
                 "leave it out or write .npz."
@@ -188,22 +206,41 @@ def _shown(raw: bytes) -> str:
     return repr(raw[:40].decode("latin-1").strip())
 
 
-def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDArray[np.void]:
+def _read_binary(
+    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
+) -> Iterator[NDArray[np.void]]:
     """Read the last of the elements of a binary file."""
     start = header.num_bytes
-    vertex = header.elements[-1]
-    for element in header.elements:
-        stream.seek(start)
-        dtype = _record_type(path, stream, element, header.byte_order, size)
-        promised = element.num_records * dtype.itemsize
-        content = f"{element.num_records:,} records of {element.name}"
-        check_promise(path, start, promised, content, available=size - start)
-        if element is vertex or any(prop.length_code for prop in element.properties):
-            stream.seek(start)
-            records = np.fromfile(stream, dtype, count=element.num_records)
-            _check_lists(path, element, records)
-        start += promised
-    return records
+    *before, vertex = header.elements
+    for element in before:
+        dtype = _check_element(path, stream, element, header.byte_order, start, size)
+        if any(prop.length_code for prop in element.properties):
+            for rows in slices(element.num_records, chunk_size):
+                _check_lists(path, element, _read_records(stream, dtype, rows))
+        start += element.num_records * dtype.itemsize
+    dtype = _check_element(path, stream, vertex, header.byte_order, start, size)
+    for rows in slices(vertex.num_records, chunk_size):
+        records = _read_records(stream, dtype, rows)
+        _check_lists(path, vertex, records)
+        yield records
+
+
+def _check_element(
+    path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
+) -> np.dtype[np.void]:
+    """Return the type of the records of an element, all of which are there; go to the first."""
+    stream.seek(start)
+    dtype = _record_type(path, stream, element, byte_order, size)
+    promised = element.num_records * dtype.itemsize
+    content = f"{element.num_records:,} records of {element.name}"
+    check_promise(path, start, promised, content, available=size - start)
+    stream.seek(start)
+    return dtype
+
+
+def _read_records(stream: BinaryIO, dtype: np.dtype[np.void], rows: slice) -> NDArray[np.void]:
+    """Read the next records, as many as there are rows."""
+    return np.fromfile(stream, dtype, count=rows.stop - rows.start)
 
 
 def _record_type(
@@ -234,14 +271,19 @@ def _record_type(
 def _check_lists(path: Path, element: _Element, records: NDArray[np.void]) -> None:
     """Check that the lists of an element all have one length, so that records have one size."""
     for name in records.dtype.names or ():
-        if name.endswith(_LENGTH) and (records[name] != records[name][:1]).any():
+        if not name.endswith(_LENGTH):
+            continue
+        (length,) = records.dtype[name.removesuffix(_LENGTH) + _LIST].shape
+        if (records[name] != length).any():
             raise FormatError(
                 f"{path}: expected lists of one length in element {element.name}, which comes "
                 "with or before the vertices; write the vertices first and without lists."
             )
 
 
-def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDArray[np.void]:
+def _read_text(
+    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
+) -> Iterator[NDArray[np.void]]:
     """Read the last of the elements of an ASCII file."""
     *before, vertex = header.elements
     if any(prop.length_code for prop in vertex.properties):
@@ -252,9 +294,11 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> NDAr
         path,
         stream,
         np.dtype([(prop.name, prop.code) for prop in vertex.properties]),
+        chunk_size,
         num_rows=vertex.num_records,
         size=size,
         num_lines=header.num_lines,
+        start=header.num_bytes,
         skipped=sum(element.num_records for element in before),
         content="vertices",
     )

@@ -1,7 +1,7 @@
 """Points as text, ``.xyz`` and ``.txt``: one point a line, numbers between spaces or commas.
 
 A first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns;
-without it :func:`torchrg.io.fields.name_columns` does. A line of one number before the first point
+without it :func:`torchrg.io.fields.name_numbered` does. A line of one number before the first point
 is the count of points that some programs write, and is skipped. The rows of numbers in ASCII files
 of other formats are read here, too.
 """
@@ -9,15 +9,16 @@ of other formats are read here, too.
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import Spelling, assemble_cloud, flatten_cloud, name_columns
+from torchrg.io.columns import Spelling, flatten_cloud
+from torchrg.io.fields import Columns, naming_of, number_columns
 from torchrg.io.files import atomic_path, check_promise
-from torchrg.structures import Cloud
+from torchrg.io.stream import CloudStream, Table
 
 LINES_AT_ONCE = 65_536
 """Lines that are parsed or formatted together; bounds memory."""
@@ -26,31 +27,48 @@ _COUNTED_BYTES = 1 << 16
 _COMMENTS = ("#", "//")
 
 
-def read_text(path: Path, size: int) -> Cloud:
-    """Read points as text, always in float64."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        lines = iter(stream)
-        opening = _read_opening(path, lines)
-        table = _read_table(
-            path,
-            chain([opening.line], lines),
-            np.dtype([("row", "f8", (opening.num_columns,))]),
-            first_line=opening.line_number,
-            delimiter=opening.delimiter,
-            comments=_COMMENTS[0],
-        )["row"]
-    if opening.names is None:
-        return assemble_cloud(path, name_columns(table))
-    return assemble_cloud(path, {name: table[:, i] for i, name in enumerate(opening.names)})
+def open_text(path: Path, size: int) -> Table:
+    """Open points as text, always in float64."""
+    with _open_lines(path) as stream:
+        opening = _read_opening(path, stream)
+    dtype = np.dtype([("row", "f8", (opening.num_columns,))])
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        with _open_lines(path) as stream:
+            before = opening.line_number - 1
+            for rows in _read_table(
+                path,
+                islice(stream, before, None),
+                dtype,
+                chunk_size,
+                first_line=opening.line_number,
+                delimiter=opening.delimiter,
+                comments=_COMMENTS[0],
+            ):
+                table = rows["row"]
+                if opening.names is None:
+                    yield number_columns(table)
+                else:
+                    yield {name: table[:, i] for i, name in enumerate(opening.names)}
+
+    naming = naming_of(opening.num_columns) if opening.names is None else None
+    return Table(read, None, LINES_AT_ONCE, naming)
 
 
-def write_text(path: Path, cloud: Cloud) -> None:
+def _open_lines(path: Path) -> TextIO:
+    """Open a file whose letters matter only in the names of columns."""
+    return path.open(encoding="utf-8-sig", errors="replace")
+
+
+def write_text(path: Path, stream: CloudStream) -> None:
     """Write points as text that reads back to the same values, names of fields in a comment."""
-    columns = flatten_cloud(path, cloud, Spelling())
-    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
-        if cloud.fields:
-            stream.write(f"# {' '.join(columns)}\n")
-        stream.writelines(_format_table(columns.values()))
+    spelling = Spelling()
+    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
+        for number, chunk in enumerate(stream):
+            columns = flatten_cloud(path, chunk, spelling)
+            if number == 0 and chunk.fields:
+                file.write(f"# {' '.join(columns)}\n")
+            file.writelines(_format_table(columns.values()))
 
 
 def count_text(path: Path, stream: BinaryIO, size: int) -> int:
@@ -63,50 +81,54 @@ def read_ascii(
     path: Path,
     stream: BinaryIO,
     dtype: np.dtype[Any],
+    chunk_size: int,
     *,
+    start: int,
     num_rows: int,
     size: int,
     num_lines: int,
     skipped: int = 0,
     content: str,
-) -> NDArray[np.void]:
-    """Read rows of a structured type from an ASCII file of ``size`` bytes.
+) -> Iterator[NDArray[np.void]]:
+    """Read rows of a structured type from an ASCII file of ``size`` bytes, chunk by chunk.
 
-    The stream stands behind the header of ``num_lines`` lines; ``skipped`` lines come before the
-    rows, of which the header promises ``num_rows``. ``content`` is what rows are, for messages.
+    The header has ``num_lines`` lines and ends before byte ``start``; ``skipped`` lines come before
+    the rows, of which the header promises ``num_rows``. ``content`` is what rows are, for messages.
     """
-    start = stream.tell()
     # A digit and what separates it from the next; the last may end with the file.
     least = num_rows * _num_columns(dtype) * 2 - 1
     content = f"{num_rows:,} {content}"
     check_promise(path, start, least, content, available=size - start, at_least=True)
+    stream.seek(start)
     lines = (raw.decode("latin-1") for raw in stream)
     first_line = num_lines + 1 + sum(1 for _ in islice(lines, skipped))
-    return _read_table(path, lines, dtype, first_line=first_line, num_rows=num_rows)
+    return _read_table(path, lines, dtype, chunk_size, first_line=first_line, num_rows=num_rows)
 
 
 def _read_table(
     path: Path,
     lines: Iterator[str],
     dtype: np.dtype[Any],
+    chunk_size: int,
     *,
     first_line: int,
     num_rows: int | None = None,
     delimiter: str | None = None,
     comments: str | None = None,
-) -> NDArray[np.void]:
-    """Read rows of numbers, all by default; blank lines do not count.
+) -> Iterator[NDArray[np.void]]:
+    """Read rows of numbers, all by default, so many lines at a time; blank lines do not count.
 
     Lines are read only as far as needed, the first of them being number ``first_line`` of the file.
     """
-    blocks, count, line_number = [np.empty(0, dtype)], 0, first_line
+    count, line_number = 0, first_line
     while num_rows is None or count < num_rows:
-        limit = LINES_AT_ONCE if num_rows is None else min(LINES_AT_ONCE, num_rows - count)
+        limit = chunk_size if num_rows is None else min(chunk_size, num_rows - count)
         block = list(islice(lines, limit))
         if not block:
             break
         rows = _parse(path, block, dtype, line_number, delimiter, comments)
-        blocks.append(rows)
+        if len(rows) > 0:
+            yield rows
         count += len(rows)
         line_number += len(block)
     if num_rows is not None and count < num_rows:
@@ -114,7 +136,8 @@ def _read_table(
             f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got {count:,}; "
             "the file is cut off or its header is wrong, fetch it again."
         )
-    return np.concatenate(blocks)
+    if count == 0:
+        yield np.empty(0, dtype)
 
 
 def _parse(
@@ -160,7 +183,7 @@ def _num_columns(dtype: np.dtype[Any]) -> int:
 
 
 class _Opening(NamedTuple):
-    """What the lines up to the first point say, and that point's line, numbered from one.
+    """What the lines up to the first point say, and the number of that point's line, from one.
 
     Names are None without a header, the delimiter is None for white space.
     """
@@ -168,11 +191,10 @@ class _Opening(NamedTuple):
     names: list[str] | None
     delimiter: str | None
     num_columns: int
-    line: str
     line_number: int
 
 
-def _read_opening(path: Path, lines: Iterator[str]) -> _Opening:
+def _read_opening(path: Path, lines: Iterable[str]) -> _Opening:
     """Read up to the first line of numbers."""
     names: list[str] | None = None
     for number, line in enumerate(lines, start=1):
@@ -200,7 +222,7 @@ def _read_opening(path: Path, lines: Iterator[str]) -> _Opening:
                 "repair or delete this line."
             )
         else:
-            return _Opening(names, delimiter, len(words), f"{text}\n", number)
+            return _Opening(names, delimiter, len(words), number)
     raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
 
 
