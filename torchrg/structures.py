@@ -63,18 +63,29 @@ class Cloud:
         kept = self.coordinates[self.finite]
         if len(kept) == 0:
             return np.zeros(3)
-        low, high = kept.min(axis=0).astype(np.float64), kept.max(axis=0).astype(np.float64)
-        middle = low + (high - low) / 2
-        reach, half_extent = np.abs([low, high]).max(), (high - low).max() / 2
-        return middle if half_extent * 4 < reach else np.zeros(3)
+        return choose_origin(kept.min(axis=0), kept.max(axis=0))
 
     @cached_property
     def points(self) -> Tensor:
         """Coordinates about :attr:`origin`, shape ``(N, 3)``, float32; non-finite rows stay so."""
-        if self.coordinates.dtype == np.float32 and not self.origin.any():
-            return torch.from_numpy(np.ascontiguousarray(self.coordinates))
-        local = self.coordinates.astype(np.float64) - self.origin
-        return torch.from_numpy(local.astype(np.float32))
+        return torch.from_numpy(move_to_origin(self.coordinates, self.origin))
+
+
+def choose_origin(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the origin of a cloud by the corners ``(3,)`` of its box; see :attr:`Cloud.origin`."""
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    middle = low + (high - low) / 2
+    reach, half_extent = np.abs([low, high]).max(), (high - low).max() / 2
+    return middle if half_extent * 4 < reach else np.zeros(3)
+
+
+def move_to_origin(
+    coordinates: NDArray[np.floating], origin: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return coordinates ``(N, 3)`` about an origin; see :attr:`Cloud.points`."""
+    if coordinates.dtype == np.float32 and not origin.any():
+        return np.ascontiguousarray(coordinates)
+    return (coordinates.astype(np.float64) - origin).astype(np.float32)
 
 
 class Neighbors(NamedTuple):
