@@ -79,9 +79,10 @@ def find_adjacency(
 
 def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
     """Return the (at most) 8 nearest neighbours of each point ``(N, n)``, and which count."""
-    nearest = neighbors.indices[:, 1 : _NUM_CONTACTS + 1].long()
+    nearest = neighbors.indices[:, 1 : _NUM_CONTACTS + 1]
     if neighbors.valid is None:
-        return nearest, torch.ones_like(nearest, dtype=torch.bool)
+        everyone = torch.ones((), dtype=torch.bool, device=nearest.device)
+        return nearest, everyone.expand(nearest.shape)
     return nearest, neighbors.valid[:, 1 : _NUM_CONTACTS + 1]
 
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._parallel import CHUNK_SIZE, sequential_operations
+from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_operations
 from torchrg.config import GrowingConfig
 from torchrg.neighbors import canonical_order
 from torchrg.regions.bridges import cut_bridges
@@ -141,16 +141,20 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     elsewhere, -1 for none. Regions smaller than ``min_size`` become :data:`torchrg.UNLABELED`.
     """
     heads = regions.cpu().numpy()
-    placed = np.flatnonzero(heads >= 0)
-    sizes = np.bincount(heads[placed], minlength=len(heads))
-    firsts = np.full(len(heads), len(heads))
-    firsts[heads[placed][::-1]] = placed[::-1]
+    sizes = np.bincount(heads[heads >= 0], minlength=len(heads))
     kept = np.flatnonzero(sizes >= max(min_size, 1))
-    kept = kept[np.lexsort((firsts[kept], -sizes[kept]))]
+    sizes = sizes[kept]
     # The last entry is what a head of -1 finds.
-    numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int64)
+    numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int32)
     numbers[kept] = np.arange(len(kept))
-    return torch.from_numpy(numbers[heads]).to(regions.device)
+    found = numbers[heads]
+    firsts = np.full(len(kept) + 1, len(heads))
+    for rows in reversed(chunks_of(len(heads), ROWS_AT_ONCE)):
+        firsts[found[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
+    order = np.lexsort((firsts[:-1], -sizes))
+    ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
+    ranks[order] = np.arange(len(kept))
+    return torch.from_numpy(ranks[found]).to(regions.device)
 
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:

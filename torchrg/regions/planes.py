@@ -15,9 +15,12 @@ from torchrg.errors import ConfigError
 from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
-from torchrg.regions.measures import Rectangles, covered_areas, fit_rectangles, trace_outline
+from torchrg.regions.measures import covered_areas, fit_rectangles, trace_outline
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
+
+_POINTS_AT_ONCE = 2**20
+"""Points of regions that are measured together: at some 250 bytes each."""
 
 _BISQUARE_CUT = 4.685
 """Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
@@ -115,16 +118,19 @@ def summarize_planes(
         "summarize_planes", points=(points, "N 3"), normals=(normals, "N 3"), labels=(labels, "N")
     )
     check_floating("summarize_planes", points=points, normals=normals)
-    segments = Segments(labels)
-    fit = fit_planes(segments, points, normals)
+    groups = Segments(labels).split(_POINTS_AT_ONCE)
+    fits, squares = zip(*(_fit(points, normals, some) for some in groups), strict=True)
+    fit = FittedPlanes(*(torch.cat(parts) for parts in zip(*fits, strict=True)))
     first, second = _plane_axes(fit)
-    places, centers = segments.take_columns(points), segments.spread_columns(fit.center)
-    centered = [place - center for place, center in zip(places, centers, strict=True)]
-    u, v = (_sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
 
-    def measure() -> tuple[Rectangles, Tensor, Tensor]:
-        boxes = fit_rectangles(segments, u, v)
-        return boxes, *covered_areas(segments, u, v, boxes)
+    def measure() -> list[_Measures]:
+        found, start = [], 0
+        for some in groups:
+            rows = slice(start, start + len(some.counts))
+            frame = (fit.center[rows], first[rows], second[rows])
+            found.append(_measure(points, some, frame, outline=outline))
+            start = rows.stop
+        return found
 
     def meet() -> PlaneAdjacency | None:
         if neighbors is None:
@@ -133,9 +139,11 @@ def summarize_planes(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
 
-    (boxes, area, width), found = run_beside(measure, meet, points.device)
-    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
-    axes = boxes.directions @ torch.stack([first, second], dim=1)
+    measures, found = run_beside(measure, meet, points.device)
+    mean, area, sides, directions, middle = (
+        torch.cat(parts) for parts in list(zip(*measures, strict=True))[:5]
+    )
+    axes = directions @ torch.stack([first, second], dim=1)
 
     def own(values: Tensor) -> Tensor:
         return values.to(points.dtype)
@@ -146,21 +154,57 @@ def summarize_planes(
         centroid=own(fit.center + mean),
         area=own(area),
         count=fit.num_points,
-        rms=own(segments.mean(fit.residuals * fit.residuals).sqrt()),
-        extent=own(boxes.sides),
+        rms=own(torch.cat(squares).sqrt()),
+        extent=own(sides),
         axes=own(axes),
-        center=own(fit.center + (boxes.center[:, None] @ axes).squeeze(1)),
+        center=own(fit.center + (middle[:, None] @ axes).squeeze(1)),
         curved=fit.curved,
     )
     if up is not None:
         planes = planes._replace(kind=_classify(planes, _direction(up, points)))
     if outline:
-        frame = (fit.center, first, second)
-        planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
+        planes = planes._replace(outline=sum((part.outline for part in measures), ()))
     if found is not None:
         lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
     return planes
+
+
+def _fit(points: Tensor, normals: Tensor, segments: Segments) -> tuple[FittedPlanes, Tensor]:
+    """Return planes without the residuals of the points, and the mean square of these."""
+    fit = fit_planes(segments, points, normals)
+    squares = segments.mean(fit.residuals * fit.residuals)
+    return fit._replace(residuals=fit.residuals[:0]), squares
+
+
+class _Measures(NamedTuple):
+    """What is measured in the planes of some regions.
+
+    The mean of the points about the center ``(M, 3)``, the area ``(M,)``, sides, directions and
+    middle of the rectangles as :class:`torchrg.regions.measures.Rectangles` has them, and outlines if asked for.
+    """
+
+    mean: Tensor
+    area: Tensor
+    sides: Tensor
+    directions: Tensor
+    middle: Tensor
+    outline: tuple[tuple[Tensor, ...], ...]
+
+
+def _measure(
+    points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor, Tensor], *, outline: bool
+) -> _Measures:
+    """Measure regions in their planes, given by centers and two directions, each ``(M, 3)``."""
+    center, first, second = frame
+    centered = _centered(segments, points.unbind(dim=1), center)
+    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
+    u, v = (_along(segments, centered, axis) for axis in (first, second))
+    del centered
+    boxes = fit_rectangles(segments, u, v)
+    area, width = covered_areas(segments, u, v, boxes)
+    rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
+    return _Measures(mean, area, boxes.sides, boxes.directions, boxes.center, rings)
 
 
 def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
@@ -203,24 +247,23 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
     columns = segments.take_columns(normals)
-    shares, directions = eigh3_of_few(_covariances(segments, columns, torch.ones_like(columns[0])))
+    weights = torch.ones_like(columns[0])
+    shares, directions = eigh3_of_few(_covariances(segments, columns, weights))
+    del columns
     # The direction that the normals of a region share, signs aside, and their angle to it.
     usual = directions[:, :, 2]
     spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
     origin = segments.first(points).double()
-    starts = segments.spread_columns(origin)
-    local = [x - start for x, start in zip(segments.take_columns(points), starts, strict=True)]
+    local = _centered(segments, points.unbind(dim=1), origin)
     resolution = coordinate_resolution(segments.first(points)).double()
-    weights = torch.ones_like(local[0])
     for last in range(_NUM_FITS):
         total = segments.sum(weights)
         mean = torch.stack([segments.sum(x * weights) / total for x in local], dim=1)
-        middle = segments.spread_columns(mean)
-        centered = [x - m for x, m in zip(local, middle, strict=True)]
+        centered = [x - segments.spread(m) for x, m in zip(local, mean.unbind(dim=1), strict=True)]
         covariance = _covariances(segments, centered, weights)
         variances, axes = eigh3_of_few(covariance)
         normal = _with_sign(_plane_normals(variances, axes, usual))
-        residuals = _sum_of_products(centered, segments.spread_columns(normal))
+        residuals = _along(segments, centered, normal)
         thickness = MAD_FACTOR * segments.median(residuals.abs())
         if last == _NUM_FITS - 1:
             break
@@ -233,10 +276,21 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     return FittedPlanes(normal, center, along, covariance, thickness, residuals, sizes, curved)
 
 
-def _sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
-    """Return the scalar products of vectors given by columns."""
-    (a, b, c), (x, y, z) = first, second
-    return a * x + b * y + c * z
+def _centered(
+    segments: Segments, columns: Sequence[Tensor], centers: Tensor
+) -> list[Tensor]:
+    """Return the columns of points about the center ``(M, 3)`` of their region, in float64."""
+    pairs = zip(columns, centers.unbind(dim=1), strict=True)
+    return [segments.take(column).double() - segments.spread(center) for column, center in pairs]
+
+
+def _along(segments: Segments, columns: Sequence[Tensor], axes: Tensor) -> Tensor:
+    """Return coordinates of points, given by columns, along the axis ``(M, 3)`` of their region."""
+    total = torch.zeros_like(columns[0])
+    # Products and sums apart: their rounding must not depend on where a block of memory ends.
+    for column, part in zip(columns, axes.unbind(dim=1), strict=True):
+        total += column * segments.spread(part)
+    return total
 
 
 def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:

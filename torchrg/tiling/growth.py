@@ -10,8 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.regions.edges import EdgeLists
 from torchrg.regions.growth import first_to_reach
+from torchrg.tiling.parts import Part
 
 
 class Condensed(NamedTuple):
@@ -28,46 +30,58 @@ class Condensed(NamedTuple):
     targets: NDArray[np.int64]
 
 
-def condense(edges: EdgeLists, first_row: int) -> Condensed:
+def condense(edges: EdgeLists, part: Part) -> Condensed:
     """Shrink points of a tile that reach one another to one node.
 
-    The edges are those of the points of the tile, which begins at ``first_row``; their targets are
-    rows of the whole cloud. Equal edges are left once.
+    The edges are those of the points of a part; those that leave the tile stay. Equal edges are
+    left once.
 
     Example:
-        >>> edges = EdgeLists(np.array([0, 1, 3, 4]), np.array([11, 10, 12, 7], dtype=np.int32))
-        >>> found = condense(edges, 10)
-        >>> found.components[0] == found.components[1], found.targets.tolist()
-        (np.True_, [12, 7])
+        >>> import torch
+        >>> from torchrg.structures import Neighbors
+        >>> edges = EdgeLists(np.array([0, 1, 3, 4]), np.array([1, 0, 2, 2], dtype=np.int32))
+        >>> rows, lists = torch.tensor([10, 11, 17]), Neighbors(torch.zeros(3, 1))
+        >>> found = condense(edges, Part(rows, slice(0, 2), lists))
+        >>> found.components.tolist(), found.targets.tolist()
+        ([0, 0], [17])
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    num_points = len(edges.starts) - 1
-    targets = edges.targets[: edges.starts[-1]] - np.int32(first_row)
-    is_inner = (targets >= 0) & (targets < num_points)
-    before = np.zeros(len(targets) + 1, dtype=np.int64)
-    np.cumsum(is_inner, out=before[1:])
-    inner = targets[is_inner]
+    first, num_points = part.own.start, part.own.stop - part.own.start
+    starts = edges.starts[first : part.own.stop + 1]
+    begin = starts[0]
+    inner = np.empty(starts[-1] - begin, dtype=np.int32)
+    chunks = chunks_of(num_points, ROWS_IN_CACHE)
+
+    def edges_of(rows: slice) -> tuple[slice, NDArray[np.int64], NDArray[np.int32]]:
+        """Return the places of the edges of some points, their sources and their targets."""
+        places = slice(starts[rows.start] - begin, starts[rows.stop] - begin)
+        counts = np.diff(starts[rows.start : rows.stop + 1])
+        sources = np.repeat(np.arange(rows.start, rows.stop), counts)
+        return places, sources, edges.targets[places.start + begin : places.stop + begin] - first
+
+    for rows in chunks:
+        places, sources, targets = edges_of(rows)
+        # An edge to itself changes nothing.
+        inner[places] = np.where((targets >= 0) & (targets < num_points), targets, sources)
     weights = np.broadcast_to(np.float64(1), len(inner))
-    starts = before[edges.starts].astype(np.int32)
-    graph = csr_array((weights, inner, starts), shape=(num_points, num_points))
+    graph = csr_array((weights, inner, starts - begin), shape=(num_points, num_points))
     number, components = connected_components(graph, directed=True, connection="strong")
-    sources = np.repeat(components, np.diff(edges.starts))
     # All points of a component do as target: the last one serves for all.
-    last = np.zeros(number, dtype=np.int64)
+    last = np.zeros(number, dtype=np.int32)
     last[components] = np.arange(num_points)
-    reached = components[inner]
-    targets[is_inner] = last[reached]
-    leaves = ~is_inner
-    leaves[is_inner] = sources[is_inner] != reached
-    places = np.stack([sources[leaves], targets[leaves]])
-    order = np.lexsort(places[::-1])
-    places = places[:, order]
-    is_new = np.ones(len(order), dtype=bool)
-    is_new[1:] = (places[:, 1:] != places[:, :-1]).any(axis=0)
-    sources, targets = places[:, is_new]
-    return Condensed(components, sources, targets.astype(np.int64) + first_row)
+    found = []
+    for rows in chunks:
+        places, sources, targets = edges_of(rows)
+        leaves = (targets != inner[places]) | (components[sources] != components[inner[places]])
+        sources, targets = components[sources[leaves]], targets[leaves]
+        is_inner = (targets >= 0) & (targets < num_points)
+        targets[is_inner] = last[components[targets[is_inner]]]
+        found.append(sources.astype(np.int64) * len(part.rows) + (targets + first))
+    keys = np.unique(np.concatenate(found))
+    rows_reached = part.rows.numpy()[keys % len(part.rows)]
+    return Condensed(components, (keys // len(part.rows)).astype(np.int32), rows_reached)
 
 
 def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -164,55 +164,55 @@ def _begin_edges(files: TileFiles, config: PipelineConfig) -> None:
     num_points = files.known("order")["num_points"]
     files.create("counts", np.int32, (num_points,))
     files.create("components", np.int32, (num_points,))
+    files.create("reach", np.float32, (num_points,))
     files.note("limit", value=float(limit))
 
 
 def _growing_order(files: TileFiles, config: PipelineConfig) -> tuple[NDArray[np.int32], Tensor]:
     """Return the points that may join a region by ascending curvature, and its limit."""
-    curvature = files.load("curvature")
-    valid = files.load("valid") & curvature.isfinite() & files.load("normals").isfinite().all(dim=1)
-    return growing_order(curvature, valid, config.growing)
+    return growing_order(files.load("curvature"), _growing_points(files), config.growing)
+
+
+def _growing_points(files: TileFiles) -> Tensor:
+    """Return which points may join a region."""
+    finite = files.load("curvature").isfinite() & files.map("normals").isfinite().all(dim=1)
+    return finite & files.load("valid")
 
 
 def _find_edges(files: TileFiles, tile: slice, number: int, config: PipelineConfig) -> None:
     part = cut_part(files.map("neighbors"), tile, _GROWTH_STEPS)
-    cloud = _growing_cloud(files, config, part.neighbors, part.rows)
+    points, normals, curvature, valid, residual_rms = (
+        files.map(name)[part.rows]
+        for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
+    )
+    cloud = checked_cloud(
+        config.growing, points, normals, curvature, part.neighbors, valid, None, residual_rms
+    )
+    if cloud.reach is not None:
+        files.write("reach", tile.start, cloud.reach[part.own])
     limit = torch.tensor(files.known("limit")["value"], dtype=cloud.curvature.dtype)
     if not config.growing.is_order_free:
         found = find_coded_edges(cloud, config.growing, limit, chunk_size=config.chunk_size)
-        edges = _own_edges(found, part, coded=True)
+        edges = _own_edges(found, part)
         files.save(f"edges_{number}", edges.targets)
         files.write("counts", tile.start, np.diff(edges.starts))
         return
     found, others = find_edges(cloud, config.growing, limit, spare=0, chunk_size=config.chunk_size)
-    condensed = condense(_own_edges(found, part, coded=False), tile.start)
+    condensed = condense(found, part)
     files.write("components", tile.start, condensed.components)
     files.save(f"sources_{number}", condensed.sources)
     files.save(f"targets_{number}", condensed.targets)
-    others = _own_edges(others, part, coded=True)
+    others = _own_edges(others, part)
     files.save(f"edges_{number}", others.targets)
     files.write("counts", tile.start, np.diff(others.starts))
 
 
-def _growing_cloud(
-    files: TileFiles, config: PipelineConfig, neighbors: Neighbors, rows: Tensor | slice
-) -> GrowingCloud:
-    """Return what growth reads of some points."""
-    points, normals, curvature, valid, residual_rms = (
-        files.map(name)[rows] for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
-    )
-    return checked_cloud(
-        config.growing, points, normals, curvature, neighbors, valid, None, residual_rms
-    )
-
-
-def _own_edges(edges: EdgeLists, part: Part, *, coded: bool) -> EdgeLists:
-    """Return the edges of the points of the tile, with targets in the whole cloud."""
+def _own_edges(edges: EdgeLists, part: Part) -> EdgeLists:
+    """Return the coded edges of the points of the tile, with targets in the whole cloud."""
     starts = edges.starts[part.own.start : part.own.stop + 1]
     targets = edges.targets[starts[0] : starts[-1]]
     rows = part.rows.numpy().astype(np.int32)
-    whole = rows[targets >> 1] * 2 + (targets & 1) if coded else rows[targets]
-    return EdgeLists(starts - starts[0], whole)
+    return EdgeLists(starts - starts[0], rows[targets >> 1] * 2 + (targets & 1))
 
 
 TILE_STAGES = {
@@ -227,7 +227,14 @@ def grow_tiles(files: TileFiles, config: PipelineConfig) -> None:
     """Label the points of the whole cloud from the edges of its tiles."""
     heads = _grow_in_any_order(files, config) if config.growing.is_order_free else _grow(files, config)
     with released(files.path("neighbors")) as indices:
-        cloud = _growing_cloud(files, config, Neighbors(indices), slice(None))
+        cloud = GrowingCloud(
+            files.load("cloud"),
+            files.load("normals"),
+            files.load("curvature"),
+            Neighbors(indices),
+            _growing_points(files),
+            reach=None if config.growing.plane_reach is None else files.load("reach"),
+        )
         labels = settle_regions(cloud, torch.from_numpy(heads), config.growing, config.chunk_size)
     files.save("labels", labels)
     files.note("regions")
