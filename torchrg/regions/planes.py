@@ -276,9 +276,7 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     return FittedPlanes(normal, center, along, covariance, thickness, residuals, sizes, curved)
 
 
-def _centered(
-    segments: Segments, columns: Sequence[Tensor], centers: Tensor
-) -> list[Tensor]:
+def _centered(segments: Segments, columns: Sequence[Tensor], centers: Tensor) -> list[Tensor]:
     """Return the columns of points about the center ``(M, 3)`` of their region, in float64."""
     pairs = zip(columns, centers.unbind(dim=1), strict=True)
     return [segments.take(column).double() - segments.spread(center) for column, center in pairs]

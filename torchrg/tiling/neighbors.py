@@ -1,15 +1,15 @@
 """Exact nearest neighbours of one tile of a cloud that lies on disk.
 
-A tile is a range of rows in canonical order. A search among its own points bounds how far away the
-neighbours can be; boxes that reach across the border are searched again, among all points within
-that bound. Candidates stay in canonical order, so ties come out as in memory.
+A tile is a range of rows in canonical order. How far away neighbours can be is known from a few of
+its points; among all points within that distance of its boxes the search is that of a whole cloud.
+Candidates stay in canonical order, so ties come out as in memory.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of
-from torchrg.neighbors import search_knn
+from torchrg.neighbors.knn import search_rows
 from torchrg.tiling.boxes import Boxes, farthest_neighbor, near_boxes
 
 _LEAST_CANDIDATES = 65536
@@ -38,40 +38,49 @@ def search_tile(
         >>> search_tile(points, find_boxes(points, 1), slice(3, 5), 3).tolist()
         [[3, 2, 4], [4, 3, 5]]
     """
-    own = np.array(points[tile])
-    first = int(np.searchsorted(boxes.starts, tile.start))
-    numbers = np.arange(first, int(np.searchsorted(boxes.starts, tile.stop)))
-    if len(own) < k:
-        found = np.empty((len(own), k), dtype=np.int32)
-        reach = np.array([farthest_neighbor(boxes, box, k) for box in numbers])
-    else:
-        local = search_knn(own, k, canonical=True).indices.numpy()
-        far = own[local[:, -1]].astype(np.float64) - own
-        starts = boxes.starts[numbers] - tile.start
-        reach = np.maximum.reduceat(np.sqrt((far * far).sum(axis=1)), starts)
-        found = local + np.int32(tile.start)
-    is_open = np.full(len(numbers), len(own) < k)
-    for some, near, within in near_boxes(boxes, numbers, reach):
-        is_outside = (near < numbers[0]) | (near > numbers[-1])
-        is_open[some] |= within[:, is_outside].any(axis=1)
-    waiting = [np.flatnonzero(is_open)] if is_open.any() else []
-    most = max(_CANDIDATES * len(own), _LEAST_CANDIDATES) if most is None else most
+    first, last = np.searchsorted(boxes.starts, (tile.start, tile.stop))
+    reach = _reach_of_boxes(np.array(points[tile]), boxes, slice(first, last), k)
+    found = np.empty((tile.stop - tile.start, k), dtype=np.int32)
+    most = max(_CANDIDATES * len(found), _LEAST_CANDIDATES) if most is None else most
+    waiting = [slice(first, last)]
     while waiting:
         some = waiting.pop()
-        rows = _rows_near(boxes, numbers[some], reach[some])
-        if len(rows) > most and len(some) > 1:
-            waiting += np.array_split(some, 2)
+        numbers = np.arange(some.start, some.stop)
+        rows = _rows_near(boxes, numbers, reach[numbers - first])
+        if len(rows) > most and len(numbers) > 1:
+            middle = (some.start + some.stop) // 2
+            waiting += [slice(some.start, middle), slice(middle, some.stop)]
             continue
-        asked = _rows_of(boxes, numbers[some])
         if len(rows) > most:
-            bound = np.array([farthest_neighbor(boxes, int(numbers[some[0]]), k)])
-            rows = _rows_near(boxes, numbers[some], np.minimum(reach[some], bound))
+            bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, some.start, k))
+            rows = _rows_near(boxes, numbers, bound)
+        asked = slice(boxes.starts[some.start], boxes.starts[some.stop])
+        into = slice(asked.start - tile.start, asked.stop - tile.start)
         if len(rows) > most:
-            found[asked - tile.start] = _search_each(points, rows, asked, k)
+            found[into] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
             continue
-        local = search_knn(points[rows], k, canonical=True).indices.numpy()
-        found[asked - tile.start] = rows[local[np.searchsorted(rows, asked)]]
+        start = int(np.searchsorted(rows, asked.start))
+        local = slice(start, start + asked.stop - asked.start)
+        found[into] = rows.astype(np.int32)[search_rows(points[rows], local, k)]
     return found
+
+
+def _reach_of_boxes(
+    own: NDArray[np.floating], boxes: Boxes, numbers: slice, k: int
+) -> NDArray[np.float64]:
+    """Return distances within which all points of each box of a tile have ``k`` neighbours."""
+    from scipy.spatial import cKDTree
+
+    if len(own) < k:
+        return np.array(
+            [farthest_neighbor(boxes, i, k) for i in range(numbers.start, numbers.stop)]
+        )
+    firsts = own[boxes.starts[numbers] - boxes.starts[numbers.start]]
+    tree = cKDTree(own, balanced_tree=False, compact_nodes=False)
+    sides = boxes.high[numbers] - boxes.low[numbers]
+    # Any other point of the box is at most its diagonal away from the first.
+    reach: NDArray[np.float64] = tree.query(firsts, [k])[0][:, 0] + np.linalg.norm(sides, axis=1)
+    return reach
 
 
 def _rows_of(boxes: Boxes, numbers: NDArray[np.int64]) -> NDArray[np.int64]:

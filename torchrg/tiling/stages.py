@@ -4,9 +4,7 @@ Each reads the arrays of the stage before it and writes its own. A tile is worke
 that serve clouds in memory too, on the tile with the points around it that these look at.
 """
 
-import functools
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +32,6 @@ from torchrg.structures import (
     UNLABELED,
     Cloud,
     Neighbors,
-    NormalFit,
     PlaneAdjacency,
     Planes,
     choose_origin,
@@ -225,7 +222,9 @@ TILE_STAGES = {
 
 def grow_tiles(files: TileFiles, config: PipelineConfig) -> None:
     """Label the points of the whole cloud from the edges of its tiles."""
-    heads = _grow_in_any_order(files, config) if config.growing.is_order_free else _grow(files, config)
+    heads = (
+        _grow_in_any_order(files, config) if config.growing.is_order_free else _grow(files, config)
+    )
     with released(files.path("neighbors")) as indices:
         cloud = GrowingCloud(
             files.load("cloud"),
