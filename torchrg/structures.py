@@ -54,38 +54,42 @@ class Cloud:
 
     @cached_property
     def origin(self) -> NDArray[np.float64]:
-        """Origin of :attr:`points`, shape ``(3,)``: zero, or the middle of a far cloud's box.
-
-        A cloud is far when moving it to its middle makes its largest coordinate less than a
-        quarter as large; a near cloud is left where it is, so that float32 files keep their
-        coordinates bit for bit.
-        """
+        """Origin of :attr:`points`, shape ``(3,)``: that of :func:`origin_of_box`."""
         kept = self.coordinates[self.finite]
         if len(kept) == 0:
             return np.zeros(3)
-        return choose_origin(kept.min(axis=0), kept.max(axis=0))
+        return origin_of_box(kept.min(axis=0), kept.max(axis=0))
 
     @cached_property
     def points(self) -> Tensor:
         """Coordinates about :attr:`origin`, shape ``(N, 3)``, float32; non-finite rows stay so."""
-        return torch.from_numpy(move_to_origin(self.coordinates, self.origin))
+        return self.about(self.origin)
+
+    def about(self, origin: NDArray[np.float64]) -> Tensor:
+        """Return the coordinates about an origin of shape ``(3,)``, float32, shape ``(N, 3)``."""
+        if self.coordinates.dtype == np.float32 and not origin.any():
+            return torch.from_numpy(np.ascontiguousarray(self.coordinates))
+        local = self.coordinates.astype(np.float64) - origin
+        return torch.from_numpy(local.astype(np.float32))
 
 
-def choose_origin(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the origin of a cloud by the corners ``(3,)`` of its box; see :attr:`Cloud.origin`."""
+def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return about what a cloud with this box is kept in float32: zero, or the middle if it is far.
+
+    A cloud is far when moving it to its middle makes its largest coordinate less than a quarter as
+    large; a near cloud is left where it is, so that float32 files keep their coordinates bit for
+    bit. A box that is not finite, as that of no points, is near.
+
+    Example:
+        >>> origin_of_box(np.array([10.0, 10.0, 0.0]), np.array([12.0, 12.0, 3.0])).tolist()
+        [11.0, 11.0, 1.5]
+    """
     low, high = low.astype(np.float64), high.astype(np.float64)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return np.zeros(3)
     middle = low + (high - low) / 2
     reach, half_extent = np.abs([low, high]).max(), (high - low).max() / 2
     return middle if half_extent * 4 < reach else np.zeros(3)
-
-
-def move_to_origin(
-    coordinates: NDArray[np.floating], origin: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Return coordinates ``(N, 3)`` about an origin; see :attr:`Cloud.points`."""
-    if coordinates.dtype == np.float32 and not origin.any():
-        return np.ascontiguousarray(coordinates)
-    return (coordinates.astype(np.float64) - origin).astype(np.float32)
 
 
 class Neighbors(NamedTuple):

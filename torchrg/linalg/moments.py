@@ -118,7 +118,8 @@ class Segments:
         They are numbered from 0 in each part. At least one part is returned.
         """
         ends = self.counts.cumsum(0).tolist()
-        parts, region, row = [], 0, 0
+        parts: list[Segments] = []
+        region = row = 0
         while region < len(ends) or not parts:
             last = max(bisect.bisect_right(ends, row + most), min(region + 1, len(ends)))
             part = Segments.__new__(Segments)

@@ -181,7 +181,8 @@ class _Measures(NamedTuple):
     """What is measured in the planes of some regions.
 
     The mean of the points about the center ``(M, 3)``, the area ``(M,)``, sides, directions and
-    middle of the rectangles as :class:`torchrg.regions.measures.Rectangles` has them, and outlines if asked for.
+    middle of the rectangles as :class:`torchrg.regions.measures.Rectangles` has them, and outlines
+    if asked for.
     """
 
     mean: Tensor

@@ -104,7 +104,7 @@ class TileFiles:
             shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
             row_bytes = int(np.prod(shape[1:])) * dtype.itemsize
             stream.seek(start * row_bytes, os.SEEK_CUR)
-            stream.write(memoryview(np.ascontiguousarray(rows, dtype=dtype)).cast("B"))
+            stream.write(np.ascontiguousarray(rows, dtype=dtype).data)
 
     def save(self, name: str, values: NDArray[Any] | Tensor) -> None:
         """Write a whole array."""
@@ -160,7 +160,7 @@ class TileFiles:
 def released(path: Path) -> Iterator[Tensor]:
     """Give an array on disk of which only what was read last stays in memory."""
     values = np.load(path, mmap_mode="c")
-    pages: mmap.mmap = values._mmap  # type: ignore[attr-defined]  # noqa: SLF001 - no public way
+    pages: mmap.mmap = values._mmap  # noqa: SLF001 - no public way
     done = Event()
 
     def release() -> None:

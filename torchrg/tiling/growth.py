@@ -1,8 +1,8 @@
 """Growth of regions from the edges of tiles: exact, without all edges in memory.
 
 Where growth is free of order, the first seed that reaches a point has it. Points that reach one
-another have the same: within a tile such components shrink to one node each, and what is left of
-the graph fits into memory. Otherwise the edges lie in one file, of which growth reads what it needs.
+another have the same: within a tile such components shrink to one node each, and what is left
+of the graph fits into memory. Otherwise the edges lie in one file, which growth reads in parts.
 """
 
 from typing import NamedTuple
@@ -106,4 +106,5 @@ def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[
     heads = first_to_reach(EdgeLists(starts, room), nodes, int(offsets[-1]))
     seed_of = np.full(int(offsets[-1]) + 1, -1, dtype=np.int32)
     seed_of[nodes] = seeds[places]
-    return seed_of[heads][node_of]
+    found: NDArray[np.int32] = seed_of[heads][node_of]
+    return found

@@ -34,8 +34,7 @@ from torchrg.structures import (
     Neighbors,
     PlaneAdjacency,
     Planes,
-    choose_origin,
-    move_to_origin,
+    origin_of_box,
 )
 from torchrg.tiling.boxes import Boxes, find_boxes
 from torchrg.tiling.files import TileFiles, released
@@ -56,27 +55,24 @@ _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 def read_points(files: TileFiles, chunks: Iterable[Cloud]) -> None:
     """Write the points of a cloud that comes in chunks, about the origin that a whole one has."""
     raw = files.folder / "coordinates.raw"
-    corners, num_points, narrow = [], 0, True
+    corners, num_points, narrow = [np.full(3, np.inf), np.full(3, -np.inf)], 0, True
     with files.writing(raw), raw.open("wb") as stream:
         for chunk in chunks:
             coordinates = chunk.coordinates
             num_points += len(coordinates)
             narrow &= coordinates.dtype == np.float32
-            stream.write(memoryview(coordinates.astype(np.float64)).cast("B"))
+            stream.write(coordinates.astype(np.float64).tobytes())
             if chunk.finite.any():
                 kept = coordinates[chunk.finite]
                 corners += [kept.min(axis=0), kept.max(axis=0)]
-    origin = np.zeros(3)
-    if corners:
-        ends = np.array(corners)
-        origin = choose_origin(ends.min(axis=0), ends.max(axis=0))
+    origin = origin_of_box(np.min(corners, axis=0), np.max(corners, axis=0))
     files.create("points", np.float32, (num_points, 3))
     dtype = np.float32 if narrow else np.float64
     step = 2**20
     for start in range(0, num_points, step):
         count = min(step, num_points - start) * 3
         some = np.fromfile(raw, np.float64, count, offset=start * 24).reshape(-1, 3)
-        files.write("points", start, move_to_origin(some.astype(dtype), origin))
+        files.write("points", start, Cloud(some.astype(dtype)).about(origin))
     raw.unlink()
     files.note("points", num_points=num_points, origin=origin.tolist())
 
@@ -150,10 +146,9 @@ def _estimate(files: TileFiles, tile: slice, number: int, config: PipelineConfig
     part = cut_part(files.map("neighbors"), tile, STEPS[method])
     points = files.map("cloud")[part.rows]
     fit = ESTIMATORS[method](points, part.neighbors, config.normals, config.chunk_size)
-    if fit.sharp is None:
-        fit = fit._replace(sharp=torch.zeros_like(fit.valid))
-    for name, values in zip(_FIT, fit.each(lambda values: values[part.own]), strict=True):
-        files.write(name, tile.start, values)
+    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
+    for name, values in zip(_FIT, (*fit[:4], sharp), strict=True):
+        files.write(name, tile.start, values[part.own])
 
 
 def _begin_edges(files: TileFiles, config: PipelineConfig) -> None:
@@ -176,7 +171,7 @@ def _growing_points(files: TileFiles) -> Tensor:
     return finite & files.load("valid")
 
 
-def _find_edges(files: TileFiles, tile: slice, number: int, config: PipelineConfig) -> None:
+def _connect(files: TileFiles, tile: slice, number: int, config: PipelineConfig) -> None:
     part = cut_part(files.map("neighbors"), tile, _GROWTH_STEPS)
     points, normals, curvature, valid, residual_rms = (
         files.map(name)[part.rows]
@@ -215,16 +210,15 @@ def _own_edges(edges: EdgeLists, part: Part) -> EdgeLists:
 TILE_STAGES = {
     "neighbors": TileStage(_begin_neighbors, _search),
     "normals": TileStage(_begin_normals, _estimate),
-    "edges": TileStage(_begin_edges, _find_edges),
+    "edges": TileStage(_begin_edges, _connect),
 }
 """The stages that run tile by tile, in their order."""
 
 
 def grow_tiles(files: TileFiles, config: PipelineConfig) -> None:
     """Label the points of the whole cloud from the edges of its tiles."""
-    heads = (
-        _grow_in_any_order(files, config) if config.growing.is_order_free else _grow(files, config)
-    )
+    grow = _grow_in_any_order if config.growing.is_order_free else _grow
+    heads = grow(files, config)
     with released(files.path("neighbors")) as indices:
         cloud = GrowingCloud(
             files.load("cloud"),
