@@ -19,7 +19,8 @@ from torchrg.tiling.files import TileFiles
 from torchrg.tiling.stages import (
     TILE_STAGES,
     TileTask,
-    grow_tiles,
+    finish_regions,
+    grow_regions,
     load_planes,
     read_points,
     restore_results,
@@ -29,7 +30,7 @@ from torchrg.tiling.stages import (
 
 __all__ = ["STAGES", "TILE_SIZE", "TileFiles", "TileTask", "run_in_turn", "segment_tiles"]
 
-STAGES = ("points", *TILE_STAGES, "regions", "planes", "results")
+STAGES = ("points", "order", *TILE_STAGES, "growth", "regions", "planes", "results")
 """Names of the stages in their order."""
 
 TILE_SIZE = 500_000
@@ -112,8 +113,7 @@ def segment_tiles(
             step()
 
     once("points", lambda: read_points(files, chunks))
-    if files.facts("order") is None:
-        sort_points(files, config, tile_size)
+    once("order", lambda: sort_points(files, config, tile_size))
     numbers = range(len(files.known("order")["bounds"]) - 1)
     for stage, work in TILE_STAGES.items():
         if files.facts(f"{stage} begun") is None:
@@ -125,7 +125,8 @@ def segment_tiles(
         for done, task in enumerate(run(tasks), len(numbers) - len(left) + 1):
             files.note(f"{stage} {task.number}")
             begin(stage, done, len(numbers))
-    once("regions", lambda: grow_tiles(files, config))
+    once("growth", lambda: grow_regions(files, config))
+    once("regions", lambda: finish_regions(files, config))
     once("planes", lambda: tabulate_planes(files, config))
     once("results", lambda: restore_results(files))
     labels, normals, curvature, sharp, valid = (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import FormatError
-from torchrg.io.files import atomic_path
+from torchrg.io.files import atomic_path, remove_leftovers
 
 _RECORD = "tiles.json"
 """Says of which cloud and settings the arrays are, and which steps are done."""
@@ -114,10 +114,7 @@ class TileFiles:
 
     def map(self, name: str) -> Tensor:
         """Return an array whose pages are read when they are needed; changes stay in memory."""
-        path = self.path(name)
-        if 0 in np.load(path, mmap_mode="r").shape:
-            return torch.from_numpy(np.load(path))
-        return torch.from_numpy(np.load(path, mmap_mode="c"))
+        return torch.from_numpy(_map(self.path(name)))
 
     def load(self, name: str) -> Tensor:
         """Return an array in memory."""
@@ -130,9 +127,10 @@ class TileFiles:
 
     def remove_all(self) -> None:
         """Remove everything of this run, and the folder if nothing else is in it."""
-        for path in self.folder.glob("*.npy"):
-            path.unlink(missing_ok=True)
-        (self.folder / _RECORD).unlink(missing_ok=True)
+        remove_leftovers(self.folder)
+        for pattern in ("*.npy", "*.raw", "*.pt", _RECORD):
+            for path in self.folder.glob(pattern):
+                path.unlink()
         if not any(self.folder.iterdir()):
             self.folder.rmdir()
 
@@ -159,8 +157,11 @@ class TileFiles:
 @contextmanager
 def released(path: Path) -> Iterator[Tensor]:
     """Give an array on disk of which only what was read last stays in memory."""
-    values = np.load(path, mmap_mode="c")
-    pages: mmap.mmap = values._mmap  # noqa: SLF001 - no public way
+    values = _map(path)
+    if len(values) == 0:
+        yield torch.from_numpy(values)
+        return
+    pages: mmap.mmap = values._mmap  # type: ignore[attr-defined]  # noqa: SLF001 - no public way
     done = Event()
 
     def release() -> None:
@@ -174,3 +175,12 @@ def released(path: Path) -> Iterator[Tensor]:
     finally:
         done.set()
         thread.join()
+
+
+def _map(path: Path) -> NDArray[Any]:
+    """Return an array whose pages are read when they are needed; an empty one has none."""
+    try:
+        values: NDArray[Any] = np.load(path, mmap_mode="c")
+    except ValueError:
+        values = np.load(path)
+    return values

@@ -86,6 +86,8 @@ def condense(edges: EdgeLists, part: Part) -> Condensed:
 
 def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return for each point of all tiles the first of the seeds that reaches it, -1 for none."""
+    if not parts:
+        return np.empty(0, dtype=np.int32)
     counts = [int(part.components.max(initial=-1)) + 1 for part in parts]
     offsets = np.cumsum([0, *counts])
     node_of = np.concatenate(

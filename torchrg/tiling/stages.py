@@ -4,6 +4,7 @@ Each reads the arrays of the stage before it and writes its own. A tile is worke
 that serve clouds in memory too, on the tile with the points around it that these look at.
 """
 
+import io
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +50,7 @@ _ROW_BYTES = 150
 """Of a point on disk beside its neighbours and edges: coordinates, normals, results."""
 
 _FIT = ("normals", "curvature", "valid", "residual_rms", "sharp")
+_PLANES = "planes.pt"
 _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 
 
@@ -82,7 +84,7 @@ def sort_points(files: TileFiles, config: PipelineConfig, tile_size: int) -> Non
     points = files.load("points")
     rows = finite_rows(points)
     points = points[rows]
-    k = min(config.normals.k, len(rows))
+    k = max(min(config.normals.k, len(rows)), 1)
     edge_bytes = 0 if config.growing.is_order_free else 4 * k
     files.check_space(len(rows) * (_ROW_BYTES + 4 * k + edge_bytes))
     files.save("rows", rows)
@@ -215,10 +217,18 @@ TILE_STAGES = {
 """The stages that run tile by tile, in their order."""
 
 
-def grow_tiles(files: TileFiles, config: PipelineConfig) -> None:
-    """Label the points of the whole cloud from the edges of its tiles."""
+def grow_regions(files: TileFiles, config: PipelineConfig) -> None:
+    """Grow the regions of the whole cloud along the edges of its tiles."""
     grow = _grow_in_any_order if config.growing.is_order_free else _grow
-    heads = grow(files, config)
+    files.save("heads", grow(files, config))
+    files.note("growth")
+    for number in range(len(files.known("order")["bounds"]) - 1):
+        files.remove(*(f"{name}_{number}" for name in ("edges", "sources", "targets")))
+    files.remove("edges")
+
+
+def finish_regions(files: TileFiles, config: PipelineConfig) -> None:
+    """Label the points of the regions that have grown."""
     with released(files.path("neighbors")) as indices:
         cloud = GrowingCloud(
             files.load("cloud"),
@@ -228,7 +238,7 @@ def grow_tiles(files: TileFiles, config: PipelineConfig) -> None:
             _growing_points(files),
             reach=None if config.growing.plane_reach is None else files.load("reach"),
         )
-        labels = settle_regions(cloud, torch.from_numpy(heads), config.growing, config.chunk_size)
+        labels = settle_regions(cloud, files.load("heads"), config.growing, config.chunk_size)
     files.save("labels", labels)
     files.note("regions")
 
@@ -290,13 +300,17 @@ def tabulate_planes(files: TileFiles, config: PipelineConfig) -> None:
             outline=config.planes.outline,
         )
     adjacency = None if planes.adjacency is None else tuple(planes.adjacency)
-    torch.save({**planes._asdict(), "adjacency": adjacency}, files.folder / "planes.pt")
+    content = io.BytesIO()
+    torch.save({**planes._asdict(), "adjacency": adjacency}, content)
+    path = files.folder / _PLANES
+    with files.writing(path):
+        path.write_bytes(content.getvalue())
     files.note("planes")
 
 
 def load_planes(files: TileFiles) -> Planes:
     """Return the table of planes."""
-    values = torch.load(files.folder / "planes.pt", weights_only=True)
+    values = torch.load(files.folder / _PLANES, weights_only=True)
     adjacency = values.pop("adjacency")
     return Planes(**values, adjacency=None if adjacency is None else PlaneAdjacency(*adjacency))
 
