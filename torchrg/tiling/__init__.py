@@ -7,6 +7,7 @@ planes of regions) runs on arrays of a few bytes a point, while neighbours stay 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -114,17 +115,19 @@ def segment_tiles(
 
     once("points", lambda: read_points(files, chunks))
     once("order", lambda: sort_points(files, config, tile_size))
-    numbers = range(len(files.known("order")["bounds"]) - 1)
+    tiles = list(itertools.pairwise(files.known("order")["bounds"]))
     for stage, work in TILE_STAGES.items():
         if files.facts(f"{stage} begun") is None:
             work.begin(files, config)
             files.note(f"{stage} begun")
-        left = [number for number in numbers if files.facts(f"{stage} {number}") is None]
-        begin(stage, len(numbers) - len(left), len(numbers))
-        tasks = [TileTask(files.folder, stage, number, config) for number in left]
-        for done, task in enumerate(run(tasks), len(numbers) - len(left) + 1):
-            files.note(f"{stage} {task.number}")
-            begin(stage, done, len(numbers))
+        tasks = [
+            TileTask(files.folder, stage, number, config, rows) for number, rows in enumerate(tiles)
+        ]
+        left = [task for task in tasks if files.facts(task.name) is None]
+        begin(stage, len(tiles) - len(left), len(tiles))
+        for done, task in enumerate(run(left), len(tiles) - len(left) + 1):
+            files.note(task.name)
+            begin(stage, done, len(tiles))
     once("growth", lambda: grow_regions(files, config))
     once("regions", lambda: finish_regions(files, config))
     once("planes", lambda: tabulate_planes(files, config))

@@ -75,6 +75,11 @@ class TileFiles:
         record["done"][step] = facts
         self._write_record(record)
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether any step is done."""
+        return (self.folder / _RECORD).exists() and bool(self._read_record()["done"])
+
     def facts(self, step: str) -> dict[str, Any] | None:
         """Return what a step found, None if it is not done."""
         facts: dict[str, Any] | None = self._read_record()["done"].get(step)

@@ -107,13 +107,23 @@ class TileTask:
     number: int
     config: PipelineConfig
 
+    rows: tuple[int, int]
+
+    @property
+    def name(self) -> str:
+        """Stage and tile, for messages and the record of what is done."""
+        return f"{self.stage} {self.number}"
+
+    @property
+    def num_points(self) -> int:
+        """Points of the tile."""
+        return self.rows[1] - self.rows[0]
+
     def run(self) -> None:
         """Do the work, and write what it found; the same again does no harm."""
-        files = TileFiles(self.folder)
-        bounds = files.known("order")["bounds"]
-        tile = slice(bounds[self.number], bounds[self.number + 1])
         with sequential_operations(), torch.no_grad():
-            TILE_STAGES[self.stage].work(files, tile, self.number, self.config)
+            work = TILE_STAGES[self.stage].work
+            work(TileFiles(self.folder), slice(*self.rows), self.number, self.config)
 
 
 @dataclass(frozen=True)
