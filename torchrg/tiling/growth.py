@@ -33,8 +33,8 @@ class Condensed(NamedTuple):
 def condense(edges: EdgeLists, part: Part) -> Condensed:
     """Shrink points of a tile that reach one another to one node.
 
-    The edges are those of the points of a part; those that leave the tile stay. Equal edges are
-    left once.
+    The edges are those of the points of a part, none of them twice (SciPy would search without
+    end); those that leave the tile stay, one for all between two components.
 
     Example:
         >>> import torch

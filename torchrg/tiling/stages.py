@@ -57,7 +57,7 @@ _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 def read_points(files: TileFiles, chunks: Iterable[Cloud]) -> None:
     """Write the points of a cloud that comes in chunks, about the origin that a whole one has."""
     raw = files.folder / "coordinates.raw"
-    corners, num_points, narrow = [np.full(3, np.inf), np.full(3, -np.inf)], 0, True
+    low, high, num_points, narrow = np.full(3, np.inf), np.full(3, -np.inf), 0, True
     with files.writing(raw), raw.open("wb") as stream:
         for chunk in chunks:
             coordinates = chunk.coordinates
@@ -66,8 +66,8 @@ def read_points(files: TileFiles, chunks: Iterable[Cloud]) -> None:
             stream.write(coordinates.astype(np.float64).tobytes())
             if chunk.finite.any():
                 kept = coordinates[chunk.finite]
-                corners += [kept.min(axis=0), kept.max(axis=0)]
-    origin = origin_of_box(np.min(corners, axis=0), np.max(corners, axis=0))
+                low, high = np.minimum(low, kept.min(axis=0)), np.maximum(high, kept.max(axis=0))
+    origin = origin_of_box(low, high)
     files.create("points", np.float32, (num_points, 3))
     dtype = np.float32 if narrow else np.float64
     step = 2**20
