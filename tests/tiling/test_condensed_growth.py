@@ -1,5 +1,7 @@
 """Growth along condensed edges, against one seed after the other."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -32,7 +34,7 @@ def part_of(targets, tile):
     lists = [np.searchsorted(rows, targets[row]).tolist() for row in rows[own]]
     lists = [[]] * first + lists + [[]] * (len(rows) - own.stop)
     starts = np.cumsum([0, *map(len, lists)])
-    edges = EdgeLists(starts, np.array(sum(lists, []), dtype=np.int32))
+    edges = EdgeLists(starts, np.array(list(itertools.chain(*lists)), dtype=np.int32))
     return edges, Part(torch.from_numpy(rows), own, Neighbors(torch.zeros(len(rows), 1)))
 
 

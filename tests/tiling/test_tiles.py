@@ -162,7 +162,7 @@ def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
 def test_settings_that_look_at_the_whole_cloud_are_refused(tmp_path):
     config = settings("consensus")
     config = dataclasses.replace(config, normals=dataclasses.replace(config.normals, adaptive_k=99))
-    with pytest.raises(ConfigError, match="expected normals.adaptive_k of none, got 99"):
+    with pytest.raises(ConfigError, match=r"expected normals\.adaptive_k of none, got 99"):
         segment(wall(300), tmp_path, config, 100)
     with pytest.raises(ConfigError, match="expected tile_size >= 1, got 0"):
         segment(wall(300), tmp_path, settings("classic"), 0)
