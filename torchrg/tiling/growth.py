@@ -8,6 +8,7 @@ of the graph fits into memory. Otherwise the edges lie in one file, which growth
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
@@ -55,16 +56,16 @@ def condense(edges: EdgeLists, part: Part) -> Condensed:
     chunks = chunks_of(num_points, ROWS_IN_CACHE)
 
     def edges_of(rows: slice) -> tuple[slice, NDArray[np.int64], NDArray[np.int32]]:
-        """Return the places of the edges of some points, their sources and their targets."""
+        """Return the places of the edges of some points, how many each has, and their targets."""
         places = slice(starts[rows.start] - begin, starts[rows.stop] - begin)
-        counts = np.diff(starts[rows.start : rows.stop + 1])
-        sources = np.repeat(np.arange(rows.start, rows.stop), counts)
-        return places, sources, edges.targets[places.start + begin : places.stop + begin] - first
+        targets = edges.targets[places.start + begin : places.stop + begin] - np.int32(first)
+        return places, np.diff(starts[rows.start : rows.stop + 1]), targets
 
     for rows in chunks:
-        places, sources, targets = edges_of(rows)
+        places, counts, targets = edges_of(rows)
         # An edge to itself changes nothing.
-        inner[places] = np.where((targets >= 0) & (targets < num_points), targets, sources)
+        itself = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int32), counts)
+        inner[places] = np.where((targets >= 0) & (targets < num_points), targets, itself)
     weights = np.broadcast_to(np.float64(1), len(inner))
     graph = csr_array((weights, inner, starts - begin), shape=(num_points, num_points))
     number, components = connected_components(graph, directed=True, connection="strong")
@@ -73,9 +74,12 @@ def condense(edges: EdgeLists, part: Part) -> Condensed:
     last[components] = np.arange(num_points)
     found = []
     for rows in chunks:
-        places, sources, targets = edges_of(rows)
-        leaves = (targets != inner[places]) | (components[sources] != components[inner[places]])
-        sources, targets = components[sources[leaves]], targets[leaves]
+        places, counts, targets = edges_of(rows)
+        sources = np.repeat(components[rows], counts)
+        # NumPy would first make long numbers of the short ones that it shall take.
+        reached = torch.from_numpy(components).index_select(0, torch.from_numpy(inner[places]))
+        leaves = np.flatnonzero((targets != inner[places]) | (sources != reached.numpy()))
+        sources, targets = sources[leaves], targets[leaves]
         is_inner = (targets >= 0) & (targets < num_points)
         targets[is_inner] = last[components[targets[is_inner]]]
         found.append(sources.astype(np.int64) * len(part.rows) + (targets + first))

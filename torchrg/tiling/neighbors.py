@@ -6,6 +6,7 @@ Candidates stay in canonical order, so ties come out as in memory.
 """
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of
@@ -61,7 +62,10 @@ def search_tile(
             continue
         start = int(np.searchsorted(rows, asked.start))
         local = slice(start, start + asked.stop - asked.start)
-        found[into] = rows.astype(np.int32)[search_rows(points[rows], local, k)]
+        near = torch.from_numpy(search_rows(points[rows], local, k))
+        numbers_of = torch.from_numpy(rows.astype(np.int32))
+        out = torch.from_numpy(found[into]).view(-1)
+        torch.index_select(numbers_of, 0, near.view(-1), out=out)
     return found
 
 
