@@ -74,7 +74,7 @@ def test_what_cells_answer_is_what_all_distances_say(kind, k, monkeypatch):
         np.testing.assert_array_equal(neighbors, rows[queried])
         answered[queried] += 1
 
-    left = search_cells(points, k, near[::5, -1], store)
+    left = search_cells(points, k, np.arange(len(points)), near[::5, -1], store)
     answered[left] += 1
     assert (answered == 1).all()
     if kind == "surface" and k > 2:

@@ -10,7 +10,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.edges import EdgeLists
-from torchrg.regions.growth import _curvature_limit, _first_to_reach, number_by_size
+from torchrg.regions.growth import curvature_limit, first_to_reach, number_by_size
 from torchrg.structures import Neighbors
 
 CLASSIC = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -40,7 +40,7 @@ def test_right_angles_join_at_a_limit_of_ninety_degrees():
     assert grow_regions(points, normals, curvature, neighbors, config).tolist() == [0] * 4
 
 
-def test_points_above_the_curvature_limit_join_but_do_not_spread():
+def test_points_above_thecurvature_limit_join_but_do_not_spread():
     points, normals, curvature, neighbors = strip(9, 0.0)
     curvature[4] = 0.2
     config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.5})
@@ -70,12 +70,12 @@ def test_a_point_that_joined_unconnected_is_a_seed_once_a_connected_seed_reaches
     assert grow_regions(*cloud, printed).tolist() == [0, 0, 0, 1, 1, 1]
 
 
-def test_curvature_limit_is_the_lower_quantile():
+def testcurvature_limit_is_the_lower_quantile():
     for num_values in (12, 237):
         values = torch.rand(num_values, generator=torch.Generator().manual_seed(0))
         for share in (0.0, 0.5, 0.95, 0.98, 1.0):
             expected = np.quantile(values.numpy(), share, method="lower")
-            assert _curvature_limit(values, share).item() == expected
+            assert curvature_limit(values, share).item() == expected
 
 
 def test_regions_smaller_than_min_size_are_not_labelled():
@@ -149,7 +149,7 @@ def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
         np.concatenate([np.arange(1, num_points), np.zeros(2 * num_points + 1)]).astype(np.int32),
     )
     seeds = np.arange(num_points, dtype=np.int32)
-    assert not _first_to_reach(edges, seeds, num_points).any()
+    assert not first_to_reach(edges, seeds, num_points).any()
 
 
 def test_neighbours_across_a_gap_join_only_within_the_distance():

@@ -7,7 +7,7 @@ from torchrg._optional import require
 from torchrg.batch.convert import ScanReport, convert_scan
 from torchrg.batch.local import BEAT_SECONDS, ONE_THREAD, Work
 from torchrg.batch.memory import memory_of_scan
-from torchrg.batch.scans import Job
+from torchrg.batch.scans import Task
 
 _RETRIES = 3
 """How often Ray tries a scan again whose process or node was lost."""
@@ -16,7 +16,7 @@ _OBJECT_STORE_BYTES = 100_000_000
 
 
 def run_ray(
-    jobs: Sequence[Job],
+    jobs: Sequence[Task],
     *,
     workers: int | None = None,
     memory_limit: int,
@@ -57,7 +57,7 @@ def run_ray(
         runtime_env={"env_vars": ONE_THREAD},
         **({} if address else started),
     )
-    pending: dict[Any, Job] = {}
+    pending: dict[Any, Task] = {}
     try:
         largest = max(
             int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]
@@ -80,7 +80,7 @@ def run_ray(
         ray.shutdown()
 
 
-def _convert(work: Work, job: Job) -> ScanReport:
+def _convert(work: Work, job: Task) -> ScanReport:
     """Convert a scan in one thread."""
     import torch
 
@@ -88,7 +88,7 @@ def _convert(work: Work, job: Job) -> ScanReport:
     return work(job)
 
 
-def _collect(ray: Any, reference: Any, job: Job) -> ScanReport:  # noqa: ANN401
+def _collect(ray: Any, reference: Any, job: Task) -> ScanReport:  # noqa: ANN401
     """Return the report of a task, of its loss if Ray could not finish it."""
     try:
         report: ScanReport = ray.get(reference)

@@ -150,14 +150,14 @@ def terminate_as_interrupt() -> Iterator[None]:
 def run_each(
     write: Callable[..., None],
     arguments: Any,  # noqa: ANN401
-    *paths: Sequence[Path | None],
+    *columns: Sequence[Any],
 ) -> int:
-    """Call ``write`` with the arguments and the paths of each input; return the exit code.
+    """Call ``write`` with the arguments and the values of each input; return the exit code.
 
     One that fails stops no other and is told in one line; where it is the only one, its error is
     that of the command.
     """
-    rows = list(zip(arguments.inputs, *paths, strict=True))
+    rows = list(zip(*columns, strict=True))
     num_failed = 0
     for row in rows:
         try:

@@ -54,7 +54,7 @@ def run(argv: list[str]) -> int:
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     outputs = console.output_paths(arguments.inputs, arguments.out)
-    return console.run_each(_estimate_file, arguments, outputs)
+    return console.run_each(_estimate_file, arguments, arguments.inputs, outputs)
 
 
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:

@@ -2,24 +2,32 @@
 
 import dataclasses
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import torch
 import tyro
 from tqdm import tqdm
 
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
+from torchrg.batch.run import Reports
 from torchrg.batch.scans import check_finite
+from torchrg.batch.tiles import TileJob, choose_tile_size, segmented_in_tiles, work_on_tile
 from torchrg.cli import console
-from torchrg.config import SuperpointsConfig
+from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.errors import ConfigError
-from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.io import check_output, estimate_points, read_cloud, write_cloud
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
 from torchrg.render.page import check_library
+from torchrg.structures import Cloud, Segmentation, join_clouds
 from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -55,6 +63,20 @@ class Arguments:
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
+    merge: bool = False
+    """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
+    limit_memory: float | None = None
+    """Gigabytes that a cloud may take. One that would take more is segmented in tiles on disk, with
+    the same result. Default: half of what is free."""
+    workdir: Path | None = None
+    """Directory for the work on such a cloud, some 500 bytes a point, removed when the result is
+    written. A command that ended early goes on from there. Default: one beside the result."""
+    engine: Literal["local", "ray"] = "local"
+    """Where tiles are worked on: in this process, or as tasks on Ray (pip install
+    'torchrg[ray]')."""
+    ray_address: str | None = None
+    """Ray cluster to use, "auto" for the one of this machine; every node sees the working directory
+    under its path. Default: one that is started for the time of the command."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 
@@ -70,11 +92,15 @@ def run(argv: list[str]) -> int:
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
     console.use_threads(arguments.threads)
-    outputs = console.output_paths(arguments.inputs, arguments.out)
+    _check_memory(arguments)
+    clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
+    firsts = tuple(sources[0] for sources in clouds if sources)
+    outputs = console.output_paths(firsts, arguments.out)
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments)
-    code = console.run_each(_segment_file, arguments, outputs, pictures)
+    with console.terminate_as_interrupt():
+        code = console.run_each(_segment, arguments, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
@@ -108,16 +134,115 @@ def _refuse_images(argv: list[str]) -> None:
             )
 
 
-def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
-    """Segment one file, with a progress bar on a terminal and one line about the result."""
-    begin = time.perf_counter()
-    cloud = read_cloud(source)
+def _check_memory(arguments: Arguments) -> None:
+    """Refuse what is said about memory and the engine where it makes no sense."""
+    limit = arguments.limit_memory
+    if limit is not None and not limit > 0:
+        raise ConfigError(f"expected --limit-memory > 0, in GB, got {limit}.")
+    if arguments.ray_address is not None and arguments.engine != "ray":
+        raise ConfigError("expected --ray-address together with --engine ray.")
+
+
+def _segment(
+    arguments: Arguments, sources: tuple[Path, ...], target: Path, picture: Path | None
+) -> None:
+    """Segment a cloud of one file or of several, in tiles if it is too large for memory."""
+    given = arguments.limit_memory
+    limit = available_memory() // 2 if given is None else int(given * 1e9)
+    num_points = sum(map(estimate_points, sources))
+    if memory_of_scan(num_points) > limit:
+        _segment_tiles(arguments, sources, target, num_points, limit)
+    else:
+        _segment_whole(arguments, sources, target, picture)
+
+
+def _name_of(sources: tuple[Path, ...]) -> str:
+    """Return what a cloud of some files is called in messages."""
+    return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
+
+
+def _read(sources: tuple[Path, ...]) -> Cloud:
+    """Read files as one cloud."""
+    clouds = [read_cloud(source) for source in sources]
+    return clouds[0] if len(clouds) == 1 else join_clouds(clouds)
+
+
+def _chunks(sources: tuple[Path, ...]) -> Iterator[Cloud]:
+    """Read the points of files in chunks."""
+    for source in sources:
+        coordinates = read_cloud(source).coordinates
+        yield from (Cloud(coordinates[rows]) for rows in chunks_of(len(coordinates), ROWS_AT_ONCE))
+
+
+def _segment_tiles(
+    arguments: Arguments, sources: tuple[Path, ...], target: Path, num_points: int, limit: int
+) -> None:
+    """Segment a cloud in tiles, after a line that says so."""
+    begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
+    for name in ("voxel", "superpoints", "picture"):
+        if getattr(arguments, name):
+            raise ConfigError(
+                f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
+                f"takes more than {limit / 1e9:.1f} GB; raise --limit-memory, or leave it out."
+            )
+    tile_size = choose_tile_size(num_points, limit)
+    workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
+    print(
+        f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.1f} GB of "
+        f"memory, the limit is {limit / 1e9:.1f}: in tiles of {tile_size:,} in {workdir}",
+        flush=True,
+    )
+    with tqdm(unit="tile", leave=False, disable=None) as bar:
+
+        def show(stage: str, done: int, of: int) -> None:
+            bar.set_description_str(stage, refresh=False)
+            bar.total, bar.n = of, done
+            bar.refresh()
+
+        with segmented_in_tiles(
+            sources,
+            _chunks(sources),
+            workdir,
+            settings,
+            tile_size=tile_size,
+            start=_engine(arguments, limit),
+            on_stage=show,
+        ) as seg:
+            write_cloud(target, _read(sources), seg, provenance=_describe(sources, settings))
+            _report(source, seg, target, time.perf_counter() - begin)
+
+
+def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
+    """Return what runs the tiles elsewhere, None where this process does."""
+    if arguments.engine == "local":
+        return None
+    from torchrg.batch.ray_tasks import run_ray
+
+    return partial(run_ray, memory_limit=limit, address=arguments.ray_address, work=work_on_tile)
+
+
+def _describe(sources: tuple[Path, ...], settings: PipelineConfig) -> dict[str, Any]:
+    """Return the provenance of a cloud of one file or of several."""
+    provenance = describe_run(sources[0], settings)
+    if len(sources) > 1:
+        provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
+    return provenance
+
+
+def _segment_whole(
+    arguments: Arguments, sources: tuple[Path, ...], target: Path, picture: Path | None
+) -> None:
+    """Segment a cloud, with a progress bar on a terminal and one line about the result."""
+    begin, source = time.perf_counter(), _name_of(sources)
+    cloud = _read(sources)
     for note in check_finite(cloud):
         console.warn(f"{source}: {note}.")
     check_output(target, cloud)
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
-    with tqdm(total=len(stages), desc=source.name, unit="stage", leave=False, disable=None) as bar:
+    with tqdm(
+        total=len(stages), desc=sources[0].name, unit="stage", leave=False, disable=None
+    ) as bar:
 
         def advance(stage: str) -> None:
             bar.set_postfix_str(stage)
@@ -128,7 +253,7 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
             seg = segment_planes(cloud.points, settings, on_stage=advance)
         else:
             seg = segment_voxels(cloud.points, voxels, settings, on_stage=advance)
-        parts, provenance = None, describe_run(source, settings)
+        parts, provenance = None, _describe(sources, settings)
         if arguments.superpoints:
             advance("superpoints")
             parts = partition_voxels(
@@ -146,17 +271,21 @@ def _segment_file(arguments: Arguments, source: Path, target: Path, picture: Pat
             write_page(picture, make_page(result))
         else:
             draw_planes(picture, result)
-    seconds = time.perf_counter() - begin
-    num_planes = len(seg.planes.count)
-    if num_planes == 0:
+    if len(seg.planes.count) == 0:
         kept = cloud.coordinates[cloud.finite]
         reason = "all points are equal" if (kept == kept[0]).all() else "no region is large enough"
         console.warn(f"{source}: no plane found: {reason}.")
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         print(f"{source}: superpoints of each level: {found}")
-    share = float((seg.labels >= 0).double().mean()) * 100
+    _report(source, seg, target, time.perf_counter() - begin)
+
+
+def _report(source: str, seg: Segmentation, target: Path, seconds: float) -> None:
+    """Print the line about a result."""
+    num_points, num_planes = len(seg.labels), len(seg.planes.count)
+    share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
     print(
-        f"{source}: {len(cloud):,} points, {num_planes:,} planes, {share:.1f} % of the points "
+        f"{source}: {num_points:,} points, {num_planes:,} planes, {share:.1f} % of the points "
         f"labelled, {seconds:.1f} s -> {target}"
     )

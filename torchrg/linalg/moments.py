@@ -8,6 +8,7 @@ the robust fits factor the scatter by Gram-Schmidt as they need determinants of 
 images have running sums over windows, and the grid of pictures adds whole numbers, which are exact.
 """
 
+import bisect
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -121,6 +122,24 @@ class Segments:
             sizes = [len(part) for part in parts]
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
         self.labels = torch.repeat_interleave(self.counts)
+
+    def split(self, most: int) -> "list[Segments]":
+        """Return regions that follow one another together, up to so many points, or one region.
+
+        They are numbered from 0 in each part. At least one part is returned.
+        """
+        ends = self.counts.cumsum(0).tolist()
+        parts: list[Segments] = []
+        region = row = 0
+        while region < len(ends) or not parts:
+            last = max(bisect.bisect_right(ends, row + most), min(region + 1, len(ends)))
+            part = Segments.__new__(Segments)
+            end = ends[last - 1] if last else 0
+            part.rows, part.labels = self.rows[row:end], self.labels[row:end] - region
+            part.counts = self.counts[region:last]
+            parts.append(part)
+            region, row = last, end
+        return parts
 
     def take(self, values: Tensor) -> Tensor:
         """Return the values of the points that have a region, region by region."""

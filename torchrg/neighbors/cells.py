@@ -51,15 +51,19 @@ _MAX_KEY = 2.0**62
 
 
 def search_cells(
-    points: NDArray[np.float64], k: int, reach: NDArray[np.float64], store: Store
+    points: NDArray[np.float64],
+    k: int,
+    rows: NDArray[np.int64],
+    reach: NDArray[np.float64],
+    store: Store,
 ) -> NDArray[np.int64]:
-    """Find the k nearest of distinct points ``(N, 3)`` for all that cells of some size answer for.
+    """Find the k nearest of distinct points ``(N, 3)`` for rows that cells of some size answer for.
 
     The point itself counts. ``reach`` are distances of the k-th neighbour of a sample of the
     points. ``store`` gets each answered row once, from several threads, its neighbours sorted by
     distance, then by row. Returns the rows that are left, ascending.
     """
-    left = np.arange(len(points))
+    left = rows
     if _MIN_CANDIDATES * (k + _SPARE) <= _MAX_CANDIDATES:
         for size in _cell_sizes(reach):
             if len(left) >= MIN_FOR_CELLS:

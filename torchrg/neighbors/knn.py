@@ -79,6 +79,7 @@ def search_knn(
         order = None if canonical else canonical_order(cloud).numpy()
         _search_cloud(
             cloud if order is None else cloud[order],
+            slice(0, len(cloud)),
             order,
             start,
             math.inf if max_distance is None else max_distance,
@@ -103,8 +104,22 @@ def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int
     return [(start, stop) for start, stop in bounds if stop > start]
 
 
+@sequential_operations()
+def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np.int32]:
+    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``.
+
+    Example:
+        >>> search_rows(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), slice(1, 2), 2).tolist()
+        [[1, 0]]
+    """
+    indices = np.empty((len(points), k), dtype=np.int32)
+    _search_cloud(points, rows, None, 0, math.inf, indices, None)
+    return indices[rows]
+
+
 def _search_cloud(
     points: NDArray[np.floating],
+    asked: slice,
     order: NDArray[np.int64] | None,
     first_row: int,
     max_distance: float,
@@ -113,6 +128,7 @@ def _search_cloud(
 ) -> None:
     """Search one cloud in canonical order and write results in the caller's order.
 
+    Rows that are not ``asked`` may be answered or not.
     The tree holds each distinct place once, and duplicates are put back afterwards: a place with
     many points costs no more than a place with one.
     """
@@ -143,10 +159,11 @@ def _search_cloud(
 
     width = min(k, len(places))
     tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-    left = np.arange(len(places))
+    first, last = np.searchsorted(starts, (asked.start, asked.stop - 1), side="right") - 1
+    left = np.arange(first, last + 1)
     if len(places) >= MIN_FOR_CELLS:
-        sample = places[:: -(-len(places) // _SAMPLE_SIZE)]
-        left = search_cells(places, k, tree.query(sample, [k])[0][:, 0], store)
+        sample = places[left[:: -(-len(left) // _SAMPLE_SIZE)]]
+        left = search_cells(places, k, left, tree.query(sample, [k])[0][:, 0], store)
     for chunk in chunks_of(len(left), ROWS_AT_ONCE):
         store(left[chunk], *_query(tree, places[left[chunk]], width))
 

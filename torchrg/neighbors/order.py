@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 
-_MORTON_BITS = 21
+MORTON_BITS = 21
 """Bits of a number in a Morton code: three of them fit an int64."""
 
 _SPREADS = (
@@ -50,7 +51,7 @@ def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
     coordinates = tensor.detach().cpu().numpy()
     if len(coordinates) == 0:
         return torch.zeros(0, dtype=torch.int64, device=tensor.device)
-    codes = _morton_codes(coordinates)
+    codes = morton_codes(coordinates)
     # Six times faster than a stable sort; what is equal is put in order below.
     order = np.argsort(codes)
     codes = codes[order]
@@ -99,18 +100,21 @@ def bounding_box(
     return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
 
 
-def _morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the Morton code of each point in the cube about the cloud."""
+def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the Morton code of each of finite points ``(N, 3)`` in the cube about the cloud."""
+    codes = np.zeros(len(coordinates), dtype=np.int64)
+    if len(codes) == 0:
+        return codes
     low, high = bounding_box(coordinates)
     extent = float((high - low).max())
-    codes = torch.zeros(len(coordinates), dtype=torch.int64)
     if extent == 0:
-        return codes.numpy()
-    for axis in range(3):
-        relative = (coordinates[:, axis] - low[axis]) / extent
-        steps = (relative * (2**_MORTON_BITS - 1)).astype(np.int64)
-        codes |= spread_bits(torch.from_numpy(steps)) << axis
-    return codes.numpy()
+        return codes
+    for rows in chunks_of(len(codes), ROWS_AT_ONCE):
+        relative = (coordinates[rows] - low) / extent
+        steps = torch.from_numpy((relative * (2**MORTON_BITS - 1)).astype(np.int64))
+        for axis in range(3):
+            codes[rows] |= (spread_bits(steps[:, axis]) << axis).numpy()
+    return codes
 
 
 def spread_bits(values: Tensor) -> Tensor:
@@ -123,7 +127,7 @@ def spread_bits(values: Tensor) -> Tensor:
 def gather_bits(codes: Tensor) -> Tensor:
     """Return every third bit of codes, the inverse of :func:`spread_bits`."""
     codes = codes & _SPREADS[-1][1]
-    patterns = [pattern for _, pattern in _SPREADS[-2::-1]] + [2**_MORTON_BITS - 1]
+    patterns = [pattern for _, pattern in _SPREADS[-2::-1]] + [2**MORTON_BITS - 1]
     for (shift, _), pattern in zip(reversed(_SPREADS), patterns, strict=True):
         codes = (codes | codes >> shift) & pattern
     return codes

@@ -13,7 +13,7 @@ from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
-from torchrg.normals.consensus import estimate_consensus
+from torchrg.normals.consensus import constants, estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
@@ -54,6 +54,16 @@ ESTIMATORS: dict[str, Estimator] = {
     "consensus": estimate_consensus,
 }
 """Estimators by name: points, their neighbours, settings, chunk size -> fit."""
+
+_NOISE_STEPS = 3
+STEPS = dict.fromkeys(ESTIMATORS, 1) | {
+    "irls": _NOISE_STEPS,
+    "paper": 2,
+    "consensus": _NOISE_STEPS + 1 + 2 * constants.NUM_PASSES,
+}
+"""How many steps from neighbour to neighbour the points are away that decide a fit: 1 where it is
+that of the neighbourhood. Of the noise: deviations of neighbourhoods, their quantile, the quantile
+of these. ``consensus`` with ``adaptive_k`` looks at the whole cloud."""
 
 
 @sequential_operations()

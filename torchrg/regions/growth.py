@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import CHUNK_SIZE, sequential_operations
+from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_operations
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
@@ -96,7 +96,7 @@ def grow_regions(
         tensor([0])
     """
     config = GrowingConfig() if config is None else config
-    cloud = _checked_cloud(
+    cloud = checked_cloud(
         config, points, normals, curvature, neighbors, valid, colors, residual_rms
     )
     if len(cloud.points) == 0:
@@ -105,6 +105,17 @@ def grow_regions(
     if order is not None:
         cloud = _reordered(cloud, order)
     heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
+    labels = settle_regions(cloud, heads, config, chunk_size)
+    return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+
+
+def settle_regions(
+    cloud: GrowingCloud, heads: Tensor, config: GrowingConfig, chunk_size: int
+) -> Tensor:
+    """Return labels of regions that have grown, after all that the settings ask for.
+
+    ``heads`` ``(N,)`` tell the regions apart, as :func:`number_by_size` reads them.
+    """
     least = config.min_size
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
@@ -121,10 +132,10 @@ def grow_regions(
         labels = number_by_size(parts, least)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
-    return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+    return labels
 
 
-def _checked_cloud(
+def checked_cloud(
     config: GrowingConfig,
     points: Tensor | NDArray[np.floating],
     normals: Tensor | NDArray[np.floating],
@@ -223,47 +234,74 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     elsewhere, -1 for none. Regions smaller than ``min_size`` become :data:`torchrg.UNLABELED`.
     """
     heads = regions.cpu().numpy()
-    placed = np.flatnonzero(heads >= 0)
-    sizes = np.bincount(heads[placed], minlength=len(heads))
-    firsts = np.full(len(heads), len(heads))
-    firsts[heads[placed][::-1]] = placed[::-1]
+    sizes = np.bincount(heads[heads >= 0], minlength=len(heads))
     kept = np.flatnonzero(sizes >= max(min_size, 1))
-    kept = kept[np.lexsort((firsts[kept], -sizes[kept]))]
+    sizes = sizes[kept]
     # The last entry is what a head of -1 finds.
-    numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int64)
+    numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int32)
     numbers[kept] = np.arange(len(kept))
-    return torch.from_numpy(numbers[heads]).to(regions.device)
+    found = numbers[heads]
+    firsts = np.full(len(kept) + 1, len(heads))
+    for rows in reversed(chunks_of(len(heads), ROWS_AT_ONCE)):
+        firsts[found[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
+    order = np.lexsort((firsts[:-1], -sizes))
+    ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
+    ranks[order] = np.arange(len(kept))
+    return torch.from_numpy(ranks[found]).to(regions.device)
 
 
 def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
     """Return the head of each point's region, by whichever way the settings allow."""
-    curvature, valid = cloud.curvature.cpu().numpy(), cloud.valid.cpu().numpy()
-    order = torch.from_numpy(curvature).argsort(stable=True).numpy().astype(np.int32)
-    order = order[valid[order]]
-    limit = _curvature_limit(cloud.curvature[cloud.valid], config.curvature_quantile)
+    order, limit = growing_order(cloud.curvature, cloud.valid, config)
+    valid = cloud.valid.cpu().numpy()
     if not config.is_order_free:
         edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
         indices = cloud.neighbors.indices.cpu().numpy()
-        return _grow_first_in_first_out(edges, order, valid, claims, indices)
-    seeds = order[curvature[order] <= limit.cpu().numpy()]
+        return grow_first_in_first_out(edges, order, valid, claims, indices)
+    seeds = spreading(order, cloud.curvature, limit)
     edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
-    heads = _first_to_reach(edges, seeds, len(valid))
-    # What no seed reaches are points that claim at most their k - 1 neighbours.
-    if config.min_size <= cloud.neighbors.indices.shape[1]:
-        free = heads < 0
-        left = _grow_first_in_first_out(others, order[free[order]], free)
-        heads = np.where(free, left, heads)
+    heads = first_to_reach(edges, seeds, len(valid))
+    if leaves_enough(cloud.neighbors.indices.shape[1], config):
+        heads = grow_rest(heads, others, order)
     return heads
 
 
-def _curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
+def growing_order(
+    curvature: Tensor, valid: Tensor, config: GrowingConfig
+) -> tuple[NDArray[np.int32], Tensor]:
+    """Return the rows of valid points ``(N,)`` by ascending curvature, and its limit, a scalar."""
+    order = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
+    limit = curvature_limit(curvature[valid], config.curvature_quantile)
+    return order[valid.cpu().numpy()[order]], limit
+
+
+def spreading(order: NDArray[np.int32], curvature: Tensor, limit: Tensor) -> NDArray[np.int32]:
+    """Return those of the rows in growing order whose curvature is within the limit."""
+    return order[curvature.cpu().numpy()[order] <= limit.cpu().numpy()]
+
+
+def leaves_enough(k: int, config: GrowingConfig) -> bool:
+    """Tell whether points that no seed reaches may make regions: of at most k neighbours."""
+    return config.min_size <= k
+
+
+def grow_rest(
+    heads: NDArray[np.int32], others: EdgeLists, order: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """Let free points that no seed reaches claim free neighbours by the edges of their own."""
+    free = heads < 0
+    left = grow_first_in_first_out(others, order[free[order]], free)
+    return np.where(free, left, heads)
+
+
+def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
     """Return the lower quantile of curvatures ``(n,)``, one of the values; 0 where n is 0."""
     if len(curvature) == 0:
         return curvature.new_zeros(())
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
 
 
-def _first_to_reach(
+def first_to_reach(
     edges: EdgeLists, seeds: NDArray[np.int32], num_points: int
 ) -> NDArray[np.int32]:
     """Return for each point the first of the seeds that reaches it along edges, -1 for none.
@@ -299,7 +337,7 @@ def _first_to_reach(
     return heads
 
 
-def _grow_first_in_first_out(
+def grow_first_in_first_out(
     edges: EdgeLists,
     order: NDArray[np.int32],
     valid: NDArray[np.bool_],

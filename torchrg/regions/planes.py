@@ -17,9 +17,12 @@ from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.edges import GrowingCloud, neighborhood_radii
-from torchrg.regions.measures import Rectangles, covered_areas, fit_rectangles, trace_outline
+from torchrg.regions.measures import covered_areas, fit_rectangles, trace_outline
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
+
+_POINTS_AT_ONCE = 2**20
+"""Points of regions that are measured together: at some 250 bytes each."""
 
 _BISQUARE_CUT = 4.685
 """Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
@@ -167,15 +170,19 @@ def summarize_planes(
         "summarize_planes", points=(points, "N 3"), normals=(normals, "N 3"), labels=(labels, "N")
     )
     check_floating("summarize_planes", points=points, normals=normals)
-    segments = Segments(labels)
-    fit = fit_planes(segments, points, normals)
+    groups = Segments(labels).split(_POINTS_AT_ONCE)
+    fits, squares = zip(*(_fit(points, normals, some) for some in groups), strict=True)
+    fit = FittedPlanes(*(torch.cat(parts) for parts in zip(*fits, strict=True)))
     first, second = _plane_axes(fit)
-    centered = segments.take_about(points, fit.center)
-    u, v = (_sum_of_products(centered, segments.spread_columns(axis)) for axis in (first, second))
 
-    def measure() -> tuple[Rectangles, Tensor, Tensor]:
-        boxes = fit_rectangles(segments, u, v)
-        return boxes, *covered_areas(segments, u, v, boxes)
+    def measure() -> list[_Measures]:
+        found, start = [], 0
+        for some in groups:
+            rows = slice(start, start + len(some.counts))
+            frame = (fit.center[rows], first[rows], second[rows])
+            found.append(_measure(points, some, frame, outline=outline))
+            start = rows.stop
+        return found
 
     def meet() -> PlaneAdjacency | None:
         if neighbors is None:
@@ -184,9 +191,11 @@ def summarize_planes(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
 
-    (boxes, area, width), found = run_beside(measure, meet, points.device)
-    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
-    axes = boxes.directions @ torch.stack([first, second], dim=1)
+    measures, found = run_beside(measure, meet, points.device)
+    mean, area, sides, directions, middle = (
+        torch.cat(parts) for parts in list(zip(*measures, strict=True))[:5]
+    )
+    axes = directions @ torch.stack([first, second], dim=1)
 
     def own(values: Tensor) -> Tensor:
         return values.to(points.dtype)
@@ -197,21 +206,58 @@ def summarize_planes(
         centroid=own(fit.center + mean),
         area=own(area),
         count=fit.num_points,
-        rms=own(segments.mean(fit.residuals * fit.residuals).sqrt()),
-        extent=own(boxes.sides),
+        rms=own(torch.cat(squares).sqrt()),
+        extent=own(sides),
         axes=own(axes),
-        center=own(fit.center + (boxes.center[:, None] @ axes).squeeze(1)),
+        center=own(fit.center + (middle[:, None] @ axes).squeeze(1)),
         curved=fit.curved,
     )
     if up is not None:
         planes = planes._replace(kind=_classify(planes, _direction(up, points)))
     if outline:
-        frame = (fit.center, first, second)
-        planes = planes._replace(outline=_outlines(segments, u, v, width, frame, points.dtype))
+        planes = planes._replace(outline=sum((part.outline for part in measures), ()))
     if found is not None:
         lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
     return planes
+
+
+def _fit(points: Tensor, normals: Tensor, segments: Segments) -> tuple[FittedPlanes, Tensor]:
+    """Return planes without the residuals of the points, and the mean square of these."""
+    fit = fit_planes(segments, points, normals)
+    squares = segments.mean(fit.residuals * fit.residuals)
+    return fit._replace(residuals=fit.residuals[:0]), squares
+
+
+class _Measures(NamedTuple):
+    """What is measured in the planes of some regions.
+
+    The mean of the points about the center ``(M, 3)``, the area ``(M,)``, sides, directions and
+    middle of the rectangles as :class:`torchrg.regions.measures.Rectangles` has them, and outlines
+    if asked for.
+    """
+
+    mean: Tensor
+    area: Tensor
+    sides: Tensor
+    directions: Tensor
+    middle: Tensor
+    outline: tuple[tuple[Tensor, ...], ...]
+
+
+def _measure(
+    points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor, Tensor], *, outline: bool
+) -> _Measures:
+    """Measure regions in their planes, given by centers and two directions, each ``(M, 3)``."""
+    center, first, second = frame
+    centered = segments.take_about(points, center)
+    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
+    u, v = (_along(segments, centered, axis) for axis in (first, second))
+    del centered
+    boxes = fit_rectangles(segments, u, v)
+    area, width = covered_areas(segments, u, v, boxes)
+    rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
+    return _Measures(mean, area, boxes.sides, boxes.directions, boxes.center, rings)
 
 
 def _plane_axes(fit: FittedPlanes) -> tuple[Tensor, Tensor]:
@@ -259,8 +305,8 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
     origin = segments.first(points).double()
     local = segments.take_about(points, origin)
-    resolution = coordinate_resolution(segments.first(points)).double()
     weights = torch.ones_like(local[0])
+    resolution = coordinate_resolution(segments.first(points)).double()
     for last in range(_NUM_FITS):
         total = segments.sum(weights)
         mean = torch.stack([segments.sum(x * weights) / total for x in local], dim=1)
@@ -268,7 +314,7 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         covariance = _covariances(segments, centered, weights)
         variances, axes = eigh3_of_few(covariance)
         normal = _with_sign(_plane_normals(variances, axes, usual))
-        residuals = _sum_of_products(centered, segments.spread_columns(normal))
+        residuals = _along(segments, centered, normal)
         thickness = MAD_FACTOR * segments.median(residuals.abs())
         if last == _NUM_FITS - 1:
             break
@@ -302,10 +348,13 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     return RegionPlanes(fit._replace(curved=fit.curved & bent), floor, reach, bent)
 
 
-def _sum_of_products(first: list[Tensor], second: list[Tensor]) -> Tensor:
-    """Return the scalar products of vectors given by columns."""
-    (a, b, c), (x, y, z) = first, second
-    return a * x + b * y + c * z
+def _along(segments: Segments, columns: Sequence[Tensor], axes: Tensor) -> Tensor:
+    """Return coordinates of points, given by columns, along the axis ``(M, 3)`` of their region."""
+    total = torch.zeros_like(columns[0])
+    # Products and sums apart: their rounding must not depend on where a block of memory ends.
+    for column, part in zip(columns, axes.unbind(dim=1), strict=True):
+        total += column * segments.spread(part)
+    return total
 
 
 def _spread_of(segments: Segments, normals: Tensor) -> Tensor:

@@ -1,0 +1,134 @@
+"""``torchrg segment`` of clouds beyond the limit of memory, and of several files as one."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections import Counter
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.batch.run import DirectoryLock
+from torchrg.batch.tiles import choose_tile_size
+from torchrg.cli import main
+from torchrg.config import load_config
+from torchrg.errors import ConfigError
+from torchrg.io import read_cloud
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+
+LIMIT = "0.542"
+"""Gigabytes: what a few thousand points take in tiles, and not in memory at once."""
+ROOM = 40_000
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """Two files, with points that are not finite in one."""
+    folder = tmp_path_factory.mktemp("rooms")
+    room = make_room(num_points=ROOM, noise=0.003, seed=1)
+    points = room.points.numpy()
+    points[7] = np.nan
+    np.savez(folder / "a.npz", points=points[::2], labels=room.labels[::2], other=points[::2, 0])
+    np.savez(folder / "b.npz", points=points[1::2], labels=room.labels[1::2])
+    return folder
+
+
+def run(*arguments):
+    return main(["segment", *map(str, arguments)])
+
+
+def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys):
+    files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic")
+    assert run(*files, "--out", tmp_path / "whole.npz", "--limit-memory", "9") == 0
+    assert "in tiles of" not in capsys.readouterr().out
+    assert run(*files, "--out", tmp_path / "tiles.npz", "--limit-memory", LIMIT) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "about 40,000 points take 0.5 GB of memory, the limit is 0.5: in tiles of" in said[0]
+    assert (tmp_path / "whole.npz").read_bytes() == (tmp_path / "tiles.npz").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles.npz", "whole.npz"]
+
+
+def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
+    files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic")
+    assert run(*files, "--out", tmp_path / "both.ply") == 0
+    both = read_cloud(tmp_path / "both.ply")
+    parts = [read_cloud(rooms / name) for name in ("a.npz", "b.npz")]
+    points = np.concatenate([part.coordinates for part in parts])
+    np.testing.assert_array_equal(both.coordinates, points)
+    found = segment_planes(torch.from_numpy(points), load_config("classic"))
+    np.testing.assert_array_equal(both.fields["labels"], found.labels)
+    assert "other" not in both.fields
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--limit-memory", "0.1"), "expected --limit-memory of at least 0.5 GB for about 20,000"),
+        (("--limit-memory", "-1"), "expected --limit-memory > 0, in GB, got -1"),
+        (("--limit-memory", LIMIT, "--merge", "--voxel", "0.1"), "expected no --voxel for a cloud"),
+        (("--ray-address", "auto"), "expected --ray-address together with --engine ray"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(rooms, tmp_path, capsys, flags, message):
+    files = sorted(rooms.iterdir())[: 1 + ("--merge" in flags)]
+    assert run(*files, "--out", tmp_path / "x.npz", *flags) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_working_directory_is_of_one_command(rooms, tmp_path, capsys):
+    work = tmp_path / "work"
+    work.mkdir()
+    files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--out", tmp_path / "x.npz")
+    with DirectoryLock(work):
+        assert run(*files, "--workdir", work, "--limit-memory", LIMIT) == 2
+    assert "another torchrg" in capsys.readouterr().err
+
+
+def test_tiles_are_as_large_as_memory_allows():
+    assert choose_tile_size(10**7, 3 * 10**9) > choose_tile_size(10**7, 2 * 10**9)
+    assert choose_tile_size(10**7, 10**12) == choose_tile_size(1, 10**12)
+    with pytest.raises(ConfigError, match=r"expected --limit-memory of at least 110\.5 GB"):
+        choose_tile_size(10**9, 3 * 10**9)
+
+
+def python(*arguments):
+    """Run Python with the modules of this folder at hand."""
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    }
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+@pytest.mark.slow
+def test_killed_in_every_stage_it_goes_on_and_does_no_tile_twice(tmp_path):
+    np.save(tmp_path / "room.npy", make_room(num_points=3000, noise=0.003, seed=2).points)
+    script, deaths = Path(__file__).with_name("killed_tiles.py"), 0
+    while (done := python(script, tmp_path / "room.npy", tmp_path / "work", 7)).returncode:
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        deaths += 1
+    assert deaths > 5
+    python(script, tmp_path / "room.npy", tmp_path / "other", 0)
+    for name in ("labels", "normals", "area"):
+        found, expected = (np.load(tmp_path / f"{run}.npz")[name] for run in ("work", "other"))
+        np.testing.assert_array_equal(found, expected)
+    assert set(Counter((tmp_path / "work.log").read_text().splitlines()).values()) == {1}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
+def test_ray_gives_the_bytes_of_one_process(rooms, tmp_path):
+    files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic")
+    assert run(*files, "--out", tmp_path / "here.npz", "--limit-memory", LIMIT) == 0
+    options = ("--out", tmp_path / "ray.npz", "--limit-memory", LIMIT, "--engine", "ray")
+    done = python("-m", "torchrg", "segment", *files, *options)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "ray.npz").read_bytes() == (tmp_path / "here.npz").read_bytes()

@@ -1,0 +1,114 @@
+"""Neighbours of tiles and the boxes they are found by, against all distances."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.neighbors import finite_rows
+from torchrg.tiling.boxes import farthest_neighbor, find_boxes, near_boxes
+from torchrg.tiling.neighbors import search_tile
+from torchrg.tiling.parts import cut_part
+
+
+def lattice(rng):
+    return np.stack(np.mgrid[:20, :20, :1], axis=-1).reshape(-1, 3) * 0.1
+
+
+def doubled(rng):
+    places = rng.uniform(0, 1, (150, 3))
+    return np.concatenate([places, places[:80], np.repeat(places[:2], 70, axis=0)])
+
+
+def cluster_and_outliers(rng):
+    cluster = 0.01 * rng.uniform(0, 1, (300, 3)) + 0.5
+    return np.concatenate([rng.uniform(0, 1, (60, 3)), cluster, [[500.0, 0, 0], [-900, 3, 4]]])
+
+
+def equal(rng):
+    return np.ones((90, 3))
+
+
+CLOUDS = (lattice, doubled, cluster_and_outliers, equal)
+
+
+def in_order(make):
+    """A cloud in canonical order."""
+    points = torch.from_numpy(make(np.random.default_rng(0)).astype(np.float32))
+    return points[finite_rows(points)].numpy()
+
+
+def nearest(points, k):
+    """The first k rows of all points by (not itself, distance, row)."""
+    away = points[:, None].astype(np.float64) - points
+    distances = np.sqrt(away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2)
+    np.fill_diagonal(distances, -1.0)
+    return np.argsort(distances, axis=1, kind="stable")[:, :k]
+
+
+def tiles_of(boxes, size):
+    """Ranges of about so many rows that end where boxes do."""
+    ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, boxes.starts[-1], size))]
+    bounds = np.unique(np.append(ends, boxes.starts[-1])).tolist()
+    return [slice(*rows) for rows in itertools.pairwise(bounds)]
+
+
+@pytest.mark.parametrize("make", CLOUDS)
+@pytest.mark.parametrize(("size", "most"), [(5, None), (60, None), (100, 130), (100, 1)])
+def test_neighbors_of_tiles_are_the_nearest_of_all(make, size, most):
+    points = in_order(make)
+    boxes = find_boxes(points, 8)
+    for k in (1, 12):
+        found = [search_tile(points, boxes, tile, k, most) for tile in tiles_of(boxes, size)]
+        np.testing.assert_array_equal(np.concatenate(found), nearest(points, k))
+
+
+@pytest.mark.parametrize("make", CLOUDS)
+def test_boxes_hold_few_points_each_and_all_together(make):
+    points = in_order(make)
+    boxes = find_boxes(points, 8)
+    assert boxes.starts[0] == 0
+    assert boxes.starts[-1] == len(points)
+    for box, (start, stop) in enumerate(itertools.pairwise(boxes.starts)):
+        inside = points[start:stop]
+        assert len(inside) <= 8 or (inside == inside[0]).all()
+        np.testing.assert_array_equal(boxes.low[box], inside.min(axis=0))
+        np.testing.assert_array_equal(boxes.high[box], inside.max(axis=0))
+
+
+def test_near_boxes_are_those_with_a_corner_within_reach():
+    points = in_order(cluster_and_outliers)
+    boxes = find_boxes(points, 8)
+    chosen, reach = np.arange(0, len(boxes.low), 2), np.random.default_rng(1).uniform(0, 0.4, 999)
+    gap = np.maximum(
+        boxes.low - boxes.high[chosen][:, None], boxes.low[chosen][:, None] - boxes.high
+    ).clip(min=0)
+    expected = np.linalg.norm(gap, axis=2) <= reach[: len(chosen), None]
+    found = np.zeros_like(expected)
+    for some, near, within in near_boxes(boxes, chosen, reach[: len(chosen)]):
+        found[np.ix_(range(some.start, some.stop), near)] = within
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_bound_of_a_box_holds_for_all_its_points():
+    points = in_order(cluster_and_outliers)
+    boxes = find_boxes(points, 8)
+    last = points[nearest(points, 12)[:, -1]].astype(np.float64)
+    distances = np.linalg.norm(last - points, axis=1)
+    for box, (start, stop) in enumerate(itertools.pairwise(boxes.starts)):
+        assert distances[start:stop].max() <= farthest_neighbor(boxes, box, 12)
+
+
+def test_a_part_has_all_points_within_so_many_steps():
+    lists = torch.from_numpy(np.random.default_rng(0).integers(0, 400, (400, 3)))
+    lists[:, 0] = torch.arange(400)
+    reached = set(range(100, 120))
+    for steps in range(4):
+        part = cut_part(lists, slice(100, 120), steps)
+        assert part.rows.tolist() == sorted(reached)
+        assert part.rows[part.own].tolist() == list(range(100, 120))
+        for row, near in zip(part.rows.tolist(), part.neighbors.indices.tolist(), strict=True):
+            wanted = [other if other in reached else row for other in lists[row].tolist()]
+            assert part.rows[torch.tensor(near)].tolist() == wanted
+        reached |= {other for row in reached for other in lists[row].tolist()}

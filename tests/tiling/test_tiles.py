@@ -1,0 +1,168 @@
+"""Clouds in tiles: what comes out is what comes out in memory, to the last bit."""
+
+import dataclasses
+import errno
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.config import load_config
+from torchrg.errors import ConfigError, FormatError
+from torchrg.normals import STEPS
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+from torchrg.structures import Cloud
+from torchrg.tiling import STAGES, TileFiles, TileTask, segment_tiles, stages
+
+PRESETS = ("classic", "paper", "consensus")
+RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
+
+
+def settings(preset, k=16):
+    """A preset with few neighbours, so that a tile of a small cloud is not all of it."""
+    config = load_config(preset)
+    return dataclasses.replace(
+        config,
+        normals=dataclasses.replace(config.normals, k=k),
+        growing=dataclasses.replace(config.growing, min_size=12),
+        planes=dataclasses.replace(config.planes, up="z"),
+    )
+
+
+def difficult_room(num_points):
+    """A room with duplicates, a dense cluster in sparse surroundings, far points, and NaN."""
+    rng = np.random.default_rng(3)
+    room = make_room(num_points=num_points, noise=0.003, seed=1).points.double().numpy()
+    cluster = rng.uniform(0, 0.05, (num_points // 4, 3)) * [1, 1, 0] + [1.0, 1.0, 0.5]
+    sparse = rng.uniform(-20, 20, (num_points // 20, 3)) * [1, 1, 0]
+    far = np.array([[4e3, 0, 0], [-3e3, 5, 5], [-3e3, 5, 5]])
+    parts = [room, room[: num_points // 5], np.repeat(room[:2], 150, axis=0), cluster, sparse, far]
+    points = np.concatenate(parts)
+    rng.shuffle(points)
+    points[::97] = np.nan
+    points[5, 1] = np.inf
+    return points.astype(np.float32)
+
+
+def wall(num_points):
+    """One noisy wall in a national grid, far from the origin, in double precision."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform(0, 1, (num_points, 3)) * [10, 0, 3] + [5e6, 4e5, 100]
+    points[:, 1] += 0.003 * rng.normal(size=num_points)
+    return points
+
+
+def assert_same(found, expected):
+    """Check that two segmentations are equal to the last bit."""
+    for name in RESULTS:
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+    for name, values in expected.planes._asdict().items():
+        same = getattr(found.planes, name)
+        if name == "adjacency":
+            assert all(torch.equal(a, b) for a, b in zip(same, values, strict=True))
+        elif isinstance(values, torch.Tensor):
+            assert torch.equal(same, values), name
+
+
+def segment(points, folder, config, size, **options):
+    """Segment points that come in three chunks."""
+    chunks = (Cloud(part) for part in np.array_split(points, 3))
+    return segment_tiles(chunks, folder, config, tile_size=size, **options)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("make", [difficult_room, wall])
+def test_tiles_give_the_result_of_the_whole(make, preset, tmp_path):
+    points, config = make(2500), settings(preset)
+    whole = segment_planes(Cloud(points).points, config)
+    assert len(whole.planes.count) > 0
+    assert_same(segment(points, tmp_path, config, 900), whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [2_000, 10_000, 50_000])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_tiles_of_all_sizes_give_the_result_of_a_large_room(preset, size, tmp_path):
+    points, config = difficult_room(80_000), load_config(preset)
+    whole = segment_planes(Cloud(points).points, config)
+    assert_same(segment(points, tmp_path, config, size), whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", STEPS)
+def test_every_estimator_is_told_how_far_it_looks(method, tmp_path):
+    config = settings("classic")
+    config = dataclasses.replace(config, normals=dataclasses.replace(config.normals, method=method))
+    points = difficult_room(2500)
+    assert_same(
+        segment(points, tmp_path, config, 700), segment_planes(Cloud(points).points, config)
+    )
+
+
+@pytest.mark.parametrize("num_points", [0, 1, 2, 7])
+def test_few_points_are_a_cloud_too(num_points, tmp_path):
+    points = np.full((num_points + 1, 3), np.nan, dtype=np.float32)
+    points[1:] = np.arange(3 * num_points).reshape(-1, 3) ** 2
+    found = segment(points, tmp_path, settings("consensus"), 3)
+    assert_same(found, segment_planes(Cloud(points).points, settings("consensus")))
+
+
+def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
+    points, config = wall(1500), settings("classic")
+    whole = segment_planes(Cloud(points).points, config)
+    done = []
+    run = TileTask.run
+    monkeypatch.setattr(TileTask, "run", lambda task: (run(task), done.append(task.name)))
+    for name in ("read_points", "sort_points", "grow_regions", "finish_regions"):
+        step = getattr(stages, name)
+        counted = lambda *given, step=step: (step(*given), done.append(step.__name__))  # noqa: E731
+        monkeypatch.setattr(f"torchrg.tiling.{name}", counted)
+    ends = ((stage, count) for stage in STAGES for count in (0, 1))
+    # Every second stage begins, and ends the run with its first tile or with none.
+    for stage, count in itertools.islice(ends, 0, None, 3):
+
+        def stop(begun, number, of, *, stage=stage, count=count):
+            if (begun, number) == (stage, count):
+                raise KeyboardInterrupt
+
+        try:
+            segment(points, tmp_path, config, 500, on_stage=stop)
+        except KeyboardInterrupt:
+            continue
+    assert_same(segment(points, tmp_path, config, 500), whole)
+    assert len(done) == len(set(done)) > 12
+    assert_same(segment_tiles([], tmp_path, config), whole)
+    TileFiles(tmp_path).remove_all()
+    assert not tmp_path.exists()
+
+
+def test_work_of_other_settings_or_files_is_refused(tmp_path):
+    points = wall(300)
+    segment(points, tmp_path, settings("classic"), 100, identity={"file": "a"})
+    for preset, file in (("classic", "b"), ("paper", "a")):
+        with pytest.raises(FormatError, match="holds the work of another cloud"):
+            segment(points, tmp_path, settings(preset), 100, identity={"file": file})
+
+
+def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
+    files = TileFiles(tmp_path, {})
+    with (
+        pytest.raises(FormatError, match=r"a\.npy: cannot be written: No space left.*goes on"),
+        files.writing(files.path("a")),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
+    with pytest.raises(FormatError, match=r"expected 0\.\d GB of free disk for the work, got 0\.0"):
+        segment(wall(300), tmp_path / "b", settings("classic"), 100)
+
+
+def test_settings_that_look_at_the_whole_cloud_are_refused(tmp_path):
+    config = settings("consensus")
+    config = dataclasses.replace(config, normals=dataclasses.replace(config.normals, adaptive_k=99))
+    with pytest.raises(ConfigError, match=r"expected normals\.adaptive_k of none, got 99"):
+        segment(wall(300), tmp_path, config, 100)
+    with pytest.raises(ConfigError, match="expected tile_size >= 1, got 0"):
+        segment(wall(300), tmp_path, settings("classic"), 0)

@@ -1,0 +1,147 @@
+"""A cloud in tiles, as a command does it: within a limit of memory, alone in its directory."""
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchrg.batch.convert import ScanReport, report_on
+from torchrg.batch.records import describe_versions, hash_file
+from torchrg.batch.run import LOCK, DirectoryLock, Reports
+from torchrg.batch.scans import Converted, Scan
+from torchrg.config import PipelineConfig
+from torchrg.errors import ConfigError, FormatError
+from torchrg.structures import Cloud, Segmentation
+from torchrg.tiling import TileFiles, TileTask, run_in_turn, segment_tiles
+
+_BASE_BYTES = 500_000_000
+"""Of a process before the first point: Python, torch, scipy."""
+_BYTES_PER_POINT = 110
+"""What the steps that look at the whole cloud take for each of its points."""
+_BYTES_PER_TILE_POINT = 2_000
+"""What a tile takes for each of its own, with those around it."""
+_TILE_SIZES = (20_000, 2_000_000)
+"""Points. Smaller tiles are mostly what is around them, larger ones gain nothing."""
+
+
+def choose_tile_size(num_points: int, memory_limit: int) -> int:
+    """Return how many points a tile may have for a cloud to stay within a limit of memory, bytes.
+
+    Raises:
+        ConfigError: If the steps that look at the whole cloud take more than the limit.
+
+    Example:
+        >>> choose_tile_size(10_000_000, 3_000_000_000)
+        1250000
+    """
+    least, most = _TILE_SIZES
+    needed = _BASE_BYTES + max(_BYTES_PER_POINT * num_points, _BYTES_PER_TILE_POINT * least)
+    if needed > memory_limit:
+        raise ConfigError(
+            f"expected --limit-memory of at least {needed / 1e9:.1f} GB for about {num_points:,} "
+            f"points, got {memory_limit / 1e9:.1f} GB; raise it, or split the cloud."
+        )
+    return max(least, min((memory_limit - _BASE_BYTES) // _BYTES_PER_TILE_POINT, most))
+
+
+@contextlib.contextmanager
+def segmented_in_tiles(
+    sources: Sequence[Path],
+    chunks: Iterable[Cloud],
+    folder: Path,
+    settings: PipelineConfig,
+    *,
+    tile_size: int,
+    start: Callable[[Sequence["TileJob"]], Reports] | None = None,
+    on_stage: Callable[[str, int, int], None] | None = None,
+) -> Iterator[Segmentation]:
+    """Segment files as one cloud, and remove the working directory when the result is used.
+
+    Where the work or what is done with the result ends early, the directory stays, and the same
+    call goes on from there.
+
+    Args:
+        sources: The files.
+        chunks: Their points.
+        folder: Working directory; another process that works there is refused.
+        settings: Of the pipeline.
+        tile_size: Points of a tile.
+        start: Starts an engine on the jobs of a stage. Default: this process, tile by tile.
+        on_stage: See :func:`torchrg.tiling.segment_tiles`.
+
+    Yields:
+        The segmentation.
+
+    Raises:
+        FormatError: If another process works in the directory, or a tile failed.
+    """
+    inputs = [{"name": path.name, "sha256": hash_file(path)} for path in sources]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"{folder}: cannot be made: {error.strerror or error}.") from error
+    files = TileFiles(folder)
+    with DirectoryLock(folder):
+        try:
+            yield segment_tiles(
+                chunks,
+                folder,
+                settings,
+                tile_size=tile_size,
+                identity={"inputs": inputs, "versions": describe_versions()},
+                run=run_in_turn if start is None else lambda tasks: _run_jobs(tasks, start),
+                on_stage=on_stage,
+            )
+        except BaseException:
+            if not files.is_begun:
+                _remove(files)
+            raise
+        _remove(files)
+
+
+def _remove(files: TileFiles) -> None:
+    """Remove the working directory, unless something else is in it."""
+    (files.folder / LOCK).unlink(missing_ok=True)
+    files.remove_all()
+
+
+@dataclass(frozen=True)
+class TileJob:
+    """The work on a tile, as engines take it."""
+
+    task: TileTask
+
+    @property
+    def scan(self) -> Scan:
+        """The tile under the name of its stage; its size is one of memory."""
+        return Scan(self.task.name, (), self.task.num_points * _BYTES_PER_TILE_POINT // 1_100)
+
+    def remove_leftovers(self) -> None:
+        """Do nothing: a tile is written where it belongs."""
+
+
+def work_on_tile(job: TileJob) -> ScanReport:
+    """Work on a tile; what goes wrong is in the report."""
+
+    def work(begin: Callable[[str], None]) -> Converted:
+        begin(job.task.stage)
+        job.task.run()
+        return Converted(job.task.num_points, 0, ())
+
+    return report_on(job.task.name, work)
+
+
+def _run_jobs(
+    tasks: Sequence[TileTask], start: Callable[[Sequence[TileJob]], Reports]
+) -> Iterator[TileTask]:
+    """Run tasks on an engine, and yield each that is done; raise FormatError for one that fails."""
+    by_name = {task.name: task for task in tasks}
+    if not tasks:
+        return
+    with contextlib.closing(start([TileJob(task) for task in tasks])) as reports:
+        for report in reports:
+            if report is None:
+                continue
+            if report.status == "failed":
+                raise FormatError(f"{report.name}: {report.reason}")
+            yield by_name[report.name]
