@@ -107,6 +107,14 @@ def test_colours_out_of_range_are_the_same_error(tmp_path):
             read(tmp_path / "a.npz")
 
 
+@pytest.mark.parametrize("name", ["labels", "normals", "color"])
+def test_fields_of_a_wrong_shape_are_the_same_error(tmp_path, name):
+    np.savez(tmp_path / "a.npz", points=np.zeros((60, 3)), **{name: np.zeros((60, 2), complex)})
+    for read in (read_cloud, lambda path: list(stream_cloud(path, chunk_size=7))):
+        with pytest.raises(FormatError, match=r"got shape \(N, 2\) of complex128"):
+            read(tmp_path / "a.npz")
+
+
 def test_las_dimension_that_one_point_uses_is_a_field_of_all(tmp_path):
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")

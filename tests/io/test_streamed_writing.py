@@ -230,6 +230,14 @@ def test_number_of_points_is_held_to(tmp_path, make_cloud, kind, promised):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("kind", list(FORMATS))
+def test_field_of_more_values_than_points_is_refused(tmp_path, make_cloud, kind):
+    needs(kind)
+    message = r"a\.\w+: expected field more of shape \(60, \.\.\.\), got \(61,\)"
+    with pytest.raises(FormatError, match=message):
+        write_cloud(tmp_path / f"a{kind}", replace(make_cloud(), fields={"more": np.ones(61)}))
+
+
 def test_segmentation_of_another_stream_is_refused(tmp_path, make_cloud, make_segmentation):
     stream = CloudStream.of(make_cloud(), chunk_size=7)
     with pytest.raises(FormatError, match=r"a\.ply: expected a segmentation of 60 points, got 59"):

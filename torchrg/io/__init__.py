@@ -193,9 +193,9 @@ def write_cloud(
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
         cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
-            same bytes (``.laz``: the same points). Its chunks are gone through two or three times,
-            for ``.npz`` without a segmentation once for each field; tensors of the results may be
-            mapped from files then, as they are taken chunk by chunk, too.
+            same bytes. Its chunks are gone through two or three times, for ``.npz`` without a
+            segmentation once for each field. Tensors of the results are taken chunk by chunk, too,
+            so they may be mapped from files.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
         superpoints: What :func:`torchrg.make_superpoints` said about them.
         provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
@@ -216,6 +216,8 @@ def write_cloud(
     found = _format_of(target)
     if isinstance(cloud, Cloud):
         check_output(target, cloud)
+        for name, values in cloud.fields.items():
+            check_length(target, name, values, len(cloud))
         points = checked_coordinates(target, cloud.coordinates)
         stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=CHUNK_SIZE)
     else:

@@ -58,6 +58,11 @@ WIDEN = 257
 """65535 / 255: what eight bits become in sixteen, and back without loss."""
 
 
+def _row_text(values: NDArray[Any]) -> str:
+    """Return the shape of a field for a message, which is the same for a chunk and the whole."""
+    return f"({', '.join(['N', *map(str, values.shape[1:])])})"
+
+
 class Span(NamedTuple):
     """What the values of a column are between: all that the type of a colour depends on.
 
@@ -317,7 +322,7 @@ def _labels(path: Path, labels: NDArray[Any]) -> NDArray[np.int64]:
     flat = labels.reshape(-1) if labels.shape[1:] == (1,) else labels
     if flat.ndim != 1 or flat.dtype.kind not in "biuf":
         raise FormatError(
-            f"{path}: expected one whole number a point as labels, got shape {labels.shape} "
+            f"{path}: expected one whole number a point as labels, got shape {_row_text(labels)} "
             f"of {labels.dtype}; rename or remove that field."
         )
     if flat.dtype.kind == "f":
@@ -367,6 +372,6 @@ def _check_triples(path: Path, name: str, values: NDArray[Any]) -> None:
     """Check that a field is three real numbers a point."""
     if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
         raise FormatError(
-            f"{path}: expected {name} to be three numbers a point, got shape {values.shape} "
+            f"{path}: expected {name} to be three numbers a point, got shape {_row_text(values)} "
             f"of {values.dtype}; rename or remove that field."
         )

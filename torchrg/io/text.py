@@ -116,13 +116,13 @@ def _read_table(
     delimiter: str | None = None,
     comments: str | None = None,
 ) -> Iterator[NDArray[np.void]]:
-    """Read rows of numbers, all by default, so many lines at a time; blank lines do not count.
+    """Read rows of numbers, all by default, a few lines at a time; blank ones do not count.
 
     Lines are read only as far as needed, the first of them being number ``first_line`` of the file.
     """
-    count, line_number = 0, first_line
+    count, line_number, at_once = 0, first_line, min(chunk_size, LINES_AT_ONCE)
     while num_rows is None or count < num_rows:
-        limit = chunk_size if num_rows is None else min(chunk_size, num_rows - count)
+        limit = at_once if num_rows is None else min(at_once, num_rows - count)
         block = list(islice(lines, limit))
         if not block:
             break
