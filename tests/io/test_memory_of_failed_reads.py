@@ -11,7 +11,7 @@ from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
 from torchrg.structures import Cloud
 
-NUM_POINTS = 20_000
+NUM_POINTS = 2_000
 NUM_READS = 10_000
 MOST_KEPT_BYTES = 10_000_000
 """A kilobyte a read."""
