@@ -223,6 +223,20 @@ def test_scattered_normals_make_a_region_curved_only_where_noise_does_not_explai
         assert (found.fit.curved.tolist(), found.noise.tolist()) == ([True], [0.0])
 
 
+@pytest.mark.parametrize("width", [0.2, 1.0])
+def test_a_bend_is_thick_for_its_width_and_scatter_is_not(width):
+    rng = np.random.default_rng(16)
+    turn, along = rng.uniform(-0.3, 0.3, 2000), rng.uniform(0, 1, 2000)
+    radius = width / 0.6
+    arc = np.stack([radius * np.sin(turn), along, radius * np.cos(turn)], axis=1)
+    normals = np.stack([np.sin(turn), 0 * turn, np.cos(turn)], axis=1)
+    flat = sheet(rng, 2000) * [width, 1, 1]
+    for points, own, curved in ((arc, normals, True), (flat, scattered(rng, 2000, 8.0), False)):
+        segments = Segments(torch.zeros(2000, dtype=torch.int64))
+        fit = fit_planes(segments, torch.tensor(points), torch.tensor(own))
+        assert fit.curved.tolist() == [curved]
+
+
 @pytest.mark.parametrize("scatter_deg", [0.0, 12.0])
 def test_what_lies_within_the_noise_of_a_larger_face_is_part_of_it(scatter_deg):
     rng = np.random.default_rng(13)

@@ -52,6 +52,10 @@ _BENT = 0.5
 """Reaches. A region thicker than this share of the reach that its points have is bent: twice as
 thick as the neighbourhoods in it. From 0.3 to 0.5 made rooms come out the same."""
 
+_LEAST_HEIGHT = 0.2
+"""Of the product of angle and width, both as standard deviations: an arc is 0.45 of it thick, a cap
+of a sphere 0.41. Scattered normals in a thin region are noise."""
+
 _MAX_TILT_DEG = 15.0
 """A floor or ceiling is within this angle of horizontal, a wall of vertical."""
 
@@ -323,7 +327,12 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
         ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
     along = axes[:, :, 2]
-    center, sizes, curved = origin + mean, segments.counts, spread > _CURVED_SPREAD_DEG
+    # The angle times the width across the bend, which is at least the middle one, is its height.
+    height = _LEAST_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
+    # Of an arc without width the plane is its own, and says nothing of its thickness.
+    crosses = (usual * normal).sum(dim=1).abs() > math.sqrt(0.5)
+    curved = (spread > _CURVED_SPREAD_DEG) & ~(crosses & (thickness < height))
+    center, sizes = origin + mean, segments.counts
     return FittedPlanes(normal, center, along, covariance, thickness, residuals, sizes, curved)
 
 
