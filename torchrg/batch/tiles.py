@@ -12,7 +12,7 @@ from torchrg.batch.scans import Converted, Scan
 from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiling import TileFiles, TileTask, run_in_turn, segment_tiles
+from torchrg.tiling import TILE_SIZE, TileFiles, TileTask, run_in_turn, segment_tiles
 
 _BASE_BYTES = 500_000_000
 """Of a process before the first point: Python, torch, scipy."""
@@ -20,8 +20,8 @@ _BYTES_PER_POINT = 110
 """What the steps that look at the whole cloud take for each of its points."""
 _BYTES_PER_TILE_POINT = 2_000
 """What a tile takes for each of its own, with those around it."""
-_TILE_SIZES = (20_000, 2_000_000)
-"""Points. Smaller tiles are mostly what is around them, larger ones gain nothing."""
+_SMALLEST_TILE = 20_000
+"""Points. Smaller ones are mostly what is around them."""
 
 
 def choose_tile_size(num_points: int, memory_limit: int) -> int:
@@ -31,17 +31,18 @@ def choose_tile_size(num_points: int, memory_limit: int) -> int:
         ConfigError: If the steps that look at the whole cloud take more than the limit.
 
     Example:
-        >>> choose_tile_size(10_000_000, 3_000_000_000)
-        1250000
+        >>> choose_tile_size(1_000_000, 800_000_000)
+        150000
     """
-    least, most = _TILE_SIZES
-    needed = _BASE_BYTES + max(_BYTES_PER_POINT * num_points, _BYTES_PER_TILE_POINT * least)
+    most = (memory_limit - _BASE_BYTES) // _BYTES_PER_TILE_POINT
+    least = max(_BYTES_PER_POINT * num_points, _BYTES_PER_TILE_POINT * _SMALLEST_TILE)
+    needed = _BASE_BYTES + least
     if needed > memory_limit:
         raise ConfigError(
             f"expected --limit-memory of at least {needed / 1e9:.1f} GB for about {num_points:,} "
             f"points, got {memory_limit / 1e9:.1f} GB; raise it, or split the cloud."
         )
-    return max(least, min((memory_limit - _BASE_BYTES) // _BYTES_PER_TILE_POINT, most))
+    return min(most, TILE_SIZE)
 
 
 @contextlib.contextmanager
