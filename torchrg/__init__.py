@@ -9,6 +9,7 @@ from torchrg.normals import estimate_normals
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions import grow_regions
 from torchrg.structures import UNLABELED, Cloud
+from torchrg.tiling import segment_tiles
 
 __version__ = "0.1.0"
 
@@ -30,6 +31,7 @@ __all__ = [
     "scenes",
     "search_knn",
     "segment_planes",
+    "segment_tiles",
     "transforms",
     "write_cloud",
 ]

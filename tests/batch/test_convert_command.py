@@ -111,7 +111,7 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, cap
     monkeypatch.setattr("torchrg.batch.run.DirectoryLock.__init__.__kwdefaults__", {"patience": 0})
     with DirectoryLock(tmp_path):
         assert convert("folder", rooms, tmp_path) == 2
-    assert "another torchrg convert (process" in capsys.readouterr().err
+    assert "another torchrg command (process" in capsys.readouterr().err
     assert not contents(tmp_path)
 
 

@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.config import load_config
+from torchrg.config import NormalsConfig, load_config
 from torchrg.errors import ConfigError, FormatError
-from torchrg.normals import STEPS
+from torchrg.neighbors import finite_rows, search_knn
+from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.pipeline import segment_planes
+from torchrg.regions.edges import checked_cloud
+from torchrg.regions.growth import _grow
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 from torchrg.tiling import STAGES, TileFiles, TileTask, segment_tiles, stages
+from torchrg.tiling.parts import cut_part
 
 PRESETS = ("classic", "paper", "consensus")
 RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
@@ -166,3 +170,47 @@ def test_settings_that_look_at_the_whole_cloud_are_refused(tmp_path):
         segment(wall(300), tmp_path, config, 100)
     with pytest.raises(ConfigError, match="expected tile_size >= 1, got 0"):
         segment(wall(300), tmp_path, settings("classic"), 0)
+
+
+def noisy_cube(num_points):
+    """Three faces of a cube in canonical order: exact in one half, where reach is not known."""
+    rng = np.random.default_rng(6)
+    points = rng.uniform(0, 1, (num_points, 3))
+    points[np.arange(num_points), rng.integers(0, 3, num_points)] = 0
+    points += 0.02 * rng.normal(size=points.shape) * (points[:, :1] > 0.5)
+    cloud = torch.from_numpy(points.astype(np.float32))
+    return cloud[finite_rows(cloud)]
+
+
+@pytest.mark.parametrize("method", ["pca", "paper", "consensus"])
+def test_the_points_around_a_tile_decide_its_normals(method):
+    points = noisy_cube(4000)
+    neighbors, config = search_knn(points, 12), NormalsConfig(method=method, k=12)
+    whole = ESTIMATORS[method](points, neighbors, config, 4000)
+    for start in range(0, 4000, 250):
+        part = cut_part(neighbors.indices, slice(start, start + 10), STEPS[method])
+        found = ESTIMATORS[method](points[part.rows], part.neighbors, config, 4000)
+        for one, other in zip(found[:4], whole[:4], strict=True):
+            assert torch.equal(one[part.own], other[start : start + 10])
+
+
+@pytest.mark.parametrize("preset", ["paper", "consensus"])
+def test_the_points_around_a_tile_decide_its_edges(preset, tmp_path):
+    points, config = noisy_cube(700), settings(preset, k=12)
+
+    def stop(stage, done, of):
+        if stage == "regions":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        segment(points.numpy(), tmp_path, config, 30, on_stage=stop)
+    neighbors = search_knn(points, 12)
+    fit = ESTIMATORS[config.normals.method](points, neighbors, config.normals, 4000)
+    cloud = checked_cloud(
+        config.growing, points, *fit[:2], neighbors, fit.valid, None, fit.residual_rms
+    )
+    heads = _grow(cloud, config.growing, 4000)
+    assert len(np.unique(heads)) > 20
+    np.testing.assert_array_equal(TileFiles(tmp_path).load("heads"), heads)
+    if cloud.reach is not None:
+        assert bool(cloud.reach.isinf().any() and cloud.reach.isfinite().any())

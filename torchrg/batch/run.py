@@ -207,7 +207,7 @@ class DirectoryLock:
                     holder = os.pread(self.descriptor, 200, 0).decode(errors="replace").strip()
                     os.close(self.descriptor)
                     raise FormatError(
-                        f"{folder}: another torchrg convert ({holder or 'unknown'}) writes here; "
+                        f"{folder}: another torchrg command ({holder or 'unknown'}) writes here; "
                         "wait for it, stop it, or choose another directory."
                     ) from None
                 time.sleep(0.05)
