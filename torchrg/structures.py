@@ -1,7 +1,7 @@
 """What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import ModuleType
@@ -71,26 +71,6 @@ class Cloud:
             return torch.from_numpy(np.ascontiguousarray(self.coordinates))
         local = self.coordinates.astype(np.float64) - origin
         return torch.from_numpy(local.astype(np.float32))
-
-
-def join_clouds(clouds: Sequence[Cloud]) -> Cloud:
-    """Return clouds one after the other as one, with the fields that all of them have alike.
-
-    A field of another shape in one of them is left out, and so are headers and grids.
-
-    Example:
-        >>> one = Cloud(np.zeros((2, 3)), {"labels": np.array([0, 1]), "time": np.zeros(2)})
-        >>> both = join_clouds([one, Cloud(np.ones((1, 3)), {"labels": np.array([5])})])
-        >>> len(both), both.fields["labels"].tolist(), list(both.fields)
-        (3, [0, 1, 5], ['labels'])
-    """
-    fields = {}
-    for name in clouds[0].fields:
-        values = [cloud.fields[name] for cloud in clouds if name in cloud.fields]
-        if len(values) == len(clouds) and len({part.shape[1:] for part in values}) == 1:
-            fields[name] = np.concatenate(values)
-    coordinates = np.concatenate([cloud.coordinates for cloud in clouds])
-    return Cloud(coordinates, fields, source=clouds[0].source)
 
 
 def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:

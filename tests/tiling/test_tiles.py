@@ -14,8 +14,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.pipeline import segment_planes
-from torchrg.regions.edges import checked_cloud
-from torchrg.regions.growth import _grow
+from torchrg.regions.growth import _grow, checked_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 from torchrg.tiling import STAGES, TileFiles, TileTask, segment_tiles, stages

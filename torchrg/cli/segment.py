@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,6 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
 from torchrg.batch.run import Reports
@@ -21,13 +20,21 @@ from torchrg.batch.tiles import TileJob, choose_tile_size, segmented_in_tiles, w
 from torchrg.cli import console
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.errors import ConfigError
-from torchrg.io import check_output, estimate_points, read_cloud, write_cloud
+from torchrg.io import (
+    CloudStream,
+    check_output,
+    estimate_points,
+    merge_streams,
+    read_cloud,
+    stream_cloud,
+    write_cloud,
+)
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
 from torchrg.render.page import check_library
-from torchrg.structures import Cloud, Segmentation, join_clouds
+from torchrg.structures import Segmentation
 from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -149,11 +156,15 @@ def _segment(
     """Segment a cloud of one file or of several, in tiles if it is too large for memory."""
     given = arguments.limit_memory
     limit = available_memory() // 2 if given is None else int(given * 1e9)
-    num_points = sum(map(estimate_points, sources))
+    stream = _stream(sources)
+    # Of text only reading says how many points there are.
+    num_points = stream.num_points or sum(map(estimate_points, sources))
     if memory_of_scan(num_points) > limit:
-        _segment_tiles(arguments, sources, target, num_points, limit)
+        # A header that promises more than the file holds is refused before anything is planned.
+        next(iter(stream))
+        _segment_tiles(arguments, sources, stream, target, num_points, limit)
     else:
-        _segment_whole(arguments, sources, target, picture)
+        _segment_whole(arguments, sources, stream, target, picture)
 
 
 def _name_of(sources: tuple[Path, ...]) -> str:
@@ -161,21 +172,21 @@ def _name_of(sources: tuple[Path, ...]) -> str:
     return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
 
 
-def _read(sources: tuple[Path, ...]) -> Cloud:
-    """Read files as one cloud."""
-    clouds = [read_cloud(source) for source in sources]
-    return clouds[0] if len(clouds) == 1 else join_clouds(clouds)
-
-
-def _chunks(sources: tuple[Path, ...]) -> Iterator[Cloud]:
-    """Read the points of files in chunks."""
-    for source in sources:
-        coordinates = read_cloud(source).coordinates
-        yield from (Cloud(coordinates[rows]) for rows in chunks_of(len(coordinates), ROWS_AT_ONCE))
+def _stream(sources: tuple[Path, ...]) -> CloudStream:
+    """Open files as one cloud, and say what they do not share."""
+    stream, notes = merge_streams([stream_cloud(source) for source in sources])
+    for note in notes:
+        console.warn(f"{_name_of(sources)}: {note}.")
+    return stream
 
 
 def _segment_tiles(
-    arguments: Arguments, sources: tuple[Path, ...], target: Path, num_points: int, limit: int
+    arguments: Arguments,
+    sources: tuple[Path, ...],
+    stream: CloudStream,
+    target: Path,
+    num_points: int,
+    limit: int,
 ) -> None:
     """Segment a cloud in tiles, after a line that says so."""
     begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
@@ -201,14 +212,14 @@ def _segment_tiles(
 
         with segmented_in_tiles(
             sources,
-            _chunks(sources),
+            stream,
             workdir,
             settings,
             tile_size=tile_size,
             start=_engine(arguments, limit),
             on_stage=show,
         ) as seg:
-            write_cloud(target, _read(sources), seg, provenance=_describe(sources, settings))
+            write_cloud(target, stream, seg, provenance=_describe(sources, settings))
             _report(source, seg, target, time.perf_counter() - begin)
 
 
@@ -230,11 +241,15 @@ def _describe(sources: tuple[Path, ...], settings: PipelineConfig) -> dict[str, 
 
 
 def _segment_whole(
-    arguments: Arguments, sources: tuple[Path, ...], target: Path, picture: Path | None
+    arguments: Arguments,
+    sources: tuple[Path, ...],
+    stream: CloudStream,
+    target: Path,
+    picture: Path | None,
 ) -> None:
     """Segment a cloud, with a progress bar on a terminal and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
-    cloud = _read(sources)
+    cloud = read_cloud(sources[0]) if len(sources) == 1 else stream.read()
     for note in check_finite(cloud):
         console.warn(f"{source}: {note}.")
     check_output(target, cloud)
