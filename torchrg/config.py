@@ -102,7 +102,7 @@ class GrowingConfig:
     """A neighbour whose colour differs by more than this (Euclidean, in the unit of the colours)
     does not join. None: not tested."""
     min_size: int = 50
-    """Smaller regions are not labelled."""
+    """Smaller regions are not labelled. With ``absorb`` the points at their borders count."""
     cut_bridges: bool = False
     """Whether regions of several faces that a few doubtful points join are split: faces 12 degrees
     apart, floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
@@ -121,7 +121,8 @@ class GrowingConfig:
     within reach by the line in which these meet. Only with ``absorb``. Most of all in faces a few
     centimetres wide."""
     merge_coplanar: bool = False
-    """Whether flat regions that touch and lie on one plane then become one."""
+    """Whether regions that touch and lie on one plane then become one, those included that lie
+    within the noise of a larger one, as the residuals of the normals tell it."""
     merge_tolerance: float = 1.2
     """They lie on one plane when neither is thicker about it than this many times what it is about
     its own."""

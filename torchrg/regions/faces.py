@@ -115,6 +115,8 @@ def cut_bridges(
     sound &= others[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
     cores = torch.where(sound, labels + int(cores.max()) + 1, cores)
     cores = torch.unique(cores, return_inverse=True)[1] - int((cores < 0).any())
+    around = _gather(cores.to(torch.int32), cloud.neighbors.indices[rows])
+    rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
 
     owner = torch.full((int(cores.max()) + 1,), UNLABELED, device=labels.device)
@@ -181,8 +183,9 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> tuple[Growing
     """Return some points as a cloud, and which neighbours are in it and of the point's region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-    indices = cloud.neighbors.indices[rows].long()
-    counted = (labels[indices] == labels[rows, None]) & (row_of[indices] >= 0)
+    indices = cloud.neighbors.indices[rows]
+    places = _gather(row_of, indices)
+    counted = (_gather(labels.to(torch.int32), indices) == labels[rows, None]) & (places >= 0)
     if cloud.neighbors.valid is not None:
         counted &= cloud.neighbors.valid[rows]
     own = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
@@ -191,7 +194,7 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> tuple[Growing
         cloud.points[rows],
         cloud.normals[rows],
         cloud.curvature[rows],
-        Neighbors(torch.where(counted, row_of[indices], own), counted),
+        Neighbors(torch.where(counted, places, own), counted),
         cloud.valid[rows],
         colors,
         reach,
@@ -199,12 +202,17 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> tuple[Growing
     return part, counted
 
 
+def _gather(values: Tensor, indices: Tensor) -> Tensor:
+    """Return values ``(N,)`` at places ``(n, K)``."""
+    return values.index_select(0, indices.reshape(-1)).view(indices.shape)
+
+
 def _find_edges(
     cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _Edges:
     """Return the edges of some points."""
     targets = cloud.neighbors.indices[rows].long()
-    inside = labels[targets] == labels[rows, None]
+    inside = _gather(labels, targets) == labels[rows, None]
     if cloud.neighbors.valid is not None:
         inside &= cloud.neighbors.valid[rows]
     passed = torch.zeros_like(inside)
