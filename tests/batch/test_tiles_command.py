@@ -69,7 +69,10 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--limit-memory", "0.1"), "expected --limit-memory of at least 0.5 GB for about 20,000"),
+        (
+            ("--limit-memory", "0.1"),
+            "a.npz: expected --limit-memory of at least 0.5 GB for about 20,000",
+        ),
         (("--limit-memory", "-1"), "expected --limit-memory > 0, in GB, got -1"),
         (("--limit-memory", LIMIT, "--merge", "--voxel", "0.1"), "expected no --voxel for a cloud"),
         (("--ray-address", "auto"), "expected --ray-address together with --engine ray"),

@@ -149,11 +149,16 @@ def _segment(
     """Segment a cloud of one file or of several, in tiles if it is too large for memory."""
     given = arguments.limit_memory
     limit = available_memory() // 2 if given is None else int(given * 1e9)
-    num_points = sum(map(estimate_points, sources))
+    num_points = sum(map(_count_points, sources))
     if memory_of_scan(num_points) > limit:
         _segment_tiles(arguments, sources, target, num_points, limit)
     else:
         _segment_whole(arguments, sources, target, picture)
+
+
+def _count_points(source: Path) -> int:
+    """Return the number of points of a file: no more than bytes, whatever a damaged header says."""
+    return min(estimate_points(source), source.stat().st_size) if source.is_file() else 0
 
 
 def _name_of(sources: tuple[Path, ...]) -> str:
@@ -185,7 +190,10 @@ def _segment_tiles(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
                 f"takes more than {limit / 1e9:.1f} GB; raise --limit-memory, or leave it out."
             )
-    tile_size = choose_tile_size(num_points, limit)
+    try:
+        tile_size = choose_tile_size(num_points, limit)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
     workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.1f} GB of "
