@@ -247,6 +247,12 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
+    parts = [_fit_together(some, points, normals) for some in segments.split(_POINTS_AT_ONCE)]
+    return FittedPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> FittedPlanes:
+    """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
     columns = segments.take_columns(normals)
     weights = torch.ones_like(columns[0])
     shares, directions = eigh3_of_few(_covariances(segments, columns, weights))
