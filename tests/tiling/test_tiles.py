@@ -158,7 +158,7 @@ def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
-    with pytest.raises(FormatError, match=r"expected 0\.\d GB of free disk for the work, got 0\.0"):
+    with pytest.raises(FormatError, match=r"expected 0\.\d MB of free disk for the work, got 0\.0"):
         segment(wall(300), tmp_path / "b", settings("classic"), 100)
 
 

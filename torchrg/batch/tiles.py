@@ -16,8 +16,10 @@ from torchrg.tiling import TILE_SIZE, TileFiles, TileTask, run_in_turn, segment_
 
 _BASE_BYTES = 500_000_000
 """Of a process before the first point: Python, torch, scipy."""
-_BYTES_PER_POINT = 110
+_BYTES_PER_POINT = 90
 """What the steps that look at the whole cloud take for each of its points."""
+_BYTES_AT_ONCE, _POINTS_AT_ONCE = 250, 2**20
+"""And what planes take for each of those points that are measured together."""
 _BYTES_PER_TILE_POINT = 2_000
 """What a tile takes for each of its own, with those around it."""
 _SMALLEST_TILE = 20_000
@@ -31,12 +33,12 @@ def choose_tile_size(num_points: int, memory_limit: int) -> int:
         ConfigError: If the steps that look at the whole cloud take more than the limit.
 
     Example:
-        >>> choose_tile_size(1_000_000, 800_000_000)
+        >>> choose_tile_size(100_000, 800_000_000)
         150000
     """
     most = (memory_limit - _BASE_BYTES) // _BYTES_PER_TILE_POINT
-    least = max(_BYTES_PER_POINT * num_points, _BYTES_PER_TILE_POINT * _SMALLEST_TILE)
-    needed = _BASE_BYTES + least
+    whole = _BYTES_PER_POINT * num_points + _BYTES_AT_ONCE * min(num_points, _POINTS_AT_ONCE)
+    needed = _BASE_BYTES + max(whole, _BYTES_PER_TILE_POINT * _SMALLEST_TILE)
     if needed > memory_limit:
         raise ConfigError(
             f"expected --limit-memory of at least {needed / 1e9:.1f} GB for about {num_points:,} "

@@ -196,7 +196,10 @@ def _segment_tiles(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
                 f"takes more than {limit / 1e9:.1f} GB; raise --limit-memory, or leave it out."
             )
-    tile_size = choose_tile_size(num_points, limit)
+    try:
+        tile_size = choose_tile_size(num_points, limit)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
     workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.1f} GB of "

@@ -303,6 +303,12 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> FittedPla
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
+    parts = [_fit_together(some, points, normals) for some in segments.split(_POINTS_AT_ONCE)]
+    return FittedPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> FittedPlanes:
+    """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
     shares, directions = eigh3_of_few(_spread_of(segments, normals))
     # The direction that the normals of a region share, signs aside, and their angle to it.
     usual = directions[:, :, 2]

@@ -154,8 +154,8 @@ class TileFiles:
         free = shutil.disk_usage(self.folder).free
         if needed > free:
             raise FormatError(
-                f"{self.folder}: expected {needed / 1e9:,.1f} GB of free disk for the work, got "
-                f"{free / 1e9:,.1f} GB; make room or choose another directory."
+                f"{self.folder}: expected {needed / 1e6:,.1f} MB of free disk for the work, got "
+                f"{free / 1e6:,.1f} MB; make room or choose another directory."
             )
 
 

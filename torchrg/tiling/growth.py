@@ -43,8 +43,10 @@ def condense(edges: EdgeLists, part: Part) -> Condensed:
         >>> edges = EdgeLists(np.array([0, 1, 3, 4]), np.array([1, 0, 2, 2], dtype=np.int32))
         >>> rows, lists = torch.tensor([10, 11, 17]), Neighbors(torch.zeros(3, 1))
         >>> found = condense(edges, Part(rows, slice(0, 2), lists))
-        >>> found.components.tolist(), found.targets.tolist()
-        ([0, 0], [17])
+        >>> found.components.tolist()
+        [0, 0]
+        >>> found.targets.tolist()
+        [17]
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components

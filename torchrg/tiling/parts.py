@@ -34,8 +34,10 @@ def cut_part(indices: Tensor, tile: slice, steps: int) -> Part:
     Example:
         >>> chain = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4], [4, 3]])
         >>> part = cut_part(chain, slice(0, 2), 1)
-        >>> part.rows.tolist(), part.neighbors.indices.tolist()
-        ([0, 1, 2], [[0, 1], [1, 2], [2, 2]])
+        >>> part.rows.tolist()
+        [0, 1, 2]
+        >>> part.neighbors.indices.tolist()
+        [[0, 1], [1, 2], [2, 2]]
     """
     lists = indices.numpy()
     inside = np.zeros(len(lists), dtype=bool)
