@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from ray.cluster_utils import Cluster
 
 from torchrg.batch.ray_tasks import run_ray
 from torchrg.batch.tiles import segmented_in_tiles, work_on_tile
@@ -18,6 +17,8 @@ from torchrg.structures import Cloud
 
 def main(source, result):
     """Segment, lose a node when the first normals are there, and write what came of it."""
+    from ray.cluster_utils import Cluster
+
     small = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=small)
     lost = cluster.add_node(num_cpus=2, object_store_memory=80_000_000)
