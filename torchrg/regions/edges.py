@@ -220,9 +220,11 @@ def _pack(
 def are_valid(cloud: GrowingCloud, rows: Rows) -> Tensor:
     """Tell which edges lead from one valid point to another one that is its neighbour."""
     indices, counted = cloud.neighbors
-    own = torch.arange(len(cloud.valid), device=indices.device)[rows, None]
+    own = rows
+    if isinstance(own, slice):
+        own = torch.arange(own.start, own.stop, device=indices.device)
     passed = _of_neighbors(cloud, rows, cloud.valid) & cloud.valid[rows, None]
-    passed &= indices[rows] != own
+    passed &= indices[rows] != own[:, None]
     return passed if counted is None else passed & counted[rows]
 
 
