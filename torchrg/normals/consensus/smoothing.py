@@ -50,7 +50,7 @@ def smooth_planes(
         offset = planes.offsets.index_select(0, flat).view(indices.shape)
         rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
         sq_chords = 2 * (1 - cosines.abs())
-        sq_error = (errors * errors).index_select(0, flat).view(indices.shape)
+        sq_error = errors.index_select(0, flat).view(indices.shape).square()
         sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
         reach = constants.SMOOTHING_REACH * noise[chosen][:, None]
         weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
