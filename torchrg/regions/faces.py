@@ -114,7 +114,8 @@ def cut_bridges(
     others[labels[rows]] = True
     sound &= others[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
     cores = torch.where(sound, labels + int(cores.max()) + 1, cores)
-    cores = torch.unique(cores, return_inverse=True)[1] - int((cores < 0).any())
+    is_core = torch.bincount(cores + 1)[1:] > 0
+    cores = torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores]
     around = _gather(cores.to(torch.int32), cloud.neighbors.indices[rows])
     rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
