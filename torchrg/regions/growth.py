@@ -128,8 +128,8 @@ def settle_regions(
             found = torch.from_numpy(_grow(part, strict, chunk_size)).to(part.points.device)
             return number_by_size(found, config.min_size)
 
-        parts = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
-        labels = number_by_size(parts, least)
+        labels = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
+        labels = number_by_size(labels, least)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels

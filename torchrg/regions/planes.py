@@ -22,7 +22,7 @@ from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 
 _POINTS_AT_ONCE = 2**18
-"""Points of regions that are measured together: at some 250 bytes each."""
+"""Points of regions that are measured together: at some 400 bytes each."""
 
 _BISQUARE_CUT = 4.685
 """Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
