@@ -17,8 +17,8 @@ from torchrg.tiling import TILE_SIZE, TileFiles, TileTask, run_in_turn, segment_
 _BASE_BYTES = 500_000_000
 """Of a process before the first point: Python, torch, scipy."""
 _BYTES_PER_POINT = 100
-"""What the steps that look at the whole cloud take for each of its points: of ``consensus`` at
-10,000,000 points, which looks at more than the other presets do."""
+"""What the steps on the whole cloud take for each of its points: the regions of ``consensus``, or
+the table of planes, 55, with 150 for each point of the largest region, up to a third of all."""
 _BYTES_AT_ONCE, _POINTS_AT_ONCE = 500, 2**18
 """And what planes take for each of those points that are measured together."""
 _BYTES_PER_TILE_POINT = 2_000
