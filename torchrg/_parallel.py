@@ -6,6 +6,7 @@ a core, that takes ten times as long and more.
 """
 
 import ctypes
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -214,6 +215,13 @@ def _keep_freed_memory() -> None:
     """
     block = torch.empty(_KEPT_BYTES, dtype=torch.uint8)
     del block
+
+
+def return_freed_memory() -> None:
+    """Give the system back what the C library keeps of freed memory, where it can: with glibc."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 def places_of(mask: Tensor) -> Tensor:

@@ -98,7 +98,7 @@ def test_a_working_directory_is_of_one_command(rooms, tmp_path, capsys):
 def test_tiles_are_as_large_as_memory_allows():
     assert choose_tile_size(10**5, 10**9) > choose_tile_size(10**5, 8 * 10**8)
     assert choose_tile_size(10**7, 10**12) == choose_tile_size(1, 10**12)
-    with pytest.raises(ConfigError, match=r"expected --limit-memory of at least 90\.8 GB"):
+    with pytest.raises(ConfigError, match=r"expected --limit-memory of at least 100\.9 GB"):
         choose_tile_size(10**9, 3 * 10**9)
 
 

@@ -1,6 +1,7 @@
 """Neighbours of tiles and the boxes they are found by, against all distances."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -112,3 +113,13 @@ def test_a_part_has_all_points_within_so_many_steps():
             wanted = [other if other in reached else row for other in lists[row].tolist()]
             assert part.rows[torch.tensor(near)].tolist() == wanted
         reached |= {other for row in reached for other in lists[row].tolist()}
+
+
+def test_a_part_takes_the_memory_of_its_own_points_not_of_the_cloud():
+    chain = torch.arange(10**6, dtype=torch.int32)[:, None].clamp(max=10**6 - 2) + torch.arange(2)
+    tracemalloc.start()
+    part = cut_part(chain, slice(500_000, 500_100), 3)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert part.rows.tolist() == list(range(500_000, 500_103))
+    assert peak < 10**5

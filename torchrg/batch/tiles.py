@@ -16,10 +16,12 @@ from torchrg.tiling import TILE_SIZE, TileFiles, TileTask, run_in_turn, segment_
 
 _BASE_BYTES = 500_000_000
 """Of a process before the first point: Python, torch, scipy."""
-_BYTES_PER_POINT = 90
-"""What the steps that look at the whole cloud take for each of its points."""
-_BYTES_AT_ONCE, _POINTS_AT_ONCE = 250, 2**20
-"""And what planes take for each of those points that are measured together."""
+_BYTES_PER_POINT = 100
+"""What the steps on the whole cloud take for each of its points: the regions of ``consensus``, or
+the table of planes, 55, with 150 for each point of the largest region, up to a third of all."""
+_BYTES_AT_ONCE, _POINTS_AT_ONCE = 250, 1_500_000
+"""And for each point up to so many: regions that are measured together, and those pages of the
+neighbours' file that were just read."""
 _BYTES_PER_TILE_POINT = 2_000
 """What a tile takes for each of its own, with those around it."""
 _SMALLEST_TILE = 20_000

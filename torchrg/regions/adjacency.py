@@ -1,12 +1,16 @@
 """Which planes meet, along which length, and at which angle."""
 
 import math
+from array import array
+from collections import Counter
+from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of, places_of
+from torchrg._parallel import ROWS_IN_CACHE, chunks_of, places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency
 
@@ -50,31 +54,33 @@ def find_adjacency(
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
     """
-    pairs, contacts = _find_contacts(labels, neighbors.indices, neighbors.valid)
+    border = _Border(labels, neighbors)
+    pairs = border.pairs
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
     angle = unsigned_angle_deg(first, second)
     crossing = (angle > _PARALLEL_DEG) & ~curved[pairs].any(dim=1)
-    is_crossing = crossing[contacts.pair]
-    on_lines = _select(contacts, is_crossing)
-    on_curves = _select(contacts, ~is_crossing & (contacts.column <= _NUM_CONTACTS))
-    edge = points[on_curves.target].double() - points[on_curves.source].double()
-    across = torch.stack([(edge * side[on_curves.pair]).sum(dim=1) for side in (first, second)])
-    spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
-    reach = (_REACH * thickness[pairs].amax(dim=1))[on_curves.pair]
-    flat = across.abs().amax(dim=0) <= torch.maximum(reach, _MAX_STEEPNESS * spacing)
-    on_curves = _select(on_curves, flat)
-    size = edge.norm(dim=1)
-    share = math.pi**2 * spacing * spacing / (2 * num_nearest * num_nearest * size)
-    share = torch.where(size > 0, share, 0.0)
-    num_contacts = torch.bincount(torch.cat([on_lines.pair, on_curves.pair]), minlength=len(pairs))
+    reach = _REACH * thickness[pairs].amax(dim=1)
+    lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
+    for contacts in border.contacts():
+        is_crossing = crossing[contacts.pair]
+        on_lines = _select(contacts, is_crossing)
+        lines.add(on_lines.pair, _edges(points, on_lines).norm(dim=1))
+        on_curves = _select(contacts, ~is_crossing & (contacts.column <= _NUM_CONTACTS))
+        edge, pair = _edges(points, on_curves), on_curves.pair
+        across = torch.stack([(edge * side[pair]).sum(dim=1) for side in (first, second)])
+        spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
+        farthest = torch.maximum(reach[pair], _MAX_STEEPNESS * spacing)
+        size = edge.norm(dim=1)
+        share = math.pi**2 * spacing * spacing / (2 * num_nearest * num_nearest * size)
+        share = torch.where(size > 0, share, 0.0)
+        flat = across.abs().amax(dim=0) <= farthest
+        curves.add(pair[flat], share[flat])
+    (sizes, on_line), (shares, on_curve) = (kind.on(points.device) for kind in (lines, curves))
     along = torch.linalg.cross(first, second)
-    length = torch.where(
-        crossing,
-        _length_on_line(points, on_lines, along / along.norm(dim=1, keepdim=True), len(pairs)),
-        _sum_of(on_curves.pair, share[flat], len(pairs)),
-    )
-    kept = num_contacts >= _LEAST_CONTACTS
-    return PlaneAdjacency(pairs[kept], length[kept], angle[kept])
+    along = along / along.norm(dim=1, keepdim=True)
+    length = _length_on_line(points, border, along, sizes / on_line)
+    kept = on_line + on_curve >= _LEAST_CONTACTS
+    return PlaneAdjacency(pairs[kept], torch.where(crossing, length, shares)[kept], angle[kept])
 
 
 def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
@@ -92,8 +98,8 @@ def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor
     Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending, and
     counts ``(E,)``.
     """
-    pairs, contacts = _find_contacts(labels, *contact_neighbors(neighbors))
-    return pairs, torch.bincount(contacts.pair, minlength=len(pairs))
+    border = _Border(labels, Neighbors(*contact_neighbors(neighbors)))
+    return border.pairs, border.counts
 
 
 class _Contacts(NamedTuple):
@@ -105,32 +111,74 @@ class _Contacts(NamedTuple):
     column: Tensor
 
 
-def _find_contacts(
-    labels: Tensor, targets: Tensor, counted: Tensor | None
-) -> tuple[Tensor, _Contacts]:
-    """Return the pairs of regions with an edge between them, ascending, and these edges."""
-    num_regions = int(labels.max()) + 1 if len(labels) else 0
-    narrow = labels.to(torch.int32)
-    found = []
-    for start in range(0, max(len(labels), 1), ROWS_AT_ONCE):
-        rows = slice(start, start + ROWS_AT_ONCE)
-        target, own = targets[rows].reshape(-1), narrow[rows]
-        other = narrow.index_select(0, target).view(targets[rows].shape)
+class _Totals:
+    """Sums of values of each pair, and how many these are: one after the other on any device."""
+
+    def __init__(self, num_pairs: int) -> None:
+        self._sums, self._counts = np.zeros(num_pairs), np.zeros(num_pairs, dtype=np.int64)
+
+    def add(self, pair: Tensor, values: Tensor) -> None:
+        """Add values ``(n,)`` to the sums of their pairs ``(n,)``."""
+        owner = pair.cpu().numpy()
+        np.add.at(self._sums, owner, values.cpu().numpy())
+        np.add.at(self._counts, owner, 1)
+
+    def on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return sums and counts, each ``(E,)``."""
+        return torch.from_numpy(self._sums).to(device), torch.from_numpy(self._counts).to(device)
+
+
+class _Border:
+    """The edges between regions, found anew each time: all of them may outweigh the cloud.
+
+    Attributes:
+        pairs: Pairs of regions with an edge between them, ascending, shape ``(E, 2)``.
+        counts: Edges of each pair, shape ``(E,)``.
+    """
+
+    def __init__(self, labels: Tensor, neighbors: Neighbors) -> None:
+        # Narrow numbers are gathered three times as fast.
+        self._labels, self._neighbors = labels.to(torch.int32), neighbors
+        self._num_regions = int(labels.max()) + 1 if len(labels) else 0
+        touches = torch.zeros_like(labels, dtype=torch.bool)
+        # Small tensors kept from each chunk would split the room that glibc has for the next.
+        counts: Counter[int] = Counter()
+        for some in chunks_of(len(labels), ROWS_IN_CACHE):
+            places, _, keys = self._edges_of(some)
+            touches[some.start + places // self._width] = True
+            found = torch.unique(keys, return_counts=True)
+            counts.update(dict(zip(*(values.tolist() for values in found), strict=True)))
+        self._rows = places_of(touches).to(torch.int32)
+        self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
+        self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
+        num_regions = max(self._num_regions, 1)
+        self.pairs = torch.stack([self._keys // num_regions, self._keys % num_regions], dim=1)
+
+    @property
+    def _width(self) -> int:
+        return max(self._neighbors.indices.shape[1], 1)
+
+    def _edges_of(self, rows: slice | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where in the lists of some points other regions are, the lists, and the pairs."""
+        own, targets = self._labels[rows], self._neighbors.indices[rows]
+        other = self._labels.index_select(0, targets.reshape(-1)).view(targets.shape)
         touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
-        if counted is not None:
-            touches &= counted[rows]
+        if self._neighbors.valid is not None:
+            touches &= self._neighbors.valid[rows]
         places = places_of(touches)
-        source, column = places // touches.shape[1], places % touches.shape[1]
-        first, second = own[source].long(), other.reshape(-1)[places].long()
-        key = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
-        ends = ((source + start).int(), target[places].int(), column.to(torch.int16))
-        found.append((key, *ends))
-    keys, sources, targets, columns = (torch.cat(parts) for parts in zip(*found, strict=True))
-    del found
-    numbers, pair = torch.unique(keys, return_inverse=True)
-    width = max(num_regions, 1)
-    pairs = torch.stack([numbers // width, numbers % width], dim=1)
-    return pairs, _Contacts(pair, sources, targets, columns)
+        first = own.index_select(0, places // self._width)
+        second = other.reshape(-1).index_select(0, places)
+        lower, higher = torch.minimum(first, second), torch.maximum(first, second)
+        return places, targets, lower.long() * self._num_regions + higher
+
+    def contacts(self) -> Iterator[_Contacts]:
+        """Yield all edges, those of some points at a time, in the order of their rows."""
+        for rows in torch.split(self._rows, ROWS_IN_CACHE):
+            places, targets, keys = self._edges_of(rows)
+            source, column = places // self._width, places % self._width
+            targets = targets.reshape(-1).index_select(0, places)
+            pair = torch.searchsorted(self._keys, keys)
+            yield _Contacts(pair, rows.index_select(0, source), targets, column)
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
@@ -139,28 +187,42 @@ def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
     return _Contacts(*(values.index_select(0, rows) for values in contacts))
 
 
-def _length_on_line(points: Tensor, contacts: _Contacts, along: Tensor, num_pairs: int) -> Tensor:
-    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
+def _edges(points: Tensor, contacts: _Contacts) -> Tensor:
+    """Return the edges as vectors ``(n, 3)`` in float64."""
+    start, end = (points.index_select(0, rows) for rows in (contacts.source, contacts.target))
+    return end.double() - start.double()
+
+
+def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Tensor) -> Tensor:
+    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``.
+
+    ``along`` are directions of the lines, ``(E, 3)``, and ``spacing`` mean lengths of the edges,
+    NaN for pairs that do not meet on a line.
+    """
     origin = points[:1].double()
-    lengths, places = [], []
-    for some in chunks_of(len(contacts.pair), ROWS_AT_ONCE):
-        ends = (contacts.source[some], contacts.target[some])
-        start, end = (points[rows].double() - origin for rows in ends)
-        lengths.append((end - start).norm(dim=1))
-        places.append(((start + end) / 2 * along[contacts.pair[some]]).sum(dim=1))
-    size = _sum_of(contacts.pair, torch.cat([points.new_empty(0).double(), *lengths]), num_pairs)
-    size = size / torch.bincount(contacts.pair, minlength=num_pairs)
-    place = torch.cat([size[:0], *places]) / size[contacts.pair]
-    cell = torch.where(place.isfinite(), place, 0.0).floor().long()
-    low = int(cell.min()) if len(cell) else 0
-    width = int(cell.max()) - low + 2 if len(cell) else 1
-    keys = torch.unique(contacts.pair * width + (cell - low))
-    owner = keys // width
-    is_next = torch.zeros(len(keys), dtype=torch.float64, device=points.device)
-    is_next[1:] = (keys[1:] == keys[:-1] + 1).double()
+    found = array("q"), array("q")
+    for contacts in border.contacts():
+        contacts = _select(contacts, spacing[contacts.pair].isfinite())
+        ends = (contacts.source, contacts.target)
+        start, end = (points.index_select(0, rows).double() - origin for rows in ends)
+        place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
+        cell = torch.where(place.isfinite(), place, 0.0).floor().long()
+        for kept, values in zip(found, _each_once(contacts.pair, cell), strict=True):
+            kept.frombytes(values.cpu().numpy().tobytes())
+    pair, cell = _each_once(*(torch.from_numpy(np.array(kept)).to(points.device) for kept in found))
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
-    steps = _sum_of(owner, is_next, num_pairs)
-    return steps * torch.where(size.isfinite(), size, 0.0)
+    is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
+    steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))
+    return steps * torch.where(spacing.isfinite(), spacing, 0.0)
+
+
+def _each_once(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cells of pairs ascending, each once."""
+    if len(cell) == 0:
+        return pair, cell
+    low, width = cell.min(), cell.max() - cell.min() + 1
+    keys = torch.unique(pair * width + (cell - low))
+    return keys // width, keys % width + low
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -172,12 +234,3 @@ def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[
     number = counted.sum(dim=1)
     last = nearest.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
     return (points[last].double() - points[rows].double()).norm(dim=1), number
-
-
-def _sum_of(owner: Tensor, values: Tensor, num_owners: int) -> Tensor:
-    """Return the sum of the values of each owner, one after the other."""
-    order = owner.argsort(stable=True)
-    counts = torch.bincount(owner, minlength=num_owners)
-    if num_owners == 0:
-        return values[:0]
-    return torch.segment_reduce(values[order].contiguous(), "sum", lengths=counts)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import chunks_of
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords
 from torchrg.linalg.moments import Segments
@@ -114,7 +114,8 @@ def cut_bridges(
     others[labels[rows]] = True
     sound &= others[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
     cores = torch.where(sound, labels + int(cores.max()) + 1, cores)
-    cores = torch.unique(cores, return_inverse=True)[1] - int((cores < 0).any())
+    is_core = torch.bincount(cores + 1)[1:] > 0
+    cores = torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores]
     around = _gather(cores.to(torch.int32), cloud.neighbors.indices[rows])
     rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
@@ -150,8 +151,14 @@ def _find_suspects(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -
     rows = doubtful.nonzero().squeeze(1)
     near = has_region & ~off & (on_plane & mixed)[region]
     others = near.nonzero().squeeze(1)
-    directions = planes.fit.normal[labels[others]].unbind(dim=1)
-    turn = sq_chords(cloud.normals[others].double().unbind(dim=1), directions)
+    turns = [
+        sq_chords(
+            cloud.normals[some].double().unbind(dim=1),
+            planes.fit.normal[labels[some]].unbind(dim=1),
+        )
+        for some in torch.split(others, ROWS_AT_ONCE)
+    ]
+    turn = torch.cat(turns)
     near, sound = (
         torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
         for limit in (config.max_angle_deg, _STRICTER * config.max_angle_deg)

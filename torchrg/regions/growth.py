@@ -28,8 +28,9 @@ from torchrg.structures import UNLABELED, Neighbors
 _LONG_QUEUE = 32
 """From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
 
-_CLAIMING_SEEDS = 2**16
-"""Seeds whose claims are gathered at a time; with 50 neighbours some 30 MB."""
+_CLAIMING_SEEDS = 2**13
+"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB. NumPy keeps other
+threads waiting meanwhile, also the one that gives back pages of files."""
 
 
 @sequential_operations()
@@ -128,8 +129,8 @@ def settle_regions(
             found = torch.from_numpy(_grow(part, strict, chunk_size)).to(part.points.device)
             return number_by_size(found, config.min_size)
 
-        parts = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
-        labels = number_by_size(parts, least)
+        labels = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
+        labels = number_by_size(labels, least)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
     return labels

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import run_beside
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of, run_beside
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
@@ -21,8 +21,8 @@ from torchrg.regions.measures import covered_areas, fit_rectangles, trace_outlin
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 
-_POINTS_AT_ONCE = 2**20
-"""Points of regions that are measured together: at some 250 bytes each."""
+_POINTS_AT_ONCE = 2**18
+"""Points of regions that are measured together: at some 400 bytes each."""
 
 _BISQUARE_CUT = 4.685
 """Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
@@ -126,9 +126,11 @@ class RegionPlanes(NamedTuple):
     def distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return the distance of each point ``(n, 3)`` from the plane of a region ``(n,)``."""
         away = points.new_zeros(len(points), dtype=torch.float64)
-        columns = (values.unbind(dim=1) for values in (points, self.fit.center, self.fit.normal))
-        for place, center, normal in zip(*columns, strict=True):
-            away += (place.double() - center[regions]) * normal[regions]
+        columns = [values.unbind(dim=1) for values in (points, self.fit.center, self.fit.normal)]
+        for some in chunks_of(len(points), ROWS_AT_ONCE):
+            owner = regions[some]
+            for place, center, normal in zip(*columns, strict=True):
+                away[some] += (place[some].double() - center[owner]) * normal[owner]
         return away.abs_()
 
 
@@ -350,8 +352,13 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     segments = Segments(labels, most=MOST_FITTED)
     fit = fit_planes(segments, cloud.points, cloud.normals)
     indices, counted = cloud.neighbors
-    some = Neighbors(indices[segments.rows], None if counted is None else counted[segments.rows])
-    radius = segments.median(neighborhood_radii(cloud.points, some)).double()
+    radii = [
+        neighborhood_radii(
+            cloud.points, Neighbors(indices[rows], None if counted is None else counted[rows])
+        )
+        for rows in torch.split(segments.rows, ROWS_AT_ONCE)
+    ]
+    radius = segments.median(torch.cat(radii)).double()
     floor = config.coplanarity_floor * radius
     fit = fit._replace(num_points=torch.bincount(labels + 1, minlength=1)[1:])
     if cloud.reach is None:

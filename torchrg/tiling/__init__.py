@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrg._parallel import sequential_operations
+from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.structures import Cloud, Segmentation
@@ -112,6 +112,8 @@ def segment_tiles(
     def once(stage: str, step: Callable[[], None]) -> None:
         begin(stage, 0, 1)
         if files.facts(stage) is None:
+            # Beside the arrays of the whole cloud, what tiles have freed would be too much.
+            return_freed_memory()
             step()
 
     once("points", lambda: read_points(files, chunks))

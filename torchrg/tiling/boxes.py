@@ -68,13 +68,26 @@ def near_boxes(
     For some of the chosen ones at a time: which these are, the numbers of boxes near them, and who
     is near whom, shape ``(chosen, near)``.
     """
+    about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
+    all_low, all_high = boxes.low[about], boxes.high[about]
     for some in chunks_of(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[some]], boxes.high[chosen[some]]
-        far = reach[some].max() * _ROUNDING
-        inside = (boxes.low <= high.max(axis=0) + far) & (boxes.high >= low.min(axis=0) - far)
-        near = np.flatnonzero(inside.all(axis=1))
-        gap = _gaps(boxes.low[near], boxes.high[near], low, high)
-        yield some, near, gap <= reach[some, None] * _ROUNDING
+        near = _about(all_low, all_high, low, high, reach[some])
+        gap = _gaps(all_low[near], all_high[near], low, high)
+        yield some, about[near], gap <= reach[some, None] * _ROUNDING
+
+
+def _about(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    own_low: NDArray[np.float64],
+    own_high: NDArray[np.float64],
+    reach: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Return which boxes are within the largest reach of the box about some."""
+    far = reach.max() * _ROUNDING
+    inside = (low <= own_high.max(axis=0) + far) & (high >= own_low.min(axis=0) - far)
+    return np.flatnonzero(inside.all(axis=1))
 
 
 def farthest_neighbor(boxes: Boxes, box: int, k: int) -> float:

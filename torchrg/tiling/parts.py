@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.structures import Neighbors
@@ -40,21 +41,30 @@ def cut_part(indices: Tensor, tile: slice, steps: int) -> Part:
         [[0, 1], [1, 2], [2, 2]]
     """
     lists = indices.numpy()
-    inside = np.zeros(len(lists), dtype=bool)
-    inside[tile] = True
-    new = np.arange(tile.start, tile.stop)
+    rows = new = np.arange(tile.start, tile.stop)
     for _ in range(steps):
-        reached = np.zeros_like(inside)
-        reached[lists[new].ravel()] = True
-        new = np.flatnonzero(reached & ~inside)
-        inside[new] = True
-    rows = np.flatnonzero(inside)
-    numbers = torch.full((len(lists),), -1, dtype=torch.int32)
-    numbers[torch.from_numpy(rows)] = torch.arange(len(rows), dtype=torch.int32)
-    near = torch.from_numpy(lists[rows])
-    near = numbers.index_select(0, near.reshape(-1)).view(near.shape)
-    itself = torch.arange(len(rows), dtype=torch.int32)[:, None]
-    near = torch.where(near < 0, itself, near)
+        new = _not_among(rows, lists[new].ravel())
+        rows = np.sort(np.concatenate([rows, new]))
     first = int(np.searchsorted(rows, tile.start))
     own = slice(first, first + tile.stop - tile.start)
+    # Neighbours before and behind all rows of the part are at the ends, which have no number.
+    low, high = (int(end) for end in (rows[0] - 1, rows[-1] + 1))
+    numbers = torch.full((high - low + 1,), -1, dtype=torch.int32)
+    itself = torch.arange(len(rows), dtype=torch.int32)
+    numbers[torch.from_numpy(rows - low)] = itself
+    near = torch.from_numpy(lists[rows]).clamp_(low, high).sub_(low)
+    near = numbers.index_select(0, near.view(-1)).view(near.shape)
+    near = torch.where(near < 0, itself[:, None], near)
     return Part(torch.from_numpy(rows), own, Neighbors(near))
+
+
+def _not_among(rows: NDArray[np.int64], near: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return those near that are not among ascending rows, ascending, each once.
+
+    A mask over their range takes a tenth of the time of sorting.
+    """
+    low, high = (int(end) for end in (near.min(initial=rows[0]), near.max(initial=rows[-1])))
+    reached = np.zeros(high - low + 1, dtype=bool)
+    reached[near - np.int32(low)] = True
+    reached[rows - low] = False
+    return np.flatnonzero(reached) + low
