@@ -2,6 +2,10 @@
 
 import json
 import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,6 +148,7 @@ def mistakes(tmp_path, room):
         ("ROOM", ["--normals.k", "many"], "--normals.k"),
         ("ROOM", ["--no-such-flag"], "no-such-flag"),
         ("ROOM", ["--threads", "0"], "--threads >= 1"),
+        ("ROOM", ["--voxel", "nan"], "--voxel > 0"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(
@@ -180,6 +185,48 @@ def test_scores_need_the_same_points(room, tmp_path, capsys):
     assert "expected as many points as" in error_line(capsys)
 
 
+@pytest.mark.parametrize("command", [["segment"], ["segment", "--merge"], ["normals"]])
+def test_no_result_takes_the_place_of_an_input(room, tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    Path("other").mkdir()
+    for folder in (".", "other"):
+        shutil.copy(room, Path(folder, "room é.npz"))
+    before = Path("room é.npz").read_bytes()
+    for out in ("room é.npz", "."):
+        several = ["other/room é.npz"] if "--merge" in command else []
+        assert main([*command, *several, "room é.npz", "--out", out]) == 2
+        assert "expected a place of its own for each result" in error_line(capsys)
+    assert Path("room é.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", [*([name] for name in COMMANDS), ["convert", "folder"]])
+def test_a_command_without_arguments_is_wrong_use(command, capsys):
+    try:
+        code = main(command)
+    except SystemExit as stop:
+        code = stop.code
+    assert code == 2
+    shown = capsys.readouterr()
+    assert "Missing from torchrg" in shown.err or shown.out.startswith("usage: torchrg convert")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["info", "ROOM"]])
+def test_a_reader_that_goes_away_is_no_error(arguments, room):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [
+        sys.executable,
+        "-m",
+        "torchrg",
+        *(str(room) if a == "ROOM" else a for a in arguments),
+    ]
+    done = subprocess.run(
+        command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=120
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_unknown_command_lists_the_known_ones(capsys):
     assert main(["segmnet"]) == 2
     line = error_line(capsys)
@@ -207,6 +254,9 @@ def test_view_draws_a_picture(room, tmp_path, capsys):
     assert main(["view", str(room), "--out", str(out), "--color", "curvature"]) == 2
     assert "expected curvature for --color curvature" in error_line(capsys)
     assert main(["view", str(room), "--out", "room.jpg"]) == 2
+    capsys.readouterr()
+    assert main(["view", str(room), "--out", str(out), "--azimuth-deg", "nan"]) == 2
+    assert "expected azimuth_deg to be finite, got nan" in error_line(capsys)
 
 
 def test_info_says_what_a_file_holds(room, capsys):

@@ -49,7 +49,7 @@ def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys):
     assert "in tiles of" not in capsys.readouterr().out
     assert run(*files, "--out", tmp_path / "tiles.npz", "--limit-memory", LIMIT) == 0
     said = capsys.readouterr().out.splitlines()
-    assert "about 40,000 points take 0.5 GB of memory, the limit is 0.5: in tiles of" in said[0]
+    assert "about 40,000 points take 0.54 GB of memory, the limit is 0.54: in tiles of" in said[0]
     assert (tmp_path / "whole.npz").read_bytes() == (tmp_path / "tiles.npz").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles.npz", "whole.npz"]
 

@@ -36,30 +36,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 done; 2 wrong use or bad input; 3 some items of a batch failed; 130 interrupted.
     """
-    from torchrg.cli.console import USAGE_ERROR, fail
-
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_OVERVIEW)
-        return 0 if arguments else USAGE_ERROR
-    name, *rest = arguments
-    if name == "--version":
-        from torchrg import __version__
-
-        print(f"torchrg {__version__}")
-        return 0
-    if name not in COMMANDS:
-        return fail(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
-    return _run(name, rest)
-
-
-def _run(name: str, arguments: list[str]) -> int:
-    """Run one command; a user's mistake becomes one line on stderr, never a traceback."""
     from torchrg.cli.console import INTERRUPTED, fail
     from torchrg.errors import TorchrgError
 
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    name = next(iter(arguments), "")
     try:
-        code: int = importlib.import_module(f"torchrg.cli.{name}").run(arguments)
+        try:
+            return _run(arguments)
+        finally:
+            # Here, where an error of writing is told, and not when Python ends.
+            print(end="", flush=True)
     except TorchrgError as error:
         return fail(str(error))
     except MemoryError:
@@ -72,4 +59,23 @@ def _run(name: str, arguments: list[str]) -> int:
         return fail(f"{error.filename or name}: {error.strerror or error}.")
     except KeyboardInterrupt:
         return fail("interrupted; every file written is complete.", code=INTERRUPTED)
+
+
+def _run(arguments: list[str]) -> int:
+    """Run the command that the first argument names."""
+    from torchrg.cli.console import USAGE_ERROR
+    from torchrg.errors import ConfigError
+
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_OVERVIEW)
+        return 0 if arguments else USAGE_ERROR
+    name, *rest = arguments
+    if name == "--version":
+        from torchrg import __version__
+
+        print(f"torchrg {__version__}")
+        return 0
+    if name not in COMMANDS:
+        raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
+    code: int = importlib.import_module(f"torchrg.cli.{name}").run(rest)
     return code

@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -102,7 +103,7 @@ class PlaneSettings:
             'pca'
         """
         values = {"--preset": DEFAULT_PRESET, "--config": ""}
-        for argument, following in zip(argv, [*argv[1:], ""], strict=True):
+        for argument, following in zip_longest(argv, argv[1:], fillvalue=""):
             name, equals, value = argument.partition("=")
             if name in values:
                 values[name] = value if equals else following
@@ -197,6 +198,18 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
             raise FormatError(f"{source}: another input has the same name; run them one by one.")
     out.mkdir(parents=True, exist_ok=True)
     return results
+
+
+def check_apart(results: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Raise FormatError if a result would take the place of an input or of another result."""
+    taken = {path.resolve() for path in inputs}
+    for path in results:
+        if path.resolve() in taken:
+            raise FormatError(
+                f"{path}: expected a place of its own for each result, got one of an input or of "
+                "another result; choose another."
+            )
+        taken.add(path.resolve())
 
 
 DRAWINGS = (".png", ".html")

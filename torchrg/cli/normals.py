@@ -54,6 +54,7 @@ def run(argv: list[str]) -> int:
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     outputs = console.output_paths(arguments.inputs, arguments.out)
+    console.check_apart(outputs, arguments.inputs)
     return console.run_each(_estimate_file, arguments, arguments.inputs, outputs)
 
 

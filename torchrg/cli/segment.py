@@ -100,9 +100,12 @@ def run(argv: list[str]) -> int:
         )
     console.use_threads(arguments.threads)
     _check_memory(arguments)
+    if arguments.voxel is not None and not arguments.voxel > 0:
+        raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
     firsts = tuple(sources[0] for sources in clouds if sources)
     outputs = console.output_paths(firsts, arguments.out)
+    console.check_apart(outputs, arguments.inputs)
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments)
@@ -194,7 +197,7 @@ def _segment_tiles(
         if getattr(arguments, name):
             raise ConfigError(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
-                f"takes more than {limit / 1e9:.1f} GB; raise --limit-memory, or leave it out."
+                f"takes more than {limit / 1e9:.2f} GB; raise --limit-memory, or leave it out."
             )
     try:
         tile_size = choose_tile_size(num_points, limit)
@@ -202,8 +205,8 @@ def _segment_tiles(
         raise ConfigError(f"{source}: {error}") from None
     workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
     print(
-        f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.1f} GB of "
-        f"memory, the limit is {limit / 1e9:.1f}: in tiles of {tile_size:,} in {workdir}",
+        f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
+        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {workdir}",
         flush=True,
     )
     with tqdm(unit="tile", leave=False, disable=None) as bar:
