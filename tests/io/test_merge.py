@@ -1,5 +1,7 @@
 """Several files as one cloud."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,17 @@ def test_points_follow_each_other_with_the_fields_of_all(tmp_path, make_cloud):
     write_cloud(tmp_path / "all.npz", stream)
     write_cloud(tmp_path / "whole.npz", whole)
     assert (tmp_path / "all.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_first_chunks_of_many_files_are_not_in_memory_together():
+    def chunks():
+        yield Cloud(np.ones((40_000, 3)), {"a": np.ones(40_000)})
+
+    tracemalloc.start()
+    merge_streams([CloudStream(chunks, 40_000) for _ in range(20)])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 40_000 * 32
 
 
 def test_fields_that_differ_are_left_out_and_named():
