@@ -54,6 +54,28 @@ def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles.npz", "whole.npz"]
 
 
+@pytest.mark.parametrize(
+    ("value", "out", "code", "message"),
+    [
+        (1.0, "x.npz", 0, "no plane found: all points are equal"),
+        (np.nan, "x.npz", 2, "expected finite points, got none in 40,000 points"),
+        (None, "x.npz", 0, "1 of 40,000 points are not finite; they stay in place, unlabelled"),
+        (None, "x.las", 2, "got 1 points that are not (first: 4)"),
+    ],
+)
+def test_tiles_say_what_memory_says_before_the_work(tmp_path, capsys, value, out, code, message):
+    if out == "x.las":
+        pytest.importorskip("laspy")
+    points = np.full((ROOM, 3), 1.0 if value is None else value, np.float32)
+    points[4, 0] = np.nan if value is None else points[4, 0]
+    np.savez(tmp_path / "points.npz", points=points)
+    for limit in ("9", LIMIT):
+        flags = ("--preset", "classic", "--limit-memory", limit)
+        assert run(tmp_path / "points.npz", "--out", tmp_path / out, *flags) == code
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / ".x.tiles").exists()
+
+
 def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
     files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic")
     assert run(*files, "--out", tmp_path / "both.ply") == 0

@@ -29,12 +29,13 @@ from torchrg.io import (
     stream_cloud,
     write_cloud,
 )
+from torchrg.io.stream import Extent
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
 from torchrg.render.page import check_library
-from torchrg.structures import Segmentation
+from torchrg.structures import Cloud, Segmentation
 from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -199,6 +200,7 @@ def _segment_tiles(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
                 f"takes more than {limit / 1e9:.2f} GB; raise --limit-memory, or leave it out."
             )
+    _check_points(source, stream, target)
     try:
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
@@ -226,7 +228,14 @@ def _segment_tiles(
             on_stage=show,
         ) as seg:
             write_cloud(target, stream, seg, provenance=_describe(sources, settings))
-            _report(source, seg, target, time.perf_counter() - begin)
+            _report(source, seg, stream.extent, target, time.perf_counter() - begin)
+
+
+def _check_points(source: str, cloud: Cloud | CloudStream, target: Path) -> None:
+    """Warn of points that are not finite, before the work; refuse what cannot be written."""
+    for note in check_finite(cloud):
+        console.warn(f"{source}: {note}.")
+    check_output(target, cloud)
 
 
 def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
@@ -256,9 +265,7 @@ def _segment_whole(
     """Segment a cloud, with a progress bar on a terminal and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
     cloud = read_cloud(sources[0]) if len(sources) == 1 else stream.read()
-    for note in check_finite(cloud):
-        console.warn(f"{source}: {note}.")
-    check_output(target, cloud)
+    _check_points(source, cloud, target)
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
     with tqdm(
@@ -292,18 +299,18 @@ def _segment_whole(
             write_page(picture, make_page(result))
         else:
             draw_planes(picture, result)
-    if len(seg.planes.count) == 0:
-        kept = cloud.coordinates[cloud.finite]
-        reason = "all points are equal" if (kept == kept[0]).all() else "no region is large enough"
-        console.warn(f"{source}: no plane found: {reason}.")
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         print(f"{source}: superpoints of each level: {found}")
-    _report(source, seg, target, time.perf_counter() - begin)
+    _report(source, seg, Extent.of(cloud), target, time.perf_counter() - begin)
 
 
-def _report(source: str, seg: Segmentation, target: Path, seconds: float) -> None:
-    """Print the line about a result."""
+def _report(source: str, seg: Segmentation, extent: Extent, target: Path, seconds: float) -> None:
+    """Print the line about a result, after a warning if there is no plane in it."""
+    if len(seg.planes.count) == 0:
+        is_place = (extent.low == extent.high).all()
+        reason = "all points are equal" if is_place else "no region is large enough"
+        console.warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes.count)
     share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
     print(
