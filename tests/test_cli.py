@@ -259,6 +259,16 @@ def test_view_draws_a_picture(room, tmp_path, capsys):
     assert "expected azimuth_deg to be finite, got nan" in error_line(capsys)
 
 
+def test_info_says_where_a_cloud_far_away_is(tmp_path, capsys):
+    np.save(
+        tmp_path / "far.npy", np.array([[500000.125, 4000000.25, 1], [500001.375, 4000000.5, 2]])
+    )
+    assert main(["info", str(tmp_path / "far.npy")]) == 0
+    shown = capsys.readouterr().out
+    assert "lowest      500000.125 4000000.25 1" in shown
+    assert "extent      1.25 0.25 1" in shown
+
+
 def test_info_says_what_a_file_holds(room, capsys):
     assert main(["info", str(room)]) == 0
     shown = capsys.readouterr().out

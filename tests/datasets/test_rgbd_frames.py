@@ -105,6 +105,11 @@ def test_the_camera_of_tum_is_not_guessed(tum):
     assert data[0]["intrinsics"].dtype == torch.float64
 
 
+def test_a_scale_of_zero_is_not_that_of_the_layout(tum):
+    with pytest.raises(ConfigError, match="expected depth_scale > 0"):
+        RGBDFrames.from_folder(tum, "tum", depth_scale=0.0)
+
+
 def test_icl_nuim_frames_are_matched_by_number(tmp_path):
     root = tmp_path / "living_room_traj0"
     for number in (0, 2, 10):
