@@ -196,17 +196,19 @@ def test_depth_without_meaning_is_zero(tmp_path):
 
 
 def test_wrong_files_are_refused(tmp_path, tum):
+    (tmp_path / "empty.npy").touch()
     write_color(tmp_path / "color.png")
     write_text(tmp_path / "text.png", "no image")
     write_text(tmp_path / "text.npy", "no array")
     np.save(tmp_path / "flat.npy", np.zeros(3))
     for name, message in (
         ("color.png", "expected a gray PNG of 16 bits, got shape"),
-        ("text.png", "expected a PNG image, got "),
-        ("text.npy", "expected an array of numbers, got "),
+        ("text.png", "expected a PNG image, got: "),
+        ("text.npy", "expected an array of numbers, got: "),
         ("flat.npy", r"expected depth of shape \(H, W\), got \(3,\)"),
-        ("missing.png", "cannot be read: No such file"),
-        ("missing.npy", "cannot be read: No such file"),
+        ("missing.png", "no such file; check the spelling"),
+        ("empty.npy", "byte 0: the file is empty"),
+        ("missing.npy", "no such file; check the spelling"),
         ("depth.jpg", r"expected a depth image that ends in one of .png .npy, got '.jpg'"),
     ):
         with pytest.raises(FormatError, match=f"{name}: {message}"):

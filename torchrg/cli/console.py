@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -193,8 +194,9 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     if given in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
     results = [out / f"{path.stem}{suffix}" for path in inputs]
+    counts = Counter(results)
     for result, source in zip(results, inputs, strict=True):
-        if results.count(result) > 1:
+        if counts[result] > 1:
             raise FormatError(f"{source}: another input has the same name; run them one by one.")
     out.mkdir(parents=True, exist_ok=True)
     return results
