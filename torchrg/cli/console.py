@@ -16,6 +16,7 @@ from typing import Annotated, Any, TypeVar
 
 import torch
 import tyro
+from tqdm import tqdm
 
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
@@ -132,6 +133,18 @@ def use_threads(threads: int | None) -> None:
         raise ConfigError(f"expected --threads >= 1, got {threads}.")
     if threads is not None:
         torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar on a terminal; what is yielded is called as each stage begins."""
+    with tqdm(total=len(stages), desc=name, unit="stage", leave=False, disable=None) as bar:
+
+        def advance(stage: str) -> None:
+            bar.set_postfix_str(stage)
+            bar.update(stage != stages[0])
+
+        yield advance
 
 
 def num_cores() -> int:

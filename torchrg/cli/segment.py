@@ -200,15 +200,16 @@ def _segment_tiles(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
                 f"takes more than {limit / 1e9:.2f} GB; raise --limit-memory, or leave it out."
             )
-    _check_points(source, stream, target)
     try:
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
+    _check_points(source, stream, target)
     workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
-        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {workdir}",
+        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {workdir}, from "
+        "which the same command goes on",
         flush=True,
     )
     with tqdm(unit="tile", leave=False, disable=None) as bar:
@@ -268,14 +269,7 @@ def _segment_whole(
     _check_points(source, cloud, target)
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
-    with tqdm(
-        total=len(stages), desc=sources[0].name, unit="stage", leave=False, disable=None
-    ) as bar:
-
-        def advance(stage: str) -> None:
-            bar.set_postfix_str(stage)
-            bar.update(stage != STAGES[0])
-
+    with console.stage_bar(sources[0].name, stages) as advance:
         voxels = None if voxel is None else sample_voxels(cloud.points, voxel)
         if voxels is None:
             seg = segment_planes(cloud.points, settings, on_stage=advance)
