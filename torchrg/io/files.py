@@ -127,7 +127,7 @@ def check_promise(
         least = "at least " if at_least else ""
         raise FormatError(
             f"{path}: byte {byte}: expected {least}{promised:,} bytes for {content}, got "
-            f"{max(available, 0):,}; the file is cut off or its header is wrong, fetch it again."
+            f"{available:,}; the file is cut off or its header is wrong, fetch it again."
         )
 
 
