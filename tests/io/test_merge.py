@@ -1,6 +1,7 @@
 """Several files as one cloud."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,6 +83,11 @@ def test_sizes_of_other_units_are_noted():
     assert merged(Cloud(points), Cloud(points * 50), Cloud(np.zeros((1, 3)))).notes == []
 
 
+def test_a_file_that_is_named_twice_is_noted():
+    cloud = Cloud(np.random.default_rng(0).random((9, 3)), source="a.ply")
+    assert merged(cloud, cloud, replace(cloud, source="b.ply")).notes == ["a.ply is taken 2 times"]
+
+
 def test_one_cloud_is_itself_and_none_is_refused(make_cloud):
     stream = CloudStream.of(make_cloud())
     assert merge_streams([stream]).stream is stream
@@ -155,7 +161,7 @@ def test_scans_of_several_e57_files_are_numbered_on(tmp_path, make_cloud):
     write_cloud(tmp_path / "b.e57", Cloud(make_cloud(5).coordinates, header=one))
     paths = [tmp_path / "a.e57", tmp_path / "b.e57", tmp_path / "b.e57"]
     stream, notes = merge_streams([stream_cloud(path, chunk_size=7) for path in paths])
-    assert notes == []
+    assert notes == [f"{tmp_path / 'b.e57'} is taken 2 times"]
     write_cloud(tmp_path / "all.e57", stream)
     found = read_cloud(tmp_path / "all.e57")
     assert found.fields["scan"].tolist() == [0] * 10 + [1] * 10 + [2] * 5 + [3] * 5

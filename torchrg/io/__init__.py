@@ -193,7 +193,7 @@ def write_cloud(
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
         cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
-            same bytes. Its chunks are gone through two or three times, for ``.npz`` without a
+            same bytes. Its chunks are gone through up to four times, for ``.npz`` without a
             segmentation once for each field. Tensors of the results are taken chunk by chunk, too,
             so they may be mapped from files.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.

@@ -1,6 +1,7 @@
 """Several files as one cloud: the points of one after those of the other."""
 
 import copy
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -84,6 +85,8 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
     if len(streams) == 1:
         return Merged(streams[0], [])
     kept, notes = _kept([_without_points(next(iter(stream))) for stream in streams])
+    times = Counter(stream.source for stream in streams if stream.source)
+    notes += [f"{name} is taken {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(streams)
     header, header_notes = _joined_header(streams)
     first_scans = _first_scans(streams) if "scans" in header else None
