@@ -210,21 +210,28 @@ def test_a_command_without_arguments_is_wrong_use(command, capsys):
     assert "Missing from torchrg" in shown.err or shown.out.startswith("usage: torchrg convert")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["info", "ROOM"]])
-def test_a_reader_that_goes_away_is_no_error(arguments, room):
+def run_into(output, *arguments):
+    """Run a command, its output into a file that is open, as from a shell."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "torchrg", *map(str, arguments)]
+    return subprocess.run(
+        command, stdout=output, stderr=subprocess.PIPE, text=True, env=environment, check=False
+    )
+
+
+def test_a_reader_that_goes_away_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
-    command = [
-        sys.executable,
-        "-m",
-        "torchrg",
-        *(str(room) if a == "ROOM" else a for a in arguments),
-    ]
-    done = subprocess.run(
-        command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=120
-    )
-    os.close(writer)
+    with os.fdopen(writer, "w") as output:
+        done = run_into(output, "--help")
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_output_that_cannot_be_written_is_one_line(room):
+    with Path("/dev/full").open("w") as output:
+        done = run_into(output, "info", room)
+    assert (done.returncode, done.stderr) == (2, "torchrg: info: No space left on device.\n")
 
 
 def test_unknown_command_lists_the_known_ones(capsys):

@@ -4,6 +4,8 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from io import UnsupportedOperation
 
 COMMANDS = {
     "segment": "label the planes of scans",
@@ -51,11 +53,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return fail(str(error))
     except MemoryError:
         return fail("out of memory; lower --chunk-size, or split the cloud.")
-    except BrokenPipeError:
-        # The reader of our output went away, and Python would complain again when it flushes.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except OSError as error:
+        # What could not be printed Python would try again when it ends, and complain.
+        with suppress(UnsupportedOperation, AttributeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return 0
         return fail(f"{error.filename or name}: {error.strerror or error}.")
     except KeyboardInterrupt:
         return fail("interrupted; every file written is complete.", code=INTERRUPTED)
