@@ -266,6 +266,22 @@ def test_view_draws_a_picture(room, tmp_path, capsys):
     assert "expected azimuth_deg to be finite, got nan" in error_line(capsys)
 
 
+def test_view_shows_colours_of_sixteen_bits_as_those_of_eight(room, tmp_path):
+    points = read_cloud(room).coordinates
+    color = np.random.default_rng(0).integers(0, 256, points.shape, dtype=np.uint8)
+    wide = color.astype(np.uint16) * 257
+    wide[0, 0] += 1 if wide[0, 0] < 65535 else -1
+    pictures = []
+    for name, values in (("narrow", color), ("wide", wide)):
+        np.savez(tmp_path / f"{name}.npz", points=points, color=values)
+        assert read_cloud(tmp_path / f"{name}.npz").fields["color"].dtype == values.dtype
+        picture = tmp_path / f"{name}.png"
+        command = ["view", str(tmp_path / f"{name}.npz"), "--out", str(picture), "--width", "100"]
+        assert main(command) == 0
+        pictures.append(picture.read_bytes())
+    assert pictures[0] == pictures[1]
+
+
 def test_info_says_where_a_cloud_far_away_is(tmp_path, capsys):
     np.save(
         tmp_path / "far.npy", np.array([[500000.125, 4000000.25, 1], [500001.375, 4000000.5, 2]])
