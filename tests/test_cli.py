@@ -2,6 +2,10 @@
 
 import json
 import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,6 +148,7 @@ def mistakes(tmp_path, room):
         ("ROOM", ["--normals.k", "many"], "--normals.k"),
         ("ROOM", ["--no-such-flag"], "no-such-flag"),
         ("ROOM", ["--threads", "0"], "--threads >= 1"),
+        ("ROOM", ["--voxel", "nan"], "--voxel > 0"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(
@@ -180,6 +185,55 @@ def test_scores_need_the_same_points(room, tmp_path, capsys):
     assert "expected as many points as" in error_line(capsys)
 
 
+@pytest.mark.parametrize("command", [["segment"], ["segment", "--merge"], ["normals"]])
+def test_no_result_takes_the_place_of_an_input(room, tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    Path("other").mkdir()
+    for folder in (".", "other"):
+        shutil.copy(room, Path(folder, "room é.npz"))
+    before = Path("room é.npz").read_bytes()
+    for out in ("room é.npz", "."):
+        several = ["other/room é.npz"] if "--merge" in command else []
+        assert main([*command, *several, "room é.npz", "--out", out]) == 2
+        assert "expected a place of its own for each result" in error_line(capsys)
+    assert Path("room é.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", [*([name] for name in COMMANDS), ["convert", "folder"]])
+def test_a_command_without_arguments_is_wrong_use(command, capsys):
+    try:
+        code = main(command)
+    except SystemExit as stop:
+        code = stop.code
+    assert code == 2
+    shown = capsys.readouterr()
+    assert "Missing from torchrg" in shown.err or shown.out.startswith("usage: torchrg convert")
+
+
+def run_into(output, *arguments):
+    """Run a command, its output into a file that is open, as from a shell."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "torchrg", *map(str, arguments)]
+    return subprocess.run(
+        command, stdout=output, stderr=subprocess.PIPE, text=True, env=environment, check=False
+    )
+
+
+def test_a_reader_that_goes_away_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as output:
+        done = run_into(output, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_output_that_cannot_be_written_is_one_line(room):
+    with Path("/dev/full").open("w") as output:
+        done = run_into(output, "info", room)
+    assert (done.returncode, done.stderr) == (2, "torchrg: info: No space left on device.\n")
+
+
 def test_unknown_command_lists_the_known_ones(capsys):
     assert main(["segmnet"]) == 2
     line = error_line(capsys)
@@ -207,6 +261,35 @@ def test_view_draws_a_picture(room, tmp_path, capsys):
     assert main(["view", str(room), "--out", str(out), "--color", "curvature"]) == 2
     assert "expected curvature for --color curvature" in error_line(capsys)
     assert main(["view", str(room), "--out", "room.jpg"]) == 2
+    capsys.readouterr()
+    assert main(["view", str(room), "--out", str(out), "--azimuth-deg", "nan"]) == 2
+    assert "expected azimuth_deg to be finite, got nan" in error_line(capsys)
+
+
+def test_view_shows_colours_of_sixteen_bits_as_those_of_eight(room, tmp_path):
+    points = read_cloud(room).coordinates
+    color = np.random.default_rng(0).integers(0, 256, points.shape, dtype=np.uint8)
+    wide = color.astype(np.uint16) * 257
+    wide[0, 0] += 1 if wide[0, 0] < 65535 else -1
+    pictures = []
+    for name, values in (("narrow", color), ("wide", wide)):
+        np.savez(tmp_path / f"{name}.npz", points=points, color=values)
+        assert read_cloud(tmp_path / f"{name}.npz").fields["color"].dtype == values.dtype
+        picture = tmp_path / f"{name}.png"
+        command = ["view", str(tmp_path / f"{name}.npz"), "--out", str(picture), "--width", "100"]
+        assert main(command) == 0
+        pictures.append(picture.read_bytes())
+    assert pictures[0] == pictures[1]
+
+
+def test_info_says_where_a_cloud_far_away_is(tmp_path, capsys):
+    np.save(
+        tmp_path / "far.npy", np.array([[500000.125, 4000000.25, 1], [500001.375, 4000000.5, 2]])
+    )
+    assert main(["info", str(tmp_path / "far.npy")]) == 0
+    shown = capsys.readouterr().out
+    assert "lowest      500000.125 4000000.25 1" in shown
+    assert "extent      1.25 0.25 1" in shown
 
 
 def test_info_says_what_a_file_holds(room, capsys):

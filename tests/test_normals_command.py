@@ -1,11 +1,13 @@
 """``torchrg normals``: what it writes, its settings, and one line for every mistake."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
-from torchrg.cli import main
+from torchrg.cli import console, main
 from torchrg.io import read_cloud
 from torchrg.normals import estimate_normals
 
@@ -25,6 +27,22 @@ def error_line(capsys):
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1, captured.err
     return captured.err
+
+
+def test_stages_are_shown_on_a_terminal_and_not_in_a_pipe(room, tmp_path, monkeypatch, capsys):
+    shown = []
+
+    class Bar(tqdm):
+        def set_postfix_str(self, stage, **_):
+            shown.append((stage, bool(self.disable)))
+
+    monkeypatch.setattr(console, "tqdm", Bar)
+    flags = ("--method", "pca", "--orient", "consistent")
+    for is_terminal in (True, False):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        assert run(room, "--out", tmp_path / "normals.npz", *flags) == 0
+    expected = [(stage, off) for off in (False, True) for stage in ("normals", "orientation")]
+    assert shown == expected
 
 
 def test_result_holds_what_the_contract_says(room, tmp_path, capsys):

@@ -69,8 +69,7 @@ class Cloud:
         """Return the coordinates about an origin of shape ``(3,)``, float32, shape ``(N, 3)``."""
         if self.coordinates.dtype == np.float32 and not origin.any():
             return torch.from_numpy(np.ascontiguousarray(self.coordinates))
-        local = self.coordinates.astype(np.float64) - origin
-        return torch.from_numpy(local.astype(np.float32))
+        return torch.from_numpy((self.coordinates - origin).astype(np.float32))
 
 
 def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:

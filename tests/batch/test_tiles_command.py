@@ -49,9 +49,31 @@ def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys):
     assert "in tiles of" not in capsys.readouterr().out
     assert run(*files, "--out", tmp_path / "tiles.npz", "--limit-memory", LIMIT) == 0
     said = capsys.readouterr().out.splitlines()
-    assert "about 40,000 points take 0.5 GB of memory, the limit is 0.5: in tiles of" in said[0]
+    assert "about 40,000 points take 0.54 GB of memory, the limit is 0.54: in tiles of" in said[0]
     assert (tmp_path / "whole.npz").read_bytes() == (tmp_path / "tiles.npz").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles.npz", "whole.npz"]
+
+
+@pytest.mark.parametrize(
+    ("value", "out", "code", "message"),
+    [
+        (1.0, "x.npz", 0, "no plane found: all points are equal"),
+        (np.nan, "x.npz", 2, "expected finite points, got none in 40,000 points"),
+        (None, "x.npz", 0, "1 of 40,000 points are not finite; they stay in place, unlabelled"),
+        (None, "x.las", 2, "got 1 points that are not (first: 4)"),
+    ],
+)
+def test_tiles_say_what_memory_says_before_the_work(tmp_path, capsys, value, out, code, message):
+    if out == "x.las":
+        pytest.importorskip("laspy")
+    points = np.full((ROOM, 3), 1.0 if value is None else value, np.float32)
+    points[4, 0] = np.nan if value is None else points[4, 0]
+    np.savez(tmp_path / "points.npz", points=points)
+    for limit in ("9", LIMIT):
+        flags = ("--preset", "classic", "--limit-memory", limit)
+        assert run(tmp_path / "points.npz", "--out", tmp_path / out, *flags) == code
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / ".x.tiles").exists()
 
 
 def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):

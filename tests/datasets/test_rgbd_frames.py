@@ -105,6 +105,11 @@ def test_the_camera_of_tum_is_not_guessed(tum):
     assert data[0]["intrinsics"].dtype == torch.float64
 
 
+def test_a_scale_of_zero_is_not_that_of_the_layout(tum):
+    with pytest.raises(ConfigError, match="expected depth_scale > 0"):
+        RGBDFrames.from_folder(tum, "tum", depth_scale=0.0)
+
+
 def test_icl_nuim_frames_are_matched_by_number(tmp_path):
     root = tmp_path / "living_room_traj0"
     for number in (0, 2, 10):
@@ -191,17 +196,19 @@ def test_depth_without_meaning_is_zero(tmp_path):
 
 
 def test_wrong_files_are_refused(tmp_path, tum):
+    (tmp_path / "empty.npy").touch()
     write_color(tmp_path / "color.png")
     write_text(tmp_path / "text.png", "no image")
     write_text(tmp_path / "text.npy", "no array")
     np.save(tmp_path / "flat.npy", np.zeros(3))
     for name, message in (
         ("color.png", "expected a gray PNG of 16 bits, got shape"),
-        ("text.png", "expected a PNG image, got "),
-        ("text.npy", "expected an array of numbers, got "),
+        ("text.png", "expected a PNG image, got: "),
+        ("text.npy", "expected an array of numbers, got: "),
         ("flat.npy", r"expected depth of shape \(H, W\), got \(3,\)"),
-        ("missing.png", "cannot be read: No such file"),
-        ("missing.npy", "cannot be read: No such file"),
+        ("missing.png", "no such file; check the spelling"),
+        ("empty.npy", "byte 0: the file is empty"),
+        ("missing.npy", "no such file; check the spelling"),
         ("depth.jpg", r"expected a depth image that ends in one of .png .npy, got '.jpg'"),
     ):
         with pytest.raises(FormatError, match=f"{name}: {message}"):

@@ -1,5 +1,8 @@
 """Several files as one cloud."""
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +34,17 @@ def test_points_follow_each_other_with_the_fields_of_all(tmp_path, make_cloud):
     write_cloud(tmp_path / "all.npz", stream)
     write_cloud(tmp_path / "whole.npz", whole)
     assert (tmp_path / "all.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_first_chunks_of_many_files_are_not_in_memory_together():
+    def chunks():
+        yield Cloud(np.ones((40_000, 3)), {"a": np.ones(40_000)})
+
+    tracemalloc.start()
+    merge_streams([CloudStream(chunks, 40_000) for _ in range(20)])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 40_000 * 32
 
 
 def test_fields_that_differ_are_left_out_and_named():
@@ -67,6 +81,11 @@ def test_sizes_of_other_units_are_noted():
     _, (note,) = merged(Cloud(points, source="a.ply"), large)
     assert note == "b.ply is 1,000 times as large as a.ply; expected coordinates of one unit"
     assert merged(Cloud(points), Cloud(points * 50), Cloud(np.zeros((1, 3)))).notes == []
+
+
+def test_a_file_that_is_named_twice_is_noted():
+    cloud = Cloud(np.random.default_rng(0).random((9, 3)), source="a.ply")
+    assert merged(cloud, cloud, replace(cloud, source="b.ply")).notes == ["a.ply is taken 2 times"]
 
 
 def test_one_cloud_is_itself_and_none_is_refused(make_cloud):
@@ -142,7 +161,7 @@ def test_scans_of_several_e57_files_are_numbered_on(tmp_path, make_cloud):
     write_cloud(tmp_path / "b.e57", Cloud(make_cloud(5).coordinates, header=one))
     paths = [tmp_path / "a.e57", tmp_path / "b.e57", tmp_path / "b.e57"]
     stream, notes = merge_streams([stream_cloud(path, chunk_size=7) for path in paths])
-    assert notes == []
+    assert notes == [f"{tmp_path / 'b.e57'} is taken 2 times"]
     write_cloud(tmp_path / "all.e57", stream)
     found = read_cloud(tmp_path / "all.e57")
     assert found.fields["scan"].tolist() == [0] * 10 + [1] * 10 + [2] * 5 + [3] * 5

@@ -3,11 +3,13 @@
 import pytest
 import torch
 from reproduction.scenes import make_shape
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrg.neighbors import search_knn
 from torchrg.normals.consensus.noise import survey_noise
 from torchrg.normals.patches import fit_points
 from torchrg.normals.pca import fit_normals_pca
+from torchrg.structures import Neighbors
 
 
 def survey(points, k=50):
@@ -57,3 +59,27 @@ def test_even_spread_across_a_plane_is_noise():
     points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(1))
     points[:, 2] *= 0.1
     assert float(survey(points).noise.median()) > 0.02
+
+
+class LargestResult(TorchDispatchMode):
+    """Notes how many elements the largest new tensor of floats has."""
+
+    most = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor) and result.is_floating_point():
+            self.most = max(self.most, result.numel() * (not function.is_view))
+        return result
+
+
+def test_masked_neighbours_take_memory_by_chunks_only():
+    points = make_shape("cube", 20_000, 0.004, seed=2).points
+    neighbors = search_knn(points, 20)
+    fit = fit_points(points, neighbors, fit_normals_pca)
+    counted = torch.ones_like(neighbors.indices, dtype=torch.bool)
+    with LargestResult() as results:
+        found = survey_noise(points, Neighbors(neighbors.indices, counted), fit, chunk_size=1000)
+    assert results.most < counted.numel()
+    whole = survey_noise(points, neighbors, fit)
+    assert torch.allclose(found.noise, whole.noise, rtol=1e-5)

@@ -1,5 +1,7 @@
 """Growth: what it refuses, degenerate clouds, and what each setting does."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,12 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.edges import EdgeLists
-from torchrg.regions.growth import curvature_limit, first_to_reach, number_by_size
+from torchrg.regions.growth import (
+    curvature_limit,
+    first_to_reach,
+    grow_first_in_first_out,
+    number_by_size,
+)
 from torchrg.structures import Neighbors
 
 CLASSIC = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -150,6 +157,18 @@ def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
     )
     seeds = np.arange(num_points, dtype=np.int32)
     assert not first_to_reach(edges, seeds, num_points).any()
+
+
+def test_no_python_number_is_kept_for_every_point():
+    num_points = 300_000
+    edges = EdgeLists(np.zeros(num_points + 1, dtype=np.int32), np.empty(0, dtype=np.int32))
+    order = np.arange(num_points, dtype=np.int32)[::-1]
+    tracemalloc.start()
+    heads = grow_first_in_first_out(edges, order, np.ones(num_points, dtype=bool))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (heads[order] == order).all()
+    assert peak < 30 * num_points
 
 
 def test_neighbours_across_a_gap_join_only_within_the_distance():

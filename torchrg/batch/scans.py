@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from torchrg.datasets import describe_planes
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
+from torchrg.io import CloudStream, atomic_path
 from torchrg.io.files import remove_leftovers
+from torchrg.io.stream import Extent
 from torchrg.structures import Cloud, Segmentation
 
 
@@ -116,21 +117,22 @@ class Task(Protocol):
         """Remove what a process that was killed left half-written."""
 
 
-def check_finite(cloud: Cloud) -> tuple[str, ...]:
+def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
     """Return a warning if some points of a cloud are not finite; raise FormatError if none is.
 
     Example:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]])))
         ('1 of 2 points are not finite; they stay in place, unlabelled',)
     """
-    num_bad = len(cloud) - int(cloud.finite.sum())
-    if num_bad == len(cloud):
+    num_points, num_finite, *_ = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
+    num_bad = num_points - num_finite
+    if num_finite == 0:
         raise FormatError(
             f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
         )
     if not num_bad:
         return ()
-    return (f"{num_bad:,} of {len(cloud):,} points are not finite; they stay in place, unlabelled",)
+    return (f"{num_bad:,} of {num_points:,} points are not finite; they stay in place, unlabelled",)
 
 
 def write_results(

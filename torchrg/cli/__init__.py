@@ -4,6 +4,8 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from io import UnsupportedOperation
 
 COMMANDS = {
     "segment": "label the planes of scans",
@@ -36,9 +38,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 done; 2 wrong use or bad input; 3 some items of a batch failed; 130 interrupted.
     """
-    from torchrg.cli.console import USAGE_ERROR, fail
+    from torchrg.cli.console import INTERRUPTED, fail
+    from torchrg.errors import TorchrgError
 
     arguments = list(sys.argv[1:] if argv is None else argv)
+    name = next(iter(arguments), "")
+    try:
+        try:
+            return _run(arguments)
+        finally:
+            # Here, where an error of writing is told, and not when Python ends.
+            print(end="", flush=True)
+    except TorchrgError as error:
+        return fail(str(error))
+    except MemoryError:
+        return fail("out of memory; lower --chunk-size, or split the cloud.")
+    except OSError as error:
+        # What could not be printed Python would try again when it ends, and complain.
+        with suppress(UnsupportedOperation, AttributeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return 0
+        return fail(f"{error.filename or name}: {error.strerror or error}.")
+    except KeyboardInterrupt:
+        return fail("interrupted; every file written is complete.", code=INTERRUPTED)
+
+
+def _run(arguments: list[str]) -> int:
+    """Run the command that the first argument names."""
+    from torchrg.cli.console import USAGE_ERROR
+    from torchrg.errors import ConfigError
+
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if arguments else USAGE_ERROR
@@ -49,27 +79,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"torchrg {__version__}")
         return 0
     if name not in COMMANDS:
-        return fail(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
-    return _run(name, rest)
-
-
-def _run(name: str, arguments: list[str]) -> int:
-    """Run one command; a user's mistake becomes one line on stderr, never a traceback."""
-    from torchrg.cli.console import INTERRUPTED, fail
-    from torchrg.errors import TorchrgError
-
-    try:
-        code: int = importlib.import_module(f"torchrg.cli.{name}").run(arguments)
-    except TorchrgError as error:
-        return fail(str(error))
-    except MemoryError:
-        return fail("out of memory; lower --chunk-size, or split the cloud.")
-    except BrokenPipeError:
-        # The reader of our output went away, and Python would complain again when it flushes.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except OSError as error:
-        return fail(f"{error.filename or name}: {error.strerror or error}.")
-    except KeyboardInterrupt:
-        return fail("interrupted; every file written is complete.", code=INTERRUPTED)
+        raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
+    code: int = importlib.import_module(f"torchrg.cli.{name}").run(rest)
     return code

@@ -7,13 +7,16 @@ import os
 import re
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import torch
 import tyro
+from tqdm import tqdm
 
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
@@ -102,7 +105,7 @@ class PlaneSettings:
             'pca'
         """
         values = {"--preset": DEFAULT_PRESET, "--config": ""}
-        for argument, following in zip(argv, [*argv[1:], ""], strict=True):
+        for argument, following in zip_longest(argv, argv[1:], fillvalue=""):
             name, equals, value = argument.partition("=")
             if name in values:
                 values[name] = value if equals else following
@@ -130,6 +133,18 @@ def use_threads(threads: int | None) -> None:
         raise ConfigError(f"expected --threads >= 1, got {threads}.")
     if threads is not None:
         torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar on a terminal; what is yielded is called as each stage begins."""
+    with tqdm(total=len(stages), desc=name, unit="stage", leave=False, disable=None) as bar:
+
+        def advance(stage: str) -> None:
+            bar.set_postfix_str(stage)
+            bar.update(stage != stages[0])
+
+        yield advance
 
 
 def num_cores() -> int:
@@ -192,11 +207,24 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     if given in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
     results = [out / f"{path.stem}{suffix}" for path in inputs]
+    counts = Counter(results)
     for result, source in zip(results, inputs, strict=True):
-        if results.count(result) > 1:
+        if counts[result] > 1:
             raise FormatError(f"{source}: another input has the same name; run them one by one.")
     out.mkdir(parents=True, exist_ok=True)
     return results
+
+
+def check_apart(results: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Raise FormatError if a result would take the place of an input or of another result."""
+    taken = {path.resolve() for path in inputs}
+    for path in results:
+        if path.resolve() in taken:
+            raise FormatError(
+                f"{path}: expected a place of its own for each result, got one of an input or of "
+                "another result; choose another."
+            )
+        taken.add(path.resolve())
 
 
 DRAWINGS = (".png", ".html")

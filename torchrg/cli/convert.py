@@ -152,7 +152,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, check the plan, convert, and report."""
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
-        raise SystemExit(0)
+        raise SystemExit(0 if argv else console.USAGE_ERROR)
     kind, *rest = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")

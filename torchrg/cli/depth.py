@@ -170,14 +170,8 @@ def _list_frames(sources: tuple[Path, ...], arguments: Arguments) -> list[Frame]
             strict=True,
         )
     ]
-    taken = {source.resolve() for source in sources}
-    for path in (*targets, *(picture for picture in pictures if picture is not None)):
-        if path.resolve() in taken:
-            raise FormatError(
-                f"{path}: expected a place of its own for each result, got one of an input or of "
-                "another result; choose another directory."
-            )
-        taken.add(path.resolve())
+    drawn = [picture for picture in pictures if picture is not None]
+    console.check_apart([*targets, *drawn], sources)
     return [
         Frame(Scan(str(source), (source,), _size_of(source)), target, picture, arguments)
         for source, target, picture in zip(sources, targets, pictures, strict=True)

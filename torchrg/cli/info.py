@@ -12,6 +12,9 @@ from torchrg.io import read_cloud
 from torchrg.neighbors import search_knn
 from torchrg.structures import Cloud
 
+_DIGITS = {4: 6, 8: 10}
+"""Of a coordinate by its bytes: float32 holds no more, float64 is for millimetres far away."""
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -38,9 +41,9 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
     facts["not finite"] = f"{len(cloud) - len(kept):,}"
     if len(kept):
         low, high = kept.min(axis=0), kept.max(axis=0)
-        facts["lowest"] = " ".join(f"{value:.6g}" for value in low)
-        facts["highest"] = " ".join(f"{value:.6g}" for value in high)
-        facts["extent"] = " ".join(f"{value:.6g}" for value in high - low)
+        digits = _DIGITS[cloud.coordinates.dtype.itemsize]
+        for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
+            facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
         places = np.unique(kept - cloud.origin, axis=0)
         facts["duplicates"] = f"{len(kept) - len(places):,}"
         facts["spacing"] = "none"

@@ -54,6 +54,7 @@ def run(argv: list[str]) -> int:
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     outputs = console.output_paths(arguments.inputs, arguments.out)
+    console.check_apart(outputs, arguments.inputs)
     return console.run_each(_estimate_file, arguments, arguments.inputs, outputs)
 
 
@@ -63,21 +64,25 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     cloud = read_cloud(source)
     check_finite(cloud)
     check_output(target, cloud)
-    fit = estimate_normals(cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size)
-    if (way := arguments.orient) != "none":
-        place = arguments.viewpoint
-        viewpoint = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
-        turned = orient_normals(cloud.points, fit.normals, towards=way, viewpoint=viewpoint)
-        fit = fit._replace(normals=turned)
-    settings = describe_run(source, arguments.normals)
-    settings |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
+    settings, size = arguments.normals, arguments.chunk_size
+    with console.stage_bar(source.name, ("normals", "orientation")) as advance:
+        advance("normals")
+        fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
+        advance("orientation")
+        if (way := arguments.orient) != "none":
+            place = arguments.viewpoint
+            viewpoint = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
+            turned = orient_normals(cloud.points, fit.normals, towards=way, viewpoint=viewpoint)
+            fit = fit._replace(normals=turned)
+    provenance = describe_run(source, settings)
+    provenance |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     found = {"normals": fit.normals, "curvature": fit.curvature, "sharp": sharp, "valid": fit.valid}
     # As with segmentations, .npz holds the results alone, other formats the cloud's fields too.
     kept = {} if target.suffix.lower() == ".npz" else cloud.fields
     fields = {name: values for name, values in kept.items() if name not in found}
     fields |= {name: values.numpy() for name, values in found.items()}
-    write_cloud(target, replace(cloud, fields=fields), provenance=settings)
+    write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
     num_valid = int(fit.valid.sum())
     if num_valid < len(cloud):
         num_bad = len(cloud) - num_valid

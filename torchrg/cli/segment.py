@@ -29,12 +29,13 @@ from torchrg.io import (
     stream_cloud,
     write_cloud,
 )
+from torchrg.io.stream import Extent
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
 from torchrg.render.page import check_library
-from torchrg.structures import Segmentation
+from torchrg.structures import Cloud, Segmentation
 from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -100,9 +101,12 @@ def run(argv: list[str]) -> int:
         )
     console.use_threads(arguments.threads)
     _check_memory(arguments)
+    if arguments.voxel is not None and not arguments.voxel > 0:
+        raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
     firsts = tuple(sources[0] for sources in clouds if sources)
     outputs = console.output_paths(firsts, arguments.out)
+    console.check_apart(outputs, arguments.inputs)
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments)
@@ -194,16 +198,18 @@ def _segment_tiles(
         if getattr(arguments, name):
             raise ConfigError(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
-                f"takes more than {limit / 1e9:.1f} GB; raise --limit-memory, or leave it out."
+                f"takes more than {limit / 1e9:.2f} GB; raise --limit-memory, or leave it out."
             )
     try:
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
+    _check_points(source, stream, target)
     workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
     print(
-        f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.1f} GB of "
-        f"memory, the limit is {limit / 1e9:.1f}: in tiles of {tile_size:,} in {workdir}",
+        f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
+        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {workdir}, from "
+        "which the same command goes on",
         flush=True,
     )
     with tqdm(unit="tile", leave=False, disable=None) as bar:
@@ -223,7 +229,14 @@ def _segment_tiles(
             on_stage=show,
         ) as seg:
             write_cloud(target, stream, seg, provenance=_describe(sources, settings))
-            _report(source, seg, target, time.perf_counter() - begin)
+            _report(source, seg, stream.extent, target, time.perf_counter() - begin)
+
+
+def _check_points(source: str, cloud: Cloud | CloudStream, target: Path) -> None:
+    """Warn of points that are not finite, before the work; refuse what cannot be written."""
+    for note in check_finite(cloud):
+        console.warn(f"{source}: {note}.")
+    check_output(target, cloud)
 
 
 def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
@@ -253,19 +266,10 @@ def _segment_whole(
     """Segment a cloud, with a progress bar on a terminal and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
     cloud = read_cloud(sources[0]) if len(sources) == 1 else stream.read()
-    for note in check_finite(cloud):
-        console.warn(f"{source}: {note}.")
-    check_output(target, cloud)
+    _check_points(source, cloud, target)
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
-    with tqdm(
-        total=len(stages), desc=sources[0].name, unit="stage", leave=False, disable=None
-    ) as bar:
-
-        def advance(stage: str) -> None:
-            bar.set_postfix_str(stage)
-            bar.update(stage != STAGES[0])
-
+    with console.stage_bar(sources[0].name, stages) as advance:
         voxels = None if voxel is None else sample_voxels(cloud.points, voxel)
         if voxels is None:
             seg = segment_planes(cloud.points, settings, on_stage=advance)
@@ -289,18 +293,18 @@ def _segment_whole(
             write_page(picture, make_page(result))
         else:
             draw_planes(picture, result)
-    if len(seg.planes.count) == 0:
-        kept = cloud.coordinates[cloud.finite]
-        reason = "all points are equal" if (kept == kept[0]).all() else "no region is large enough"
-        console.warn(f"{source}: no plane found: {reason}.")
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         print(f"{source}: superpoints of each level: {found}")
-    _report(source, seg, target, time.perf_counter() - begin)
+    _report(source, seg, Extent.of(cloud), target, time.perf_counter() - begin)
 
 
-def _report(source: str, seg: Segmentation, target: Path, seconds: float) -> None:
-    """Print the line about a result."""
+def _report(source: str, seg: Segmentation, extent: Extent, target: Path, seconds: float) -> None:
+    """Print the line about a result, after a warning if there is no plane in it."""
+    if len(seg.planes.count) == 0:
+        is_place = (extent.low == extent.high).all()
+        reason = "all points are equal" if is_place else "no region is large enough"
+        console.warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes.count)
     share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
     print(

@@ -1,9 +1,10 @@
 """``torchrg view``: a picture or a page of a cloud or of a result."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+import numpy as np
 import torch
 import tyro
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchrg.cli.console import check_drawing, is_page, parse
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud
+from torchrg.io.fields import WIDEN
 from torchrg.render import (
     color_curvature,
     color_normals,
@@ -69,9 +71,19 @@ def run(argv: list[str]) -> int:
     check_drawing(arguments.out)
     up = None if arguments.up is None else _direction(arguments.up)
     write = _write_page if is_page(arguments.out) else _write_picture
-    said = write(arguments, read_cloud(arguments.file), up)
+    said = write(arguments, _read(arguments.file), up)
     print(f"{arguments.file} -> {arguments.out} ({said})")
     return 0
+
+
+def _read(path: Path) -> Cloud:
+    """Read a cloud with colours of 8 bits, which is what screens show."""
+    cloud = read_cloud(path)
+    color = cloud.fields.get("color")
+    if color is None or color.dtype == np.uint8:
+        return cloud
+    narrow = np.rint(color.astype(np.float64) / WIDEN).astype(np.uint8)
+    return replace(cloud, fields={**cloud.fields, "color": narrow})
 
 
 def _write_picture(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str:
@@ -96,8 +108,8 @@ def _write_page(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str
     """Write a page, and return what there is to say about it."""
     page = make_page(
         cloud,
-        beside=None if arguments.beside is None else read_cloud(arguments.beside),
-        truth=None if arguments.truth is None else read_cloud(arguments.truth),
+        beside=None if arguments.beside is None else _read(arguments.beside),
+        truth=None if arguments.truth is None else _read(arguments.truth),
         color=arguments.color,
         view=arguments.view,
         up=up,

@@ -219,7 +219,7 @@ def _find_tum(root: Path, intrinsics: Tensor | None, depth_scale: float | None) 
             RGBDFrame(
                 folder / image,
                 camera,
-                depth_scale or _TUM_SCALE,
+                _TUM_SCALE if depth_scale is None else depth_scale,
                 f"{name}/{Path(image).stem}",
                 None if color is None else folder / color,
                 pose,
@@ -266,7 +266,7 @@ def _find_icl_nuim(
             RGBDFrame(
                 image,
                 camera,
-                depth_scale or _TUM_SCALE,
+                _TUM_SCALE if depth_scale is None else depth_scale,
                 f"{name}/{image.stem}",
                 _image_beside(folder / "rgb", image.stem),
                 poses.get(image.stem),
@@ -409,5 +409,5 @@ def _posed_frame(
     if pose is not None:
         sources = (*sources, track)
         pose = pose if bool(pose.isfinite().all()) else None
-    scale = depth_scale or _MILLIMETERS
+    scale = _MILLIMETERS if depth_scale is None else depth_scale
     return RGBDFrame(image, camera, scale, name, color, pose, no_depth, sources)

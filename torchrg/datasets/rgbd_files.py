@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.files import DAMAGES, check_file, refusing
 
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
@@ -83,34 +84,22 @@ def _read_image(source: Path, kinds: str) -> NDArray[Any]:
     """Return what an image holds, shape ``(H, W, C)``."""
     from kornia_rs import io
 
-    _check_readable(source)
-    try:
+    check_file(source)
+    with refusing(f"{source}: expected a {kinds} image, got: ", Exception):
         # Without a mode, the library says how many bits and channels there are.
         return np.asarray(io.read_image(str(source)))
-    except Exception as error:
-        raise FormatError(f"{source}: expected a {kinds} image, got {error}.") from error
 
 
 def _read_npy(source: Path) -> NDArray[np.number]:
     """Return the values of a ``.npy`` file, shape ``(H, W)``."""
-    _check_readable(source)
-    try:
+    check_file(source)
+    with refusing(f"{source}: expected an array of numbers, got: ", OSError, *DAMAGES):
         values: NDArray[np.number] = np.load(source, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise FormatError(f"{source}: expected an array of numbers, got {error}.") from error
     if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
         raise FormatError(
             f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}."
         )
     return values
-
-
-def _check_readable(source: Path) -> None:
-    """Check that a file can be opened."""
-    try:
-        source.open("rb").close()
-    except OSError as error:
-        raise FormatError(f"{source}: cannot be read: {error.strerror}.") from error
 
 
 def read_matrix(path: Path) -> Tensor:

@@ -68,7 +68,7 @@ class Format(NamedTuple):
     open: Callable[[Path, int], Table]
     write: Callable[[Path, CloudStream], None]
     count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
-    check: Callable[[Path, Cloud | None], None] | None = None
+    check: Callable[[Path, Cloud | CloudStream | None], None] | None = None
 
 
 FORMATS: dict[str, Format] = {
@@ -193,7 +193,7 @@ def write_cloud(
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
         cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
-            same bytes. Its chunks are gone through two or three times, for ``.npz`` without a
+            same bytes. Its chunks are gone through up to four times, for ``.npz`` without a
             segmentation once for each field. Tensors of the results are taken chunk by chunk, too,
             so they may be mapped from files.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
@@ -214,14 +214,13 @@ def write_cloud(
     """
     target = Path(path)
     found = _format_of(target)
+    check_output(target, cloud)
     if isinstance(cloud, Cloud):
-        check_output(target, cloud)
         for name, values in cloud.fields.items():
             check_length(target, name, values, len(cloud))
         points = checked_coordinates(target, cloud.coordinates)
         stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=CHUNK_SIZE)
     else:
-        check_output(target)
         stream = cloud
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
         if result is not None and len(result.labels) != stream.count:
@@ -265,7 +264,7 @@ def _checked(path: Path, stream: CloudStream, has_fields: bool = True) -> CloudS
     return replace(stream, chunks=chunks, measure=lambda: stream.extent)
 
 
-def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:
+def check_output(path: str | os.PathLike[str], cloud: Cloud | CloudStream | None = None) -> None:
     """Check before long work that its result has a place: known suffix, folder there.
 
     ``cloud`` is the one that shall be written, if it is known yet: LAS holds no points that are not

@@ -111,7 +111,7 @@ def _reading(pye57: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
         yield file
 
 
-def check_e57(path: Path, cloud: Cloud | None) -> None:
+def check_e57(path: Path, cloud: Cloud | CloudStream | None) -> None:
     """Check that pye57 is installed; E57 holds any cloud."""
     _pye57("write")
 

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, NoReturn
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,19 +105,21 @@ def _reading(laspy: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
         ) from error
 
 
-def check_las(path: Path, cloud: Cloud | None) -> None:
+def check_las(path: Path, cloud: Cloud | CloudStream | None) -> None:
     """Check that laspy is installed, and that all points of a cloud that is known are finite."""
     _laspy("write")
-    if cloud is not None and not cloud.finite.all():
-        _refuse_points(path, int((~cloud.finite).sum()), int(np.argmin(cloud.finite)))
-
-
-def _refuse_points(path: Path, count: int, first: int) -> NoReturn:
-    """Raise the error that some points are not finite."""
-    raise FormatError(
-        f"{path}: expected finite coordinates, as LAS has no others, got {count} points that are "
-        f"not (first: {first}); write .npz, .ply or .pcd."
-    )
+    num_before, num_lost, first = 0, 0, 0
+    for chunk in [cloud] if isinstance(cloud, Cloud) else cloud or ():
+        lost = np.flatnonzero(~chunk.finite)
+        if len(lost) and not num_lost:
+            first = num_before + int(lost[0])
+        num_lost += len(lost)
+        num_before += len(chunk)
+    if num_lost:
+        raise FormatError(
+            f"{path}: expected finite coordinates, as LAS has no others, got {num_lost} points "
+            f"that are not (first: {first}); write .npz, .ply or .pcd."
+        )
 
 
 def write_las(path: Path, stream: CloudStream) -> None:
@@ -165,7 +167,6 @@ def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
     """Look at all points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     unfit, limits = set[str](), dict[str, Limits]()
-    num_before, num_lost, first_lost = 0, 0, 0
     for number, chunk in enumerate(stream):
         columns = flatten_cloud(path, chunk, _SPELLING)
         if number == 0:
@@ -178,14 +179,8 @@ def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
             for name in fitted.keys() & set(header.point_format.dimension_names)
             if not _holds(header.point_format.dimension_by_name(name), fitted[name])
         }
-        if not chunk.finite.all():
-            first_lost = first_lost if num_lost else num_before + int(np.argmin(chunk.finite))
-            num_lost += int((~chunk.finite).sum())
-        num_before += len(chunk)
         low = np.minimum(low, chunk.coordinates.min(axis=0))
         high = np.maximum(high, chunk.coordinates.max(axis=0))
-    if num_lost:
-        _refuse_points(path, num_lost, first_lost)
     if "las" not in stream.header:
         middle = np.rint((low + high) / 2)
         reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)

@@ -1,6 +1,7 @@
 """Several files as one cloud: the points of one after those of the other."""
 
 import copy
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -83,8 +84,9 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
         raise FormatError("merge: expected at least one cloud, got none; name a file.")
     if len(streams) == 1:
         return Merged(streams[0], [])
-    firsts = [next(iter(stream)) for stream in streams]
-    kept, notes = _kept(firsts)
+    kept, notes = _kept([_without_points(next(iter(stream))) for stream in streams])
+    times = Counter(stream.source for stream in streams if stream.source)
+    notes += [f"{name} is taken {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(streams)
     header, header_notes = _joined_header(streams)
     first_scans = _first_scans(streams) if "scans" in header else None
@@ -114,6 +116,12 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
     source = f"{streams[0].source} and {len(streams) - 1} more"
     merged = CloudStream(chunks, total, None, source, header, measure)
     return Merged(merged, notes + header_notes)
+
+
+def _without_points(cloud: Cloud) -> Cloud:
+    """Return a cloud with all but its points: chunks of many files would fill the memory."""
+    fields = {name: values[:0].copy() for name, values in cloud.fields.items()}
+    return Cloud(cloud.coordinates[:0].copy(), fields, header=cloud.header)
 
 
 def _kept(clouds: Sequence[Cloud]) -> tuple[_Kept, list[str]]:

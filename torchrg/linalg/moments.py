@@ -178,14 +178,6 @@ class Segments:
         """Return the smallest and the largest value of each region."""
         return self._reduce(values, "min", np.minimum), self._reduce(values, "max", np.maximum)
 
-    def first_of_each(self, chosen: Tensor) -> Tensor:
-        """Return the place of the first chosen value of each region that has one."""
-        places = chosen.nonzero().squeeze(1)
-        owner = self.labels[places]
-        is_first = torch.ones_like(owner, dtype=torch.bool)
-        is_first[1:] = owner[1:] != owner[:-1]
-        return places[is_first]
-
     def median(self, values: Tensor) -> Tensor:
         """Return the median of each region's values, the lower one of an even number."""
         parts = torch.split(values, self.counts.tolist())

@@ -17,8 +17,8 @@ from torchrg.structures import UNLABELED, Neighbors
 
 _AGREE = 0.3
 """Share of the largest angle. Regions too small before absorption whose normals are off by less,
-root mean square, are faces: of a small one half is border. Without this a cluttered office has 491
-regions instead of 308."""
+root mean square, are faces: of a small one half is border. Without this a cluttered office has 490
+regions instead of 306."""
 
 _MAX_PASSES = 10
 """Times. Points that moved are neighbours of the next: narrow strips fill from their ends."""

@@ -173,7 +173,7 @@ def _first_regions(
 
     found = map_chunks(find, len(places), ROWS_AT_ONCE, places.device)
     counts, targets = (torch.cat(parts) for parts in zip(*found, strict=True))
-    starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0)).to(torch.int32)
+    starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     links = np.ones(len(targets), dtype=np.int8)
     shape = (len(places), len(places))
     edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)

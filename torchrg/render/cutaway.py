@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg.errors import ConfigError
 from torchrg.render.grid import Cells
 
 
@@ -228,6 +229,9 @@ def choose_viewpoint(
     of eight, equal ones decided by the angle, and from above the one that lays the cloud across the
     picture. The elevation is the angle over the horizon: by default 35, from above 90.
     """
+    for name, angle in (("azimuth_deg", azimuth_deg), ("elevation_deg", elevation_deg)):
+        if angle is not None and not math.isfinite(angle):
+            raise ConfigError(f"choose_viewpoint: expected {name} to be finite, got {angle}.")
     directions = main_directions(cells)
     heading = _heading(directions, up)
     if elevation_deg is None:

@@ -17,7 +17,7 @@ NOISE_QUANTILE = 0.35
 +3.6 deg mean, torus, adaptive k. Double: +3.6 deg mean, bracket."""
 NOISE_COUNTS = (8, 16)
 """Neighbours. Small neighbourhoods, of which enough lie within one face at edges and corners. [0]
-Half: +10 deg mean, torus, adaptive k. Double: +3.5 deg mean, plate, exact. [1] Half: +2.3 deg mean,
+Half: +10 deg mean, torus, adaptive k. Double: +1.5 deg mean, cube, k = 16. [1] Half: +2.3 deg mean,
 torus, adaptive k (free to x0.909). Double: +0.073 deg mean, bracket (free to x1.25)."""
 NOISE_FACTORS = (1.22, 1.1)
 """Per deviation. Noise by that quantile of the deviations of noisy planes: of m points, the root of
@@ -26,17 +26,17 @@ torus, adaptive k. Double: +1.3 deg mean, cube, k = 16. [1] Half: +7 deg mean, t
 Double: +0.084 deg mean, bracket."""
 NOISE_FACTOR_OF_ALL = 1.04
 """Per deviation. The same for all neighbours. Half: +4.4 deg mean, torus, adaptive k. Double:
-free."""
++0.09 deg mean, room (free to x1.1)."""
 NOISE_LIMITS = (0.3425, 0.398)
 """Radii. What noise by these counts tends to as true noise grows, measured on noisy planes. [0]
 Half: -0.36 deg mean, torus, adaptive k. Double: +2.6 deg mean, torus, adaptive k. [1] Half: +0.093
 deg mean, bracket (free to x0.8). Double: +0.21 deg mean, torus, adaptive k."""
 COMMON_QUANTILE = 0.15
 """Share. Of the neighbours' noise: what a corner, where no neighbourhood is flat, goes by. Half:
--0.41 deg mean, plate, exact. Double: +0.51 deg mean, plate, exact."""
+-1.7 deg RMS, plate, exact. Double: +3.2 deg RMS, plate, exact."""
 MAX_ABOVE_COMMON = 3.0
 """Times. Noise above that common noise is shape. Half: -0.34 deg mean, cube, k = 16 (free to
-x0.909). Double: free."""
+x0.8). Double: +0.09 deg mean, room (free to x1.5)."""
 MAX_LAYERED_KURTOSIS = 2.2
 """Ratio. Of residuals from one plane, up to which two parallel ones are tried: 1 for both faces of
 a plate without noise, 1.8 for even spread, 3 for noise. Half: +1.67 deg mean, plate, exact. Double:
@@ -70,14 +70,14 @@ NUM_CANDIDATES = 32
 """Planes. Candidates of the vote; each costs a pass over the neighbours. Half: +0.15 deg mean,
 plate, exact (free to x0.8). Double: free."""
 CANDIDATE_POWER = 1.5
-"""Exponent. Ranks of the candidates' points: above 1 near points come more often. Half: +0.12 deg
-mean, plate, exact (free to x0.667). Double: +0.078 deg mean, bracket."""
+"""Exponent. Ranks of the candidates' points: above 1 near points come more often. Half: +3 pt ARI,
+office parts. Double: +0.078 deg mean, bracket."""
 VOTE_REACH = 2.0
-"""s. Residual from which a neighbour votes against a plane. Half: -0.24 deg mean, plate, exact.
-Double: +0.26 deg mean, coral, exact."""
+"""s. Residual from which a neighbour votes against a plane. Half: +0.18 deg mean, bracket. Double:
++0.26 deg mean, coral, exact (free to x1.1)."""
 VOTE_FALLOFF = 0.9
-"""Share. What the farthest neighbour's vote lacks of the nearest one's. Half: +0.11 deg mean,
-coral, exact. Double: free."""
+"""Share. What the farthest neighbour's vote lacks of the nearest one's. Half: +0.12 deg mean,
+coral, exact. Double: -0.38 deg RMS, plate, exact."""
 FIT_REACH = 3.5
 """s. Reach of the bisquare weights of the last fit: nearly all the points of a face. Half: +0.13
 deg mean, torus, adaptive k. Double: +0.45 deg mean, bracket."""
@@ -90,7 +90,7 @@ torus, adaptive k."""
 
 NUM_ALTERNATIONS = 4
 """Times. Planes that meet, and who belongs to which, are fitted in turn. Half: +0.35 deg mean,
-bracket. Double: +0.061 deg mean, bracket."""
+bracket. Double: +0.68 deg RMS, plate, exact (free to x1.1)."""
 MEETING_GAP = 2.0
 """s. Points farther from one plane are the first guess of the other. Half: +0.79 deg mean, bracket.
 Double: -0.41 deg mean, torus, adaptive k."""
@@ -98,14 +98,14 @@ MIN_PLANE_POINTS = 5
 """Points. A plane of fewer explains them whatever they are. Half: -0.6 deg mean, cube, k = 16.
 Double: +0.76 deg mean, bracket."""
 CORNER_LIMIT = 1.15
-"""s. Deviation of two planes above which three are tried. Half: -0.12 deg mean, plate, exact.
-Double: +0.3 deg mean, bracket."""
+"""s. Deviation of two planes above which three are tried. Half: -0.84 deg RMS, plate, exact.
+Double: +0.32 deg mean, bracket (free to x1.1)."""
 CORNER_SHARE = 0.9
 """Deviations of two planes. Three replace the two below that. Half: +0.22 deg mean, bracket.
 Double: free."""
 MEETING_LIMIT = 1.3
 """s. Deviation up to which two or three planes explain the neighbours. Half: +2.9 deg mean,
-bracket. Double: +2.7 pt ARI, office parts."""
+bracket. Double: +2.6 pt ARI, office parts."""
 MIN_GAIN = 8.0
 """Chi-square. Gain of the planes over the paraboloid that a point needs. Half: free. Double: -0.051
 deg mean, torus, adaptive k."""
@@ -127,7 +127,7 @@ MIN_ERROR = 0.003
 free. Double: +0.095 deg mean, room."""
 INLIER_REACH = 3.0
 """s. What is farther from a plane is not on it: neighbours have no part in the error and curvature
-of a sharp point, and points do not choose that plane. Half: free. Double: +1.1 pt ARI, office
+of a sharp point, and points do not choose that plane. Half: free. Double: +2.7 pt ARI, office
 parts."""
 SMOOTHING_REACH = 2.5
 """s. Residual of the point from a neighbour's plane from which that has no say. Half: +0.42 deg
@@ -141,8 +141,8 @@ torus, adaptive k. Double: free."""
 TILT_RIDGE = 0.01
 """Share of the trace. Keeps that balance solvable for points on a line. Half, double: free."""
 CHOICE_STEP = 3
-"""Ranks. Every third neighbour's plane is tried: others add time only. Half: free. Double: +0.056
-deg mean, plate, exact."""
+"""Ranks. Every third neighbour's plane is tried: others add time only. Half: free. Double: +0.08
+deg mean, plate, exact (free to x1.5)."""
 CHOICE_COST = 0.1
 """Score. Price of a residual of the point of one s, growing with its square. Half: -1.2 pt ARI,
 office parts. Double: free."""

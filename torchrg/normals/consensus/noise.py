@@ -192,19 +192,21 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
     """Return a quantile of values over the neighbours of each point."""
     indices, counted = neighbors
-    if counted is not None:
-        near = torch.where(counted, values[indices.long()], torch.inf).sort(dim=1).values
-        ranks = (quantile * counted.sum(dim=1, keepdim=True)).ceil().clamp(min=1)
-        return near.gather(1, ranks.long() - 1).squeeze(1)
-    rank = max(math.ceil(quantile * indices.shape[1]), 1)
-    if values.device.type != "cpu":
-        return values[indices.long()].kthvalue(rank, dim=1).values
-    found, columns, rows = torch.empty_like(values), values.numpy(), indices.numpy()
+    rank, found = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
 
     def work(block: slice) -> None:
-        near = np.take(columns, rows[block])
-        near.partition(rank - 1, axis=1)
-        found.numpy()[block] = near[:, rank - 1]
+        if counted is None and values.device.type == "cpu":
+            near = np.take(values.numpy(), indices[block].numpy())
+            near.partition(rank - 1, axis=1)
+            found.numpy()[block] = near[:, rank - 1]
+            return
+        of_neighbors = values[indices[block].long()]
+        if counted is None:
+            found[block] = of_neighbors.kthvalue(rank, dim=1).values
+            return
+        ranks = (quantile * counted[block].sum(dim=1, keepdim=True)).ceil().clamp(min=1)
+        ascending = torch.where(counted[block], of_neighbors, torch.inf).sort(dim=1).values
+        found[block] = ascending.gather(1, ranks.long() - 1).squeeze(1)
 
     map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
     return found
