@@ -89,6 +89,23 @@ def test_organised_clouds_keep_their_grid(tmp_path, depth, focal):
         np.testing.assert_allclose(arrays["plane_offset"], [2.0, 2.5], rtol=1e-5)
 
 
+def test_segment_says_that_a_cloud_is_a_depth_image(tmp_path, capsys, depth):
+    points = depth_to_points(depth[None], INTRINSICS[None])[0].view(-1, 3).numpy()
+    turned = points[:, [2, 0, 1]]
+    for name, coordinates, grid in (
+        ("image", points, (60, 80)),
+        ("list", points, None),
+        ("turned", turned, (60, 80)),
+    ):
+        source = tmp_path / f"{name}.pcd"
+        write_cloud(source, Cloud(coordinates, grid_shape=grid))
+        flags = ["--preset", "classic", "--out", str(tmp_path / "out.npz")]
+        assert main(["segment", str(source), *flags]) == 0
+        assert ("taken by a depth camera; torchrg depth" in capsys.readouterr().err) == (
+            name == "image"
+        )
+
+
 def test_several_images_go_into_a_folder(tmp_path, frame):
     other, out = tmp_path / "other.png", tmp_path / "out"
     other.write_bytes(frame.read_bytes())

@@ -93,7 +93,7 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
     [
         (
             ("--limit-memory", "0.1"),
-            "a.npz: expected --limit-memory of at least 0.5 GB for about 20,000",
+            "a.npz: expected --limit-memory of at least 0.54 GB for about 20,000",
         ),
         (("--limit-memory", "-1"), "expected --limit-memory > 0, in GB, got -1"),
         (("--limit-memory", LIMIT, "--merge", "--voxel", "0.1"), "expected no --voxel for a cloud"),
@@ -120,7 +120,7 @@ def test_a_working_directory_is_of_one_command(rooms, tmp_path, capsys):
 def test_tiles_are_as_large_as_memory_allows():
     assert choose_tile_size(10**5, 10**9) > choose_tile_size(10**5, 8 * 10**8)
     assert choose_tile_size(10**7, 10**12) == choose_tile_size(1, 10**12)
-    with pytest.raises(ConfigError, match=r"expected --limit-memory of at least 100\.9 GB"):
+    with pytest.raises(ConfigError, match=r"expected --limit-memory of at least 100\.88 GB"):
         choose_tile_size(10**9, 3 * 10**9)
 
 

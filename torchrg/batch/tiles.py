@@ -43,8 +43,8 @@ def choose_tile_size(num_points: int, memory_limit: int) -> int:
     needed = _BASE_BYTES + max(whole, _BYTES_PER_TILE_POINT * _SMALLEST_TILE)
     if needed > memory_limit:
         raise ConfigError(
-            f"expected --limit-memory of at least {needed / 1e9:.1f} GB for about {num_points:,} "
-            f"points, got {memory_limit / 1e9:.1f} GB; raise it, or split the cloud."
+            f"expected --limit-memory of at least {needed / 1e9:.2f} GB for about {num_points:,} "
+            f"points, got {memory_limit / 1e9:.2f} GB; raise it, or split the cloud."
         )
     return min(most, TILE_SIZE)
 

@@ -19,6 +19,7 @@ from torchrg.batch.scans import check_finite
 from torchrg.batch.tiles import TileJob, choose_tile_size, segmented_in_tiles, work_on_tile
 from torchrg.cli import console
 from torchrg.config import PipelineConfig, SuperpointsConfig
+from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import (
     CloudStream,
@@ -248,6 +249,14 @@ def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], R
     return partial(run_ray, memory_limit=limit, address=arguments.ray_address, work=work_on_tile)
 
 
+def _is_depth_image(cloud: Cloud) -> bool:
+    """Tell whether a cloud has a point for each pixel of a camera."""
+    if cloud.grid_shape is None:
+        return False
+    pixels = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
+    return find_intrinsics(pixels) is not None
+
+
 def _describe(sources: tuple[Path, ...], settings: PipelineConfig) -> dict[str, Any]:
     """Return the provenance of a cloud of one file or of several."""
     provenance = describe_run(sources[0], settings)
@@ -267,6 +276,10 @@ def _segment_whole(
     begin, source = time.perf_counter(), _name_of(sources)
     cloud = read_cloud(sources[0]) if len(sources) == 1 else stream.read()
     _check_points(source, cloud, target)
+    if _is_depth_image(cloud):
+        console.warn(
+            f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
+        )
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
     with console.stage_bar(sources[0].name, stages) as advance:
