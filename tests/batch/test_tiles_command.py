@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from torchrg.batch.run import DirectoryLock
-from torchrg.batch.tiles import choose_tile_size
+from torchrg.batch.tiles import choose_tile_size, choose_workers, segmented_in_tiles
 from torchrg.cli import main
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
-from torchrg.io import read_cloud
+from torchrg.io import read_cloud, stream_cloud
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 
@@ -122,6 +122,38 @@ def test_tiles_are_as_large_as_memory_allows():
     assert choose_tile_size(10**7, 10**12) == choose_tile_size(1, 10**12)
     with pytest.raises(ConfigError, match=r"expected --limit-memory of at least 100\.88 GB"):
         choose_tile_size(10**9, 3 * 10**9)
+
+
+def test_workers_are_as_many_as_memory_and_points_are_worth():
+    before = torch.get_num_threads()
+    torch.set_num_threads(8)
+    try:
+        assert choose_workers(10**8, 300_000, 10**11) == 8
+        assert choose_workers(10**7, 300_000, 10**11) == 5
+        # Half a gigabyte for this process, 1.1 for each of the others.
+        assert choose_workers(10**8, 300_000, 3 * 10**9) == 2
+        assert choose_workers(10**8, 300_000, 10**9) == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.slow
+def test_processes_give_the_labels_of_one(tmp_path):
+    points = make_room(num_points=3000, noise=0.003, seed=2).points
+    np.save(tmp_path / "room.npy", points)
+    config = load_config("paper")
+    with segmented_in_tiles(
+        [tmp_path / "room.npy"],
+        stream_cloud(tmp_path / "room.npy"),
+        tmp_path / "work",
+        config,
+        tile_size=500,
+        workers=2,
+    ) as found:
+        expected = segment_planes(points, config)
+        np.testing.assert_array_equal(found.labels, expected.labels)
+        np.testing.assert_array_equal(found.normals, expected.normals)
+    assert not (tmp_path / "work").exists()
 
 
 def python(*arguments):

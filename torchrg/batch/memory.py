@@ -5,7 +5,7 @@ from pathlib import Path
 
 _BASE_BYTES = 500_000_000
 """What a worker takes before the first point: Python, torch, scipy."""
-_BYTES_PER_POINT = 1_100
+SCAN_BYTES_PER_POINT = 1_100
 """What each point adds at the peak."""
 _CGROUP = Path("/sys/fs/cgroup")
 _CGROUP_FILES = (
@@ -24,7 +24,7 @@ def memory_of_scan(num_points: int) -> int:
         >>> memory_of_scan(1_000_000)
         1600000000
     """
-    return _BASE_BYTES + _BYTES_PER_POINT * num_points
+    return _BASE_BYTES + SCAN_BYTES_PER_POINT * num_points
 
 
 def available_memory() -> int:
@@ -50,12 +50,15 @@ def reset_peak_memory() -> None:
         return
 
 
-def peak_memory() -> int:
-    """Return the largest resident memory of this process since the last reset, in bytes."""
+def peak_memory(process: int | str = "self") -> int:
+    """Return the largest resident memory of a process since its last reset, in bytes.
+
+    Where the system does not say it (only Linux does), that of this process since its start.
+    """
     import resource
 
     usage = resource.getrusage(resource.RUSAGE_SELF)
-    return _read_entry("/proc/self/status", "VmHWM", otherwise=usage.ru_maxrss * 1024)
+    return _read_entry(f"/proc/{process}/status", "VmHWM", otherwise=usage.ru_maxrss * 1024)
 
 
 def _read_entry(path: str, name: str, *, otherwise: int) -> int:

@@ -3,9 +3,14 @@
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import torch
+
 from torchrg.batch.convert import ScanReport, report_on
+from torchrg.batch.local import run_local
+from torchrg.batch.memory import SCAN_BYTES_PER_POINT, memory_of_scan
 from torchrg.batch.records import describe_versions, hash_file
 from torchrg.batch.run import LOCK, DirectoryLock, Reports
 from torchrg.batch.scans import Converted, Scan
@@ -26,6 +31,9 @@ _BYTES_PER_TILE_POINT = 2_000
 """What a tile takes for each of its own, with those around it."""
 _SMALLEST_TILE = 20_000
 """Points. Smaller ones are mostly what is around them."""
+_LEAST_POINTS_A_WORKER = 2_000_000
+"""Of the whole cloud: a process takes two seconds to load torch, in each stage, and one of these
+points a microsecond at least."""
 
 
 def choose_tile_size(num_points: int, memory_limit: int) -> int:
@@ -49,6 +57,24 @@ def choose_tile_size(num_points: int, memory_limit: int) -> int:
     return min(most, TILE_SIZE)
 
 
+def choose_workers(num_points: int, tile_size: int, memory_limit: int) -> int:
+    """Return how many processes may work on tiles within a limit of memory, bytes, beside this one.
+
+    With one, this process does the work itself, on its threads.
+
+    Example:
+        >>> choose_workers(50_000, 20_000, 2**40)
+        1
+    """
+    room = (memory_limit - _BASE_BYTES) // memory_of_scan(_as_scan_points(tile_size))
+    return max(min(torch.get_num_threads(), room, num_points // _LEAST_POINTS_A_WORKER), 1)
+
+
+def _as_scan_points(num_points: int) -> int:
+    """Return of how many points a scan takes the memory that a tile takes."""
+    return num_points * _BYTES_PER_TILE_POINT // SCAN_BYTES_PER_POINT
+
+
 @contextlib.contextmanager
 def segmented_in_tiles(
     sources: Sequence[Path],
@@ -57,6 +83,7 @@ def segmented_in_tiles(
     settings: PipelineConfig,
     *,
     tile_size: int,
+    workers: int = 1,
     start: Callable[[Sequence["TileJob"]], Reports] | None = None,
     on_stage: Callable[[str, int, int], None] | None = None,
 ) -> Iterator[Segmentation]:
@@ -71,7 +98,9 @@ def segmented_in_tiles(
         folder: Working directory; another process that works there is refused.
         settings: Of the pipeline.
         tile_size: Points of a tile.
-        start: Starts an engine on the jobs of a stage. Default: this process, tile by tile.
+        workers: Processes of one thread that work on tiles side by side; with one, this process
+            works on tile after tile, on its threads.
+        start: Starts another engine on the jobs of a stage.
         on_stage: See :func:`torchrg.tiling.segment_tiles`.
 
     Yields:
@@ -86,7 +115,12 @@ def segmented_in_tiles(
     except OSError as error:
         raise FormatError(f"{folder}: cannot be made: {error.strerror or error}.") from error
     files = TileFiles(folder)
-    with DirectoryLock(folder):
+    with DirectoryLock(folder) as lock:
+        if start is None and workers > 1:
+            memory = workers * memory_of_scan(_as_scan_points(tile_size))
+            start = partial(
+                run_local, workers=workers, memory_limit=memory, lock=lock, work=work_on_tile
+            )
         try:
             yield segment_tiles(
                 chunks,
@@ -94,7 +128,7 @@ def segmented_in_tiles(
                 settings,
                 tile_size=tile_size,
                 identity={"inputs": inputs, "versions": describe_versions()},
-                run=run_in_turn if start is None else lambda tasks: _run_jobs(tasks, start),
+                run=run_in_turn if start is None else partial(_run_jobs, start=start),
                 on_stage=on_stage,
             )
         except BaseException:
@@ -119,7 +153,7 @@ class TileJob:
     @property
     def scan(self) -> Scan:
         """The tile under the name of its stage; its size is one of memory."""
-        return Scan(self.task.name, (), self.task.num_points * _BYTES_PER_TILE_POINT // 1_100)
+        return Scan(self.task.name, (), _as_scan_points(self.task.num_points))
 
     def remove_leftovers(self) -> None:
         """Do nothing: a tile is written where it belongs."""

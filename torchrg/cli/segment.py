@@ -16,7 +16,13 @@ from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
 from torchrg.batch.run import Reports
 from torchrg.batch.scans import check_finite
-from torchrg.batch.tiles import TileJob, choose_tile_size, segmented_in_tiles, work_on_tile
+from torchrg.batch.tiles import (
+    TileJob,
+    choose_tile_size,
+    choose_workers,
+    segmented_in_tiles,
+    work_on_tile,
+)
 from torchrg.cli import console
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.depth import find_intrinsics
@@ -226,6 +232,7 @@ def _segment_tiles(
             workdir,
             settings,
             tile_size=tile_size,
+            workers=choose_workers(num_points, tile_size, limit),
             start=_engine(arguments, limit),
             on_stage=show,
         ) as seg:
@@ -241,7 +248,7 @@ def _check_points(source: str, cloud: Cloud | CloudStream, target: Path) -> None
 
 
 def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
-    """Return what runs the tiles elsewhere, None where this process does."""
+    """Return what runs the tiles elsewhere, None where this machine does."""
     if arguments.engine == "local":
         return None
     from torchrg.batch.ray_tasks import run_ray
