@@ -1,6 +1,7 @@
 """A cloud in tiles, as a command does it: within a limit of memory, alone in its directory."""
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +11,7 @@ import torch
 
 from torchrg.batch.convert import ScanReport, report_on
 from torchrg.batch.local import run_local
-from torchrg.batch.memory import SCAN_BYTES_PER_POINT, memory_of_scan
+from torchrg.batch.memory import SCAN_BYTES_PER_POINT
 from torchrg.batch.records import describe_versions, hash_file
 from torchrg.batch.run import LOCK, DirectoryLock, Reports
 from torchrg.batch.scans import Converted, Scan
@@ -66,13 +67,8 @@ def choose_workers(num_points: int, tile_size: int, memory_limit: int) -> int:
         >>> choose_workers(50_000, 20_000, 2**40)
         1
     """
-    room = (memory_limit - _BASE_BYTES) // memory_of_scan(_as_scan_points(tile_size))
+    room = (memory_limit - _BASE_BYTES) // (_BASE_BYTES + _BYTES_PER_TILE_POINT * tile_size)
     return max(min(torch.get_num_threads(), room, num_points // _LEAST_POINTS_A_WORKER), 1)
-
-
-def _as_scan_points(num_points: int) -> int:
-    """Return of how many points a scan takes the memory that a tile takes."""
-    return num_points * _BYTES_PER_TILE_POINT // SCAN_BYTES_PER_POINT
 
 
 @contextlib.contextmanager
@@ -98,8 +94,8 @@ def segmented_in_tiles(
         folder: Working directory; another process that works there is refused.
         settings: Of the pipeline.
         tile_size: Points of a tile.
-        workers: Processes of one thread that work on tiles side by side; with one, this process
-            works on tile after tile, on its threads.
+        workers: Processes of one thread that work on tiles side by side, as many as there is memory
+            for; with one, this process works on tile after tile, on its threads.
         start: Starts another engine on the jobs of a stage.
         on_stage: See :func:`torchrg.tiling.segment_tiles`.
 
@@ -117,9 +113,8 @@ def segmented_in_tiles(
     files = TileFiles(folder)
     with DirectoryLock(folder) as lock:
         if start is None and workers > 1:
-            memory = workers * memory_of_scan(_as_scan_points(tile_size))
             start = partial(
-                run_local, workers=workers, memory_limit=memory, lock=lock, work=work_on_tile
+                run_local, workers=workers, memory_limit=sys.maxsize, lock=lock, work=work_on_tile
             )
         try:
             yield segment_tiles(
@@ -153,7 +148,8 @@ class TileJob:
     @property
     def scan(self) -> Scan:
         """The tile under the name of its stage; its size is one of memory."""
-        return Scan(self.task.name, (), _as_scan_points(self.task.num_points))
+        num_bytes = self.task.num_points * _BYTES_PER_TILE_POINT
+        return Scan(self.task.name, (), num_bytes // SCAN_BYTES_PER_POINT)
 
     def remove_leftovers(self) -> None:
         """Do nothing: a tile is written where it belongs."""
