@@ -97,9 +97,10 @@ def test_the_sign_of_normals_does_not_matter(config, rng):
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_float32_and_float64_agree(config):
-    points, normals, curvature, neighbors = clouds("room")
-    double = grow_regions(points, normals, curvature, neighbors, config)
-    single = grow_regions(
-        points.float(), normals.float(), curvature.float(), neighbors, config, canonical=True
-    )
-    assert torch.equal(single, double)
+    *values, neighbors = clouds("room")
+    # Points with the same neighbours have the same curvature up to the rounding of float64, which
+    # differs from processor to processor: both runs get numbers that float32 can hold.
+    singles = [value.float() for value in values]
+    doubles = [value.double() for value in singles]
+    single = grow_regions(*singles, neighbors, config, canonical=True)
+    assert torch.equal(single, grow_regions(*doubles, neighbors, config, canonical=True))
