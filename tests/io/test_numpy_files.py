@@ -54,9 +54,14 @@ def test_fortran_order_and_foreign_bytes_are_read(tmp_path):
         (np.zeros((4, 3)), {"color"}),
         (np.full((4, 3), 1e200), {"column_4", "column_5", "column_6"}),
         (np.full((4, 3), 0.3), {"column_4", "column_5", "column_6"}),
-        (np.tile([255.0, 0, 7, 3], (4, 1)), {"color", "labels"}),
         (np.tile([255.0, 0, 7, 0.5], (4, 1)), {"color", "column_7"}),
-        (np.tile([256.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
+        (np.tile([256.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
+        (np.tile([-1640.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
+        (np.tile([0.5, 0.6, 0, -0.8], (4, 1)), {"column_4", "normals"}),
+        (np.tile([0.6, 0, -0.8, 3], (4, 1)), {"normals", "column_7"}),
+        # Intensity and colour, or colour and label: values do not tell.
+        (np.tile([255.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
+        (np.tile([0.5, 0, 7, 0.5], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
     ],
 )
 def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
