@@ -90,9 +90,12 @@ class FolderArguments(CloudArguments):
     layout; with ROOT for OUT, the latter are completed in place.
     """
 
+    columns: console.ColumnsFlag = None
+
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        return FolderSource(root, self.settings.resolved, out, self.superpoint)
+        names = console.ColumnNames.parse(self.columns, root.rglob("*")).names
+        return FolderSource(root, self.settings.resolved, out, self.superpoint, names)
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
     "FORMATS",
+    "RESULT_FIELDS",
     "CloudStream",
     "atomic_path",
     "check_output",
@@ -74,6 +75,8 @@ class Format(NamedTuple):
     takes_columns: bool = False
 
 
+RESULT_FIELDS = ("labels", "normals", "curvature")
+"""What a segmentation writes of each point beside the fields of the cloud."""
 FORMATS: dict[str, Format] = {
     ".npz": Format(open_npz, write_npz, count_npz),
     ".npy": Format(open_npy, write_npy, count_npy, takes_columns=True),
@@ -268,8 +271,7 @@ def write_cloud(
     if superpoints is not None:
         stream = stream.with_results(lambda rows: superpoints.rows(rows).by_level())
     if segmentation is not None:
-        names = ("labels", "normals", "curvature")
-        results = {name: getattr(segmentation, name) for name in names}
+        results = {name: getattr(segmentation, name) for name in RESULT_FIELDS}
         stream = stream.with_results(
             lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
         )

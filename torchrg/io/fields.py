@@ -60,10 +60,12 @@ LEFT_OUT = "_"
 _MOST_GUESSED = max(_GUESSED_WIDTHS)
 FIRST_ROWS = _MOST_GUESSED + 1
 """Rows that :func:`check_first_rows` looks at."""
-COLUMNS_RULE = """Without names, columns are x y z, and a fourth alone is intensity. Of six, the
-last three are a unit normal, or a colour of whole numbers from 0 to 255, where all values fit. Of
-seven, the same is asked of the last three and of the three before the last; if one of both fits,
-it is taken, with intensity before a colour. Any other column is column_4, column_5 and so on."""
+COLUMNS_RULE = (
+    "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
+    "a unit normal, or a colour of whole numbers from 0 to 255, where all values fit. Of seven, "
+    "the same is asked of the last three and of the three before the last; if one of both fits, it "
+    "is taken, with intensity before a colour. Any other column is column_4, column_5 and so on."
+)
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
 """Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
@@ -218,14 +220,15 @@ def put_results(
 def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[str]:
     """Return what to tell people of fields that :func:`put_results` renames or leaves out."""
     shown = {name: "label" if name == "labels" else name for name in results if name in fields}
-    kept = {name: name_aside(name) for name in shown if name_aside(name) not in fields}
-    lost = [shown[name] for name in shown if name not in kept]
+    kept = [name for name in shown if name_aside(name) not in fields]
+    lost = [name for name in shown if name not in kept]
     notes = []
     if kept:
-        names = ", ".join(f"{shown[name]} as {aside}" for name, aside in kept.items())
-        notes.append(f"keeps its own {names} beside the result's")
+        names = ", ".join(f"{shown[name]} as {name_aside(name)}" for name in kept)
+        notes.append(f"its own fields are kept beside the result's: {names}")
     if lost:
-        notes.append(f"its {', '.join(lost)} give way to the result's, as its input's are kept")
+        names, asides = (", ".join(map(spell, lost)) for spell in (shown.__getitem__, name_aside))
+        notes.append(f"its own {names} left out for the result's; {asides} stay")
     return notes
 
 

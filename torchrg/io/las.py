@@ -148,7 +148,14 @@ def write_las(path: Path, stream: CloudStream) -> None:
         atomic_path(path) as beside,
         asking_system(beside, *errors),
     ):
-        with laspy.open(beside, mode="w", header=plan.header) as writer:
+        packed = path.suffix.lower() == ".laz"
+        # laspy leaves a file open that it cannot end.
+        with (
+            beside.open("wb+") as file,
+            laspy.open(
+                file, mode="w", header=plan.header, do_compress=packed, closefd=False
+            ) as writer,
+        ):
             for chunk in stream:
                 record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=plan.header)
                 data = laspy.LasData(plan.header, record)
@@ -264,11 +271,11 @@ def _own_dimensions(header: Any, cloud: Cloud) -> list[_Own]:  # noqa: ANN401
     if header is None:
         return []
     dimensions = {name: dim for dim in header.point_format.dimensions for name in _parts_of(dim)}
-    empty = {name: np.empty(0, _type_of(dim)) for name, dim in dimensions.items()}
+    fields = sources_of({name: np.empty(0, _type_of(dim)) for name, dim in dimensions.items()})
     found = dict[str, tuple[str, str]]()
-    for field, parts in sources_of(empty).items():
+    for field, parts in fields.items():
         aside = name_aside(field)
-        is_aside = aside in cloud.fields and aside not in dimensions
+        is_aside = aside in cloud.fields and aside not in fields
         name = aside if is_aside else field
         if name not in cloud.fields:
             continue
