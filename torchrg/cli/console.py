@@ -175,11 +175,9 @@ def note_input(
         warn(f"{source}: {note}.")
 
 
-def without(target: Path, cloud: Cloud) -> str:
-    """Return the words for a report on what of a cloud its result does not hold."""
-    if not _is_archive(target) or not cloud.fields:
-        return ""
-    return f" (without its own {', '.join(cloud.fields)})"
+def without(target: Path, fields: Collection[str]) -> str:
+    """Return the words for a report on which fields of a cloud its result does not hold."""
+    return f" (without its own {', '.join(fields)})" if fields and _is_archive(target) else ""
 
 
 def _is_archive(target: Path) -> bool:

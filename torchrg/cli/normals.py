@@ -98,5 +98,5 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         console.warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    without = console.without(target, cloud)
+    without = console.without(target, cloud.fields)
     print(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}{without}")

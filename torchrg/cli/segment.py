@@ -216,7 +216,7 @@ def _segment_tiles(
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    _check_points(arguments, source, stream, target)
+    fields = _check_points(arguments, source, stream, target)
     workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
@@ -243,14 +243,17 @@ def _segment_tiles(
             columns=arguments.columns,
         ) as seg:
             write_cloud(target, stream, seg, provenance=_describe(arguments, sources))
-            seconds = time.perf_counter() - begin
-            _report(source, seg, stream.extent, next(iter(stream)), target, seconds)
+            seconds, without = time.perf_counter() - begin, console.without(target, fields)
+            _report(source, seg, stream.extent, f"{target}{without}", seconds)
 
 
 def _check_points(
     arguments: Arguments, source: str, cloud: Cloud | CloudStream, target: Path
-) -> None:
-    """Warn of what is not as it seems, before the work; refuse what cannot be written."""
+) -> tuple[str, ...]:
+    """Warn of what is not as it seems, before the work; refuse what cannot be written.
+
+    Returns the names of the fields of the cloud.
+    """
     levels = range(len(arguments.partition.strengths) if arguments.superpoints else 0)
     parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
     first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
@@ -258,6 +261,7 @@ def _check_points(
     for note in check_finite(cloud):
         console.warn(f"{source}: {note}.")
     check_output(target, cloud)
+    return tuple(first.fields)
 
 
 def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
@@ -336,16 +340,12 @@ def _segment_whole(
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         print(f"{source}: superpoints of each level: {found}")
-    _report(source, seg, Extent.of(cloud), cloud, target, time.perf_counter() - begin)
+    without = console.without(target, cloud.fields)
+    _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
 
 
-def _report(
-    source: str, seg: Segmentation, extent: Extent, cloud: Cloud, target: Path, seconds: float
-) -> None:
-    """Print the line about a result, after a warning if there is no plane in it.
-
-    The cloud may be a chunk of it.
-    """
+def _report(source: str, seg: Segmentation, extent: Extent, target: str, seconds: float) -> None:
+    """Print the line about a result, after a warning if there is no plane in it."""
     if len(seg.planes.count) == 0:
         is_place = (extent.low == extent.high).all()
         reason = "all points are equal" if is_place else "no region is large enough"
@@ -354,5 +354,5 @@ def _report(
     share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
     print(
         f"{source}: {num_points:,} points, {num_planes:,} planes, {share:.1f} % of the points "
-        f"labelled, {seconds:.1f} s -> {target}{console.without(target, cloud)}"
+        f"labelled, {seconds:.1f} s -> {target}"
     )
