@@ -227,8 +227,8 @@ def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[
         names = ", ".join(f"{shown[name]} as {name_aside(name)}" for name in kept)
         notes.append(f"its own fields are kept beside the result's: {names}")
     if lost:
-        names, asides = (", ".join(map(spell, lost)) for spell in (shown.__getitem__, name_aside))
-        notes.append(f"its own {names} left out for the result's; {asides} stay")
+        names, stay = ", ".join(shown[name] for name in lost), ", ".join(map(name_aside, lost))
+        notes.append(f"its own {names} left out for the result's; {stay} stay")
     return notes
 
 
@@ -262,18 +262,14 @@ def _numbers(num_columns: int) -> list[str]:
     return names if num_columns != 4 else [*names[:3], "intensity"]
 
 
-def naming_of(num_columns: int) -> Naming | None:
-    """Return how a table without names, of so many columns, gets better ones."""
-    if num_columns not in _GUESSED_WIDTHS:
-        return None
-    return Naming(numbered_facts, name_numbered, is_guess=True)
+def rule_for(num_columns: int) -> tuple[Naming | None, tuple[str, ...]]:
+    """Return how so many columns without names get better ones, and what to tell people of them.
 
-
-def notes_on_names(num_columns: int) -> tuple[str, ...]:
-    """Return what to tell people of the names of a table without any, if they are known before."""
-    if num_columns == 3 or num_columns in _GUESSED_WIDTHS:
-        return ()
-    return (note_on_names(_numbers(num_columns)),)
+    Nothing of three columns, and of others nothing yet where the values tell.
+    """
+    if num_columns in _GUESSED_WIDTHS:
+        return Naming(numbered_facts, name_numbered, is_guess=True), ()
+    return None, (note_on_names(_numbers(num_columns)),) if num_columns > 3 else ()
 
 
 def note_on_names(names: Iterable[str]) -> str:
@@ -336,9 +332,7 @@ def numbered_facts(columns: Columns) -> set[str]:
     return facts
 
 
-def name_columns(
-    path: Path, table: NDArray[Any], names: Sequence[str] | None
-) -> dict[str, NDArray[Any]]:
+def name_columns(table: NDArray[Any], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
     """Return the columns of a table, shape ``(N, C)``, by names that are given, or by the rule."""
     if names is None:
         return number_columns(table)

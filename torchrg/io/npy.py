@@ -35,8 +35,7 @@ from torchrg.io.fields import (
     check_names,
     name_aside,
     name_columns,
-    naming_of,
-    notes_on_names,
+    rule_for,
 )
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
 from torchrg.io.stream import CHUNK_SIZE, CloudStream, Table, slices
@@ -75,13 +74,14 @@ def open_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Tab
 
     def read(chunk_size: int) -> Iterator[Columns]:
         for rows in _read_rows(lambda: path.open("rb"), layout, chunk_size):
-            yield name_columns(path, rows, columns)
+            yield name_columns(rows, columns)
 
     if columns is not None:
         check_names(path, columns, num_columns)
         return Table(read, num_rows)
     check_first_rows(path, next(_read_rows(lambda: path.open("rb"), layout, FIRST_ROWS)))
-    return Table(read, num_rows, naming=naming_of(num_columns), notes=notes_on_names(num_columns))
+    naming, notes = rule_for(num_columns)
+    return Table(read, num_rows, naming=naming, notes=notes)
 
 
 def _open_records(

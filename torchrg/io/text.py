@@ -24,8 +24,7 @@ from torchrg.io.fields import (
     check_first_rows,
     check_names,
     name_columns,
-    naming_of,
-    notes_on_names,
+    rule_for,
 )
 from torchrg.io.files import atomic_path, check_promise
 from torchrg.io.stream import CloudStream, Table
@@ -37,6 +36,27 @@ _COUNTED_BYTES = 1 << 16
 _COMMENTS = ("#", "//")
 _MOST_DIGITS = 18
 """Of a count of points; longer ones fit no file."""
+
+
+class _Form(NamedTuple):
+    """How the numbers of a line are written.
+
+    Attributes:
+        delimiter: What is between them; None for white space.
+        decimal: What their decimals begin with.
+    """
+
+    delimiter: str | None = None
+    decimal: str = "."
+
+    def split(self, text: str) -> list[str]:
+        """Return the words of a line, decimals after a point."""
+        words = [word.strip().strip("\"'") for word in text.split(self.delimiter)]
+        return [word.replace(self.decimal, ".") for word in words]
+
+
+_FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
+"""The first that makes numbers of all words of a line is its form."""
 
 
 def open_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Table:
@@ -61,15 +81,15 @@ def open_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Ta
             )
 
     def read(chunk_size: int) -> Iterator[Columns]:
-        return (name_columns(path, table, names) for table in read_rows(chunk_size))
+        return (name_columns(table, names) for table in read_rows(chunk_size))
 
     is_comma = opening.form.decimal == ","
     notes: tuple[str, ...] = ("its commas are taken as decimal points",) if is_comma else ()
     if names is not None:
         return Table(read, None, LINES_AT_ONCE, notes=notes)
     check_first_rows(path, _first_rows(read_rows(FIRST_ROWS)))
-    notes += notes_on_names(opening.num_columns)
-    return Table(read, None, LINES_AT_ONCE, naming_of(opening.num_columns), notes=notes)
+    naming, taken = rule_for(opening.num_columns)
+    return Table(read, None, LINES_AT_ONCE, naming, notes=notes + taken)
 
 
 def _first_rows(tables: Iterator[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -138,7 +158,7 @@ def _read_table(
     *,
     first_line: int,
     num_rows: int | None = None,
-    form: "_Form | None" = None,
+    form: _Form | None = None,
 ) -> Iterator[NDArray[np.void]]:
     """Read rows of numbers, all by default, a few lines at a time; blank ones do not count.
 
@@ -169,7 +189,7 @@ def _parse(
     block: Sequence[str],
     dtype: np.dtype[Any],
     line_number: int,
-    form: "_Form | None",
+    form: _Form | None,
 ) -> NDArray[np.void]:
     """Parse a block of lines, and name the first one that is wrong.
 
@@ -213,8 +233,10 @@ def words_of(raw: bytes) -> list[str]:
     r"""Return the words of a line of a header: UTF-8, or Latin-1, which some programs write.
 
     Example:
-        >>> words_of("property float höhe".encode()), words_of(b"property float h\xf6he")
-        (['property', 'float', 'höhe'], ['property', 'float', 'höhe'])
+        >>> words_of("property float höhe".encode())
+        ['property', 'float', 'höhe']
+        >>> words_of(b"property float h\xf6he")
+        ['property', 'float', 'höhe']
     """
     try:
         return [word.decode() for word in raw.split()]
@@ -225,27 +247,6 @@ def words_of(raw: bytes) -> list[str]:
 def _num_columns(dtype: np.dtype[Any]) -> int:
     """Return the number of columns of a row."""
     return sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
-
-
-class _Form(NamedTuple):
-    """How the numbers of a line are written.
-
-    Attributes:
-        delimiter: What is between them; None for white space.
-        decimal: What their decimals begin with.
-    """
-
-    delimiter: str | None = None
-    decimal: str = "."
-
-    def split(self, text: str) -> list[str]:
-        """Return the words of a line, decimals after a point."""
-        words = [word.strip().strip("\"'") for word in text.split(self.delimiter)]
-        return [word.replace(self.decimal, ".") for word in words]
-
-
-_FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
-"""The first that makes numbers of a line is its form. No line has two but those of one column."""
 
 
 class _Opening(NamedTuple):
