@@ -138,11 +138,13 @@ class ColumnNames:
     names: tuple[str, ...] | None = None
 
     @classmethod
-    def parse(cls, text: str | None, paths: Iterable[str | os.PathLike[str]]) -> "ColumnNames":
-        """Return the names in a text, which are for some of the files."""
+    def parse(
+        cls, text: str | None, paths: Iterable[str | os.PathLike[str]] | None
+    ) -> "ColumnNames":
+        """Return the names in a text, which are for some of the files, if these are known."""
         if text is None:
             return cls()
-        if not any(map(takes_columns, paths)):
+        if paths is not None and not any(map(takes_columns, paths)):
             raise ConfigError("expected text or .npy for --columns, got files that name their own.")
         return cls(tuple(name.strip() for name in text.split(",")))
 

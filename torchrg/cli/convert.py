@@ -94,8 +94,9 @@ class FolderArguments(CloudArguments):
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        names = console.ColumnNames.parse(self.columns, root.rglob("*")).names
-        return FolderSource(root, self.settings.resolved, out, self.superpoint, names)
+        paths = root.rglob("*") if root.is_dir() else None
+        names = console.ColumnNames.parse(self.columns, paths).names
+        return FolderSource(root, self.settings.resolved, out, self.superpoint, columns=names)
 
 
 @dataclass(frozen=True)
