@@ -100,8 +100,9 @@ def test_columns_of_several_kinds_are_one_line(tmp_path, names, code):
     )
     types[list(types)[-1]] = code
     np.save(tmp_path / "a.npy", np.zeros(4, list(types.items())))
-    with pytest.raises(FormatError, match=r"a\.npy: expected "):
+    with pytest.raises(FormatError, match=r"a\.npy: expected ") as caught:
         read_cloud(tmp_path / "a.npy")
+    assert len(str(caught.value).replace(str(tmp_path), "")) < 160
 
 
 def test_arrays_that_are_left_out_are_told(tmp_path):

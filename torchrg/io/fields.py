@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.files import refusing
 from torchrg.structures import UNLABELED, Cloud
 
 Columns = Mapping[str, NDArray[Any]]
@@ -441,13 +440,14 @@ def _numbered(columns: Columns) -> dict[str, list[str]]:
 
 def _stacked(path: Path, columns: list[NDArray[Any]]) -> NDArray[Any]:
     """Put single columns side by side, in native byte order."""
-    kinds = [str(column.dtype) for column in columns]
-    with refusing(
-        f"{path}: expected columns of one kind side by side, got {', '.join(kinds)}: ",
-        TypeError,
-        repair="; convert them to numbers",
-    ):
+    try:
         dtype = np.result_type(*columns)
+    except TypeError as error:
+        kinds = ", ".join(str(column.dtype) for column in columns)
+        raise FormatError(
+            f"{path}: expected columns of one kind side by side, got {kinds}; convert them to "
+            "numbers."
+        ) from error
     stacked = np.empty((len(columns[0]), len(columns)), dtype)
     for i, column in enumerate(columns):
         stacked[:, i] = column
