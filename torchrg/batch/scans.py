@@ -14,7 +14,14 @@ from torchrg.errors import FormatError
 from torchrg.io import CloudStream, atomic_path
 from torchrg.io.files import remove_leftovers
 from torchrg.io.stream import Extent
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import FARTHEST, Cloud, Segmentation
+
+_LOOKED_AT = 10_000
+"""Points, spread over a cloud or its first chunk, that tell where most are."""
+_MIDDLE = (0.25, 0.75)
+_FAR_OFF = 1000
+"""Extent of a cloud over that of its middle half, along any axis: float32 has seven digits, so that
+beyond it steps are 1e-4 of where most points are."""
 
 
 @dataclass(frozen=True)
@@ -118,21 +125,36 @@ class Task(Protocol):
 
 
 def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
-    """Return a warning if some points of a cloud are not finite; raise FormatError if none is.
+    """Return a warning if points of a cloud are missing or far off; raise FormatError if all are.
 
     Example:
-        >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]])))
-        ('1 of 2 points are not finite; they stay in place, unlabelled',)
+        >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
+        ('2 of 3 points are not finite or beyond 1e+12; they stay in place, unlabelled',)
     """
-    num_points, num_finite, *_ = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
-    num_bad = num_points - num_finite
-    if num_finite == 0:
+    extent = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
+    num_points, num_bad = extent.num_points, extent.num_points - extent.num_finite
+    if extent.num_finite == 0:
         raise FormatError(
-            f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
+            f"{cloud.source}: expected finite points, got none in {num_bad:,} points; those beyond "
+            f"{FARTHEST:g} count as missing: use another unit, or look where they come from."
         )
-    if not num_bad:
-        return ()
-    return (f"{num_bad:,} of {num_points:,} points are not finite; they stay in place, unlabelled",)
+    notes = []
+    if num_bad:
+        notes.append(
+            f"{num_bad:,} of {num_points:,} points are not finite or beyond {FARTHEST:g}; they "
+            "stay in place, unlabelled"
+        )
+    first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
+    known = first.coordinates[first.finite][:: max(len(first) // _LOOKED_AT, 1)]
+    if len(known):
+        low, high = np.quantile(known, _MIDDLE, axis=0)
+        size, width = (extent.high - extent.low).max(), float((high - low).max())
+        if width > 0 and size > _FAR_OFF * width:
+            notes.append(
+                f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which "
+                "costs the others their precision; remove those that are none"
+            )
+    return tuple(notes)
 
 
 def write_results(

@@ -82,6 +82,7 @@ def segmented_in_tiles(
     workers: int = 1,
     start: Callable[[Sequence["TileJob"]], Reports] | None = None,
     on_stage: Callable[[str, int, int], None] | None = None,
+    columns: str | None = None,
 ) -> Iterator[Segmentation]:
     """Segment files as one cloud, and remove the working directory when the result is used.
 
@@ -98,6 +99,7 @@ def segmented_in_tiles(
             for; with one, this process works on tile after tile, on its threads.
         start: Starts another engine on the jobs of a stage.
         on_stage: See :func:`torchrg.tiling.segment_tiles`.
+        columns: Names that were given for the columns of the files.
 
     Yields:
         The segmentation.
@@ -106,6 +108,7 @@ def segmented_in_tiles(
         FormatError: If another process works in the directory, or a tile failed.
     """
     inputs = [{"name": path.name, "sha256": hash_file(path)} for path in sources]
+    named = {} if columns is None else {"columns": columns}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -122,7 +125,7 @@ def segmented_in_tiles(
                 folder,
                 settings,
                 tile_size=tile_size,
-                identity={"inputs": inputs, "versions": describe_versions()},
+                identity={"inputs": inputs, "versions": describe_versions(), **named},
                 run=run_in_turn if start is None else partial(_run_jobs, start=start),
                 on_stage=on_stage,
             )

@@ -8,7 +8,7 @@ import re
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -20,9 +20,11 @@ from tqdm import tqdm
 
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import FORMATS, check_output
+from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
+from torchrg.io.fields import COLUMNS_RULE, notes_on_results
 from torchrg.io.files import check_place
 from torchrg.render.page import check_library
+from torchrg.structures import Cloud
 
 USAGE_ERROR = 2
 SOME_FAILED = 3
@@ -112,6 +114,45 @@ class PlaneSettings:
         return cls(resolved=load_config(values["--config"] or values["--preset"]))
 
 
+ColumnsFlag = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="X,Y,Z,...",
+        help="Names of the columns of text and of bare .npy arrays, in their order, as "
+        f"x,y,z,intensity,r,g,b; _ leaves one out. {COLUMNS_RULE} What was taken is printed.",
+    ),
+]
+"""Type of the argument --columns."""
+
+
+@dataclass(frozen=True)
+class ColumnNames:
+    """What the flag --columns says: names for the columns of files that have none of their own.
+
+    Example:
+        >>> names = ColumnNames.parse("x,y,z,_", ["a.txt", "b.ply"])
+        >>> names.of("a.txt"), names.of("b.ply")
+        (('x', 'y', 'z', '_'), None)
+    """
+
+    names: tuple[str, ...] | None = None
+
+    @classmethod
+    def parse(
+        cls, text: str | None, paths: Iterable[str | os.PathLike[str]] | None
+    ) -> "ColumnNames":
+        """Return the names in a text, which are for some of the files, if these are known."""
+        if text is None:
+            return cls()
+        if paths is not None and not any(map(takes_columns, paths)):
+            raise ConfigError("expected text or .npy for --columns, got files that name their own.")
+        return cls(tuple(name.strip() for name in text.split(",")))
+
+    def of(self, path: str | os.PathLike[str]) -> tuple[str, ...] | None:
+        """Return the names for the columns of a file; None for one that says them itself."""
+        return self.names if takes_columns(path) else None
+
+
 SettingsFlags = Annotated[PlaneSettings, tyro.conf.arg(name="")]
 """Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
 
@@ -125,6 +166,25 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
             f"expected --intrinsics fx,fy,cx,cy, four numbers without blanks, got {text!r}."
         ) from None
     return fx, fy, cx, cy
+
+
+def note_input(
+    source: str, cloud: Cloud, target: Path, results: Collection[str] = RESULT_FIELDS
+) -> None:
+    """Warn of what reading took for granted, and of own fields that results take the names of."""
+    written = () if _is_archive(target) else notes_on_results(cloud.fields, results)
+    for note in (*cloud.notes, *written):
+        warn(f"{source}: {note}.")
+
+
+def without(target: Path, fields: Collection[str]) -> str:
+    """Return the words for a report on which fields of a cloud its result does not hold."""
+    return f" (without its own {', '.join(fields)})" if fields and _is_archive(target) else ""
+
+
+def _is_archive(target: Path) -> bool:
+    """Whether a result goes to the format that holds it alone, without fields of the cloud."""
+    return target.suffix.lower() == ".npz"
 
 
 def use_threads(threads: int | None) -> None:

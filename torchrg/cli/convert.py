@@ -90,9 +90,13 @@ class FolderArguments(CloudArguments):
     layout; with ROOT for OUT, the latter are completed in place.
     """
 
+    columns: console.ColumnsFlag = None
+
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        return FolderSource(root, self.settings.resolved, out, self.superpoint)
+        paths = root.rglob("*") if root.is_dir() else None
+        names = console.ColumnNames.parse(self.columns, paths).names
+        return FolderSource(root, self.settings.resolved, out, self.superpoint, columns=names)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ from torchrg.depth import (
     segment_depth,
 )
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import check_output, estimate_points, read_cloud, write_cloud
+from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
+from torchrg.io.fields import notes_on_results
 from torchrg.io.files import check_place, remove_leftovers
 from torchrg.render import color_planes, write_png
 from torchrg.structures import Cloud
@@ -82,11 +83,13 @@ class Labelled(NamedTuple):
     num_seen: int
     num_labelled: int
     num_planes: int
+    notes: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a user should know."""
-        return () if self.num_planes else ("no plane found: no region is large enough.",)
+        none = () if self.num_planes else ("no plane found: no region is large enough",)
+        return tuple(f"{note}." for note in (*self.notes, *none))
 
 
 @dataclass(frozen=True)
@@ -277,6 +280,8 @@ def label_frame(frame: Frame) -> Labelled:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.from_numpy(cloud.origin)
     seg = segment_depth(depth, intrinsics, arguments.depth, pose=pose)
+    is_beside = target.suffix.lower() not in (".png", ".npz")
+    notes = notes_on_results(cloud.fields, RESULT_FIELDS) if is_beside else []
     if _is_png(target):
         write_png(target, seg.labels + 1)
     else:
@@ -297,6 +302,7 @@ def label_frame(frame: Frame) -> Labelled:
         int((depth > 0).sum()),
         int((seg.labels >= 0).sum()),
         len(seg.planes.count),
+        (*cloud.notes, *notes),
     )
 
 

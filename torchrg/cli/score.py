@@ -13,7 +13,7 @@ import tyro
 from tqdm import tqdm
 
 from torchrg.batch.report import format_table
-from torchrg.cli.console import parse
+from torchrg.cli.console import ColumnNames, ColumnsFlag, parse, warn
 from torchrg.datasets.folder import natural_key
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, atomic_path, read_cloud
@@ -56,6 +56,7 @@ class Arguments:
     """Print one JSON object instead of a table; for folders with the keys "scans" and "mean"."""
     csv: Path | None = None
     """Also write a CSV file: a row for each scan in natural order, for folders the mean last."""
+    columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
@@ -137,7 +138,11 @@ def _named(names: Iterable[str]) -> str:
 
 def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     """Return the scores of whatever two files of the same points both have."""
-    ours, theirs = read_cloud(predicted), read_cloud(truth)
+    names = ColumnNames.parse(arguments.columns, (predicted, truth))
+    ours, theirs = (read_cloud(path, columns=names.of(path)) for path in (predicted, truth))
+    for cloud in (ours, theirs):
+        for note in cloud.notes:
+            warn(f"{cloud.source}: {note}.")
     if len(ours) != len(theirs):
         raise FormatError(
             f"{predicted}: expected as many points as {truth} ({len(theirs):,}), got {len(ours):,}."

@@ -14,7 +14,7 @@ from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
-from torchrg.io import FORMATS, read_cloud
+from torchrg.io import FORMATS, read_cloud, takes_columns
 
 _NUMBERED = {"instance", "plane", "superpoint"}
 """Arrays whose numbers begin again in each scene."""
@@ -70,6 +70,8 @@ class FolderOfClouds(SceneDataset):
     Args:
         root: The folder.
         suffixes: Which files are clouds. Default: all of :data:`torchrg.io.FORMATS`.
+        columns: Names for the columns of text and of bare ``.npy`` arrays; see
+            :func:`torchrg.read_cloud`.
         transform: Called with each sample.
 
     Attributes:
@@ -85,10 +87,12 @@ class FolderOfClouds(SceneDataset):
         root: str | os.PathLike[str],
         *,
         suffixes: Sequence[str] = tuple(FORMATS),
+        columns: Sequence[str] | None = None,
         transform: Callable[[Mapping[str, Any]], Any] | None = None,
     ) -> None:
         self.root = Path(root)
         self.transform = transform
+        self.columns = columns
         known = {suffix.lower() for suffix in suffixes}
         paths = [
             path
@@ -115,7 +119,7 @@ class FolderOfClouds(SceneDataset):
         name, path, _ = self.scenes[index]
         if path.is_dir():
             return {**read_pointcept_scene(path), "name": name}
-        cloud = read_cloud(path)
+        cloud = read_cloud(path, columns=self.columns if takes_columns(path) else None)
         fields = {
             _FIELD_KEYS.get(field, field): as_tensor(str(path), field, values)
             for field, values in cloud.fields.items()

@@ -24,6 +24,8 @@ DAMAGES = (
     struct.error,
 )
 """What libraries raise on damaged files beside their own errors, found by flipping bytes."""
+_MORE_BYTES = 1 << 20
+"""More than a library writes at a time, so that they do not fit where its last did not."""
 _BESIDE = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")
 """Names that :func:`atomic_path` writes under."""
 
@@ -129,6 +131,23 @@ def check_promise(
             f"{path}: byte {byte}: expected {least}{promised:,} bytes for {content}, got "
             f"{available:,}; the file is cut off or its header is wrong, fetch it again."
         )
+
+
+@contextmanager
+def asking_system(path: Path, *errors: type[BaseException]) -> Iterator[None]:
+    """Raise the operating system's error where that of a library, met while it wrote, hides it.
+
+    What is in the way of a library, a full disk, is in the way of a few more bytes, too. The file
+    is spoilt by them; nobody wants it any more.
+    """
+    try:
+        yield
+    except errors:
+        with path.open("ab") as stream:
+            stream.write(bytes(_MORE_BYTES))
+            stream.flush()
+            os.fsync(stream.fileno())
+        raise
 
 
 @contextmanager
