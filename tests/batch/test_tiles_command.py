@@ -14,7 +14,12 @@ import pytest
 import torch
 
 from torchrg.batch.run import DirectoryLock
-from torchrg.batch.tiles import choose_tile_size, choose_workers, segmented_in_tiles
+from torchrg.batch.tiles import (
+    choose_tile_size,
+    choose_workers,
+    folder_of_work,
+    segmented_in_tiles,
+)
 from torchrg.cli import main
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
@@ -108,12 +113,12 @@ def test_what_cannot_be_done_is_one_line(rooms, tmp_path, capsys, flags, message
 
 
 @pytest.mark.slow
-def test_a_working_directory_is_of_one_command(rooms, tmp_path, capsys):
-    work = tmp_path / "work"
-    work.mkdir()
+def test_a_folder_of_work_is_of_one_command(rooms, tmp_path, capsys):
     files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--out", tmp_path / "x.npz")
+    work = folder_of_work(tmp_path / "x.npz", tmp_path / "work")
+    work.mkdir(parents=True)
     with DirectoryLock(work):
-        assert run(*files, "--workdir", work, "--limit-memory", LIMIT) == 2
+        assert run(*files, "--workdir", tmp_path / "work", "--limit-memory", LIMIT) == 2
     assert "another torchrg" in capsys.readouterr().err
 
 

@@ -118,7 +118,7 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
     whole = segment_planes(Cloud(points).points, config)
     done = []
     run = TileTask.run
-    monkeypatch.setattr(TileTask, "run", lambda task: (run(task), done.append(task.name)))
+    monkeypatch.setattr(TileTask, "run", lambda task: (done.append(task.name), run(task))[1])
     for name in ("read_points", "sort_points", "grow_regions", "finish_regions"):
         step = getattr(stages, name)
         counted = lambda *given, step=step: (step(*given), done.append(step.__name__))  # noqa: E731
@@ -151,10 +151,11 @@ def test_work_of_other_settings_or_files_is_refused(tmp_path):
 
 
 def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
-    files = TileFiles(tmp_path, {})
+    files = TileFiles(tmp_path / "a", {})
+    files.reserve("a.npy")
     with (
         pytest.raises(FormatError, match=r"a\.npy: cannot be written: No space left.*goes on"),
-        files.writing(files.path("a")),
+        files.opened("a.npy"),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
