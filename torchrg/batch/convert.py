@@ -14,7 +14,7 @@ from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.batch.records import RECORD, describe_job, is_unchanged, read_record, write_record
 from torchrg.batch.scans import Converted, Job
 from torchrg.errors import TorchrgError
-from torchrg.io.files import marked_parts
+from torchrg.io.files import marked_parts, sync_folder
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -65,6 +65,10 @@ def convert_scan(job: Job) -> ScanReport:
         begin("hash")
         description = describe_job(job)
         job.folder.mkdir(parents=True, exist_ok=True)
+        for folder in (job.folder, *job.folder.parents):
+            sync_folder(folder.parent)
+            if folder == job.out:
+                break
         job.remove_leftovers()
         earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)
