@@ -217,15 +217,21 @@ def test_a_record_that_is_damaged_is_one_line_or_made_again(tmp_path):
 
 def test_an_array_that_is_lost_during_the_work_is_one_line(tmp_path):
     points, config = wall(600), settings("classic")
-    for stage, name in (("normals", "neighbors"), ("edges", "cloud"), ("regions", "heads")):
+    for stage, at, name in (
+        ("normals", 0, "neighbors"),
+        ("normals", 1, "normals"),
+        ("edges", 0, "cloud"),
+        ("regions", 0, "heads"),
+    ):
 
-        def lose(begun, number, of, *, stage=stage, name=name):
-            if (begun, number) == (stage, 0):
-                cut_off(tmp_path / stage / f"{name}.npy")
+        def lose(begun, number, of, *, stage=stage, at=at, name=name):
+            if (begun, number) == (stage, at):
+                os.truncate(tmp_path / stage / f"{name}.npy", 100)
 
         message = rf"{name}\.npy: is damaged: .*; run the same again, or remove .*{stage} and begin"
         with pytest.raises(FormatError, match=message):
             segment(points, tmp_path / stage, config, 300, on_stage=lose)
+        TileFiles(tmp_path / stage).remove_all()
 
 
 def test_what_others_have_put_among_the_arrays_stays(tmp_path):

@@ -217,7 +217,7 @@ class TileFiles:
         return self.folder / f"{name}.npy"
 
     def reserve(self, *files: str) -> None:
-        """Make files that are not there yet, empty, their names in the record before.
+        """Make files that the work has not made yet, empty; their names are in the record before.
 
         Raises:
             FormatError: If a file is there that is not in the record.
@@ -231,17 +231,15 @@ class TileFiles:
                 )
         if new:
             self._record.append(made=new)
-        for file in files:
-            path = self.folder / file
-            if file in new or not os.path.lexists(path):
-                with _writing(path):
-                    path.touch(exist_ok=False)
+        for file in new:
+            with _writing(self.folder / file):
+                (self.folder / file).touch(exist_ok=False)
 
     @contextmanager
     def opened(self, file: str) -> Iterator[IO[bytes]]:
         """Give a reserved file to write to; no link is followed."""
         path = self.folder / file
-        with _writing(path), _open(path, os.O_RDWR) as stream:
+        with _writing(path), _open(path, os.O_RDWR | os.O_CREAT) as stream:
             yield stream
 
     def create(self, name: str, dtype: Any, shape: Sequence[int]) -> None:  # noqa: ANN401
@@ -257,8 +255,9 @@ class TileFiles:
         """Write rows of an array from row ``start`` on; other processes may write others."""
         file = self.path(name).name
         with self.opened(file) as stream:
-            np.lib.format.read_magic(stream)
-            shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+            with reading(self.path(name)):
+                np.lib.format.read_magic(stream)
+                shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
             head = stream.tell()
             row_bytes = int(np.prod(shape[1:])) * dtype.itemsize
             given = values.numpy() if isinstance(values, Tensor) else values
