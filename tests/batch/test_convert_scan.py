@@ -1,5 +1,6 @@
 """Converting one scan: what goes wrong is in the report, and files are whole or not there."""
 
+import hashlib
 import json
 
 import pytest
@@ -62,10 +63,15 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
     convert_scan(job)
     record = json.loads((job.folder / RECORD).read_text())
-    record["outputs"]["superpoint.npy"] = {"bytes": 0, "sha256": ""}
+    nothing = {"bytes": 0, "sha256": hashlib.sha256().hexdigest()}
+    earlier = ("superpoint.npy", "edited.npy", "../../elsewhere.npy")
+    record["outputs"] |= dict.fromkeys(earlier, nothing)
     (job.folder / RECORD).write_text(json.dumps(record))
-    for name in ("superpoint.npy", ".result.0123abcd.txt", "theirs.npy"):
+    unfinished = f".result.{job.mark}01234567.txt"
+    for name in (*earlier, unfinished, "theirs.npy", ".result.0123abcd.txt"):
         (job.folder / name).touch()
+    (job.folder / "edited.npy").write_text("by the user since")
     convert_scan(job)
     names = {path.name for path in job.folder.iterdir()}
-    assert names == {"result.txt", RECORD, "theirs.npy"}
+    assert names == {"result.txt", RECORD, "theirs.npy", "edited.npy", ".result.0123abcd.txt"}
+    assert (tmp_path / "elsewhere.npy").exists()

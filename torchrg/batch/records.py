@@ -95,6 +95,13 @@ def read_record(job: Job) -> dict[str, Any] | None:
     return record if isinstance(record, dict) and isinstance(record.get("outputs"), dict) else None
 
 
+def is_unchanged(job: Job, name: str, noted: Any) -> bool:  # noqa: ANN401
+    """Return whether a file beside a record is still the one that the record notes."""
+    path = job.folder / name
+    is_result = path.parent == job.folder and path.is_file() and not path.is_symlink()
+    return is_result and bool(_fingerprint(path) == noted)
+
+
 def reason_to_convert(job: Job) -> str:
     """Return why a scan is not done, or nothing if it is.
 

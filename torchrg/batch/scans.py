@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchrg.datasets import describe_planes
 from torchrg.errors import FormatError
 from torchrg.io import CloudStream, atomic_path
-from torchrg.io.files import remove_leftovers
+from torchrg.io.files import make_mark, remove_leftovers
 from torchrg.io.stream import Extent
 from torchrg.structures import FARTHEST, Cloud, Segmentation
 
@@ -96,11 +96,21 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Job:
-    """One scan to convert, with everything that a process on any machine needs for it."""
+    """One scan to convert, with everything that a process on any machine needs for it.
+
+    Attributes:
+        source: The data set.
+        scan: One of its scans.
+        out: Where results go.
+        mark: Of the names that results are written under before they have their own; see
+            :func:`torchrg.io.files.marked_parts`. What a killed process leaves is removed by those
+            who know it.
+    """
 
     source: Source
     scan: Scan
     out: Path
+    mark: str = field(default_factory=make_mark, compare=False)
 
     @property
     def folder(self) -> Path:
@@ -110,7 +120,7 @@ class Job:
     def remove_leftovers(self) -> None:
         """Remove what a process that was killed left half-written."""
         if self.folder.is_dir():
-            remove_leftovers(self.folder)
+            remove_leftovers(self.folder, self.mark)
 
 
 class Task(Protocol):

@@ -176,6 +176,7 @@ def run(argv: list[str]) -> int:
     except OSError as error:
         raise FormatError(f"{out}: cannot be made: {error.strerror or error}.") from error
     with DirectoryLock(out) as lock, console.terminate_as_interrupt():
+        jobs = [dataclasses.replace(job, mark=lock.mark) for job in jobs]
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
 
 

@@ -32,7 +32,7 @@ from torchrg.depth import (
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
-from torchrg.io.files import check_place, remove_leftovers
+from torchrg.io.files import check_place, make_mark, marked_parts, remove_leftovers
 from torchrg.render import color_planes, write_png
 from torchrg.structures import Cloud
 
@@ -94,12 +94,16 @@ class Labelled(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """One image to label, with everything that another process needs for it."""
+    """One image to label, with everything that another process needs for it.
+
+    Results are written under names that bear the ``mark`` before they have their own.
+    """
 
     scan: Scan
     target: Path
     picture: Path | None
     arguments: Arguments
+    mark: str = dataclasses.field(default_factory=make_mark, compare=False)
 
     @property
     def source(self) -> Path:
@@ -110,7 +114,7 @@ class Frame:
         """Remove what a process that was killed left half-written."""
         for path in (self.target, self.picture):
             if path is not None:
-                remove_leftovers(path.parent, of=path.name)
+                remove_leftovers(path.resolve().parent, self.mark)
 
 
 def run(argv: list[str]) -> int:
@@ -259,7 +263,8 @@ def report_frame(frame: Frame) -> ScanReport:
 
     def convert(begin: Callable[[str], None]) -> Converted:
         begin("planes")
-        found = label_frame(frame)
+        with marked_parts(frame.mark):
+            found = label_frame(frame)
         files = tuple(path.name for path in (frame.target, frame.picture) if path is not None)
         height, width = found.shape
         return Converted(height * width, found.num_planes, files, warnings=found.warnings)

@@ -20,6 +20,7 @@ from torchrg.batch.tiles import (
     TileJob,
     choose_tile_size,
     choose_workers,
+    folder_of_work,
     segmented_in_tiles,
     work_on_tile,
 )
@@ -86,8 +87,9 @@ class Arguments:
     """Gigabytes that a cloud may take. One that would take more is segmented in tiles on disk, with
     the same result. Default: half of what is free."""
     workdir: Path | None = None
-    """Directory for the work on such a cloud, some 500 bytes a point, removed when the result is
-    written. A command that ended early goes on from there. Default: one beside the result."""
+    """Directory in which such a cloud has a folder for the work on it, some 500 bytes a point,
+    removed when the result is written. A command that ended early goes on from there. Default: the
+    folder is beside the result."""
     engine: Literal["local", "ray"] = "local"
     """Where tiles are worked on: in this process, or as tasks on Ray (pip install
     'torchrg[ray]')."""
@@ -217,10 +219,10 @@ def _segment_tiles(
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
     fields = _check_points(arguments, source, stream, target)
-    workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
+    folder = folder_of_work(target, arguments.workdir)
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
-        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {workdir}, from "
+        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {folder}, from "
         "which the same command goes on",
         flush=True,
     )
@@ -234,9 +236,10 @@ def _segment_tiles(
         with segmented_in_tiles(
             sources,
             stream,
-            workdir,
+            folder,
             settings,
             tile_size=tile_size,
+            target=target,
             workers=choose_workers(num_points, tile_size, limit),
             start=_engine(arguments, limit),
             on_stage=show,
