@@ -9,12 +9,21 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.datasets import describe_planes
+from torchrg.datasets import describe_planes, read_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io import CloudStream, atomic_path
 from torchrg.io.files import remove_leftovers
 from torchrg.io.stream import Extent
 from torchrg.structures import Cloud, Segmentation
+
+_FIELDS = {
+    "plane": "labels",
+    "normal": "normals",
+    "curvature": "curvature",
+    "color": "color",
+    "superpoint": "superpoints",
+}
+"""Fields of a cloud by the arrays of a folder that hold them."""
 
 
 @dataclass(frozen=True)
@@ -163,3 +172,10 @@ def write_results(
     with atomic_path(folder / "planes.json") as beside:
         beside.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
     return [*(f"{name}.npy" for name in arrays), "planes.json"]
+
+
+def read_results(folder: Path) -> Cloud:
+    """Return a converted scan, or any folder in Pointcept's layout, as a cloud with its results."""
+    sample = read_pointcept_scene(folder)
+    fields = {_FIELDS[name]: values.numpy() for name, values in sample.items() if name in _FIELDS}
+    return Cloud(sample["coord"].numpy(), fields, source=str(folder))

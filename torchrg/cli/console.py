@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -40,6 +41,16 @@ def fail(message: str, *, code: int = USAGE_ERROR) -> int:
 def warn(message: str) -> None:
     """Print one warning line on stderr."""
     fail(f"warning: {message}")
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Print warnings as single lines."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    for warning in caught:
+        warn(str(warning.message))
 
 
 def parse(

@@ -1,9 +1,7 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NoReturn
@@ -27,15 +25,14 @@ from torchrg.batch.run import (
     run_plan,
     write_report,
 )
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Source, read_results
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli import console
 from torchrg.config import DepthConfig
-from torchrg.datasets.pointcept import read_pointcept_scene
 from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.io import FORMATS
 from torchrg.render.gallery import draw_entry, write_index
 from torchrg.render.page import check_library
-from torchrg.structures import Cloud
 
 
 @dataclass(frozen=True)
@@ -87,12 +84,16 @@ class FolderArguments(CloudArguments):
     """Convert every cloud below a folder: normals, curvature, plane labels, table of planes.
 
     Clouds are files (.npz .npy .ply .pcd .las .laz .e57 .xyz .txt) and folders in Pointcept's
-    layout; with ROOT for OUT, the latter are completed in place.
+    layout; with ROOT for OUT, the latter are completed in place. The results of ROOT/a/b.ply are in
+    OUT/a/b. Links are followed, and each file is converted once.
     """
+
+    suffixes: tuple[str, ...] = tuple(FORMATS)
+    """Which files are clouds, where two differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        return FolderSource(root, self.settings.resolved, out, self.superpoint)
+        return FolderSource(root, self.settings.resolved, out, self.superpoint, self.suffixes)
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
-    with _warnings_as_lines():
+    with console.warnings_as_lines():
         jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)
     if arguments.dry_run:
         print(format_plan(_look_at(jobs, arguments)))
@@ -245,19 +246,11 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
         name = job.scan.name
         words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
         try:
-            cloud = _read_result(job.folder)
+            cloud = read_results(job.folder)
             entries.append(draw_entry(folder, name, cloud, words=words))
         except TorchrgError as error:
             console.warn(f"{name}: no page: {error}")
     print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
-
-
-def _read_result(folder: Path) -> Cloud:
-    """Return a converted scan as a cloud with the fields of a result."""
-    sample = read_pointcept_scene(folder)
-    names = {"plane": "labels", "normal": "normals", "curvature": "curvature", "color": "color"}
-    fields = {names[name]: values.numpy() for name, values in sample.items() if name in names}
-    return Cloud(sample["coord"].numpy(), fields, source=str(folder))
 
 
 class _Progress:
@@ -302,13 +295,3 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
         return console.fail(message, code=console.SOME_FAILED)
     print(f"{state} -> {out}")
     return 0
-
-
-@contextmanager
-def _warnings_as_lines() -> Iterator[None]:
-    """Print warnings as single lines."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        yield
-    for warning in caught:
-        console.warn(str(warning.message))
