@@ -14,7 +14,7 @@ from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.batch.records import RECORD, describe_job, read_record, write_record
 from torchrg.batch.scans import Converted, Job
 from torchrg.errors import TorchrgError
-from torchrg.io.files import remove_leftovers
+from torchrg.io.files import check_place, remove_leftovers
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -65,6 +65,7 @@ def convert_scan(job: Job) -> ScanReport:
         begin("hash")
         description = describe_job(job)
         job.folder.mkdir(parents=True, exist_ok=True)
+        check_place(job.folder / RECORD)
         remove_leftovers(job.folder)
         earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)

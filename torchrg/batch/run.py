@@ -6,7 +6,6 @@ import os
 import platform
 import shutil
 import time
-import unicodedata
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
@@ -18,6 +17,7 @@ from torchrg.batch.convert import ScanReport
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.report import BatchReport, format_table, kept_report
 from torchrg.batch.scans import Job, Scan, Source
+from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
 
@@ -91,13 +91,12 @@ def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
 def _check_names(root: Path, scans: Sequence[Scan]) -> None:
     """Refuse scans whose results would share a folder, or take the place of the batch's own files.
 
-    Names that differ only in case, or in how letters with accents are put together, are one name
-    on the file systems of macOS and Windows, and results are carried there.
+    See :func:`torchrg.datasets.folder.folded_name`.
     """
-    batch_files = {_folded(name): name for name in (REPORT, LOCK)}
+    batch_files = {folded_name(name): name for name in (REPORT, LOCK)}
     taken: dict[str, str] = {}
     for name in (scan.name for scan in scans):
-        key = _folded(name)
+        key = folded_name(name)
         if name.startswith("/") or ".." in name.split("/"):
             raise FormatError(f"{root}: expected names of scans below a folder, got {name!r}.")
         if key in taken:
@@ -111,11 +110,6 @@ def _check_names(root: Path, scans: Sequence[Scan]) -> None:
                 f"{root}: expected no scan called {name}, as OUT/{batch_files[first]} is a file "
                 "of the command; rename it."
             )
-
-
-def _folded(name: str) -> str:
-    """Return what names have in common that some file systems take for one."""
-    return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())
 
 
 def make_plan(

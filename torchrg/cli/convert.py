@@ -31,7 +31,8 @@ from torchrg.cli import console
 from torchrg.config import DepthConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
-from torchrg.render.gallery import draw_entry, write_index
+from torchrg.io.files import check_place, make_folder
+from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
 
 
@@ -168,10 +169,12 @@ def run(argv: list[str]) -> int:
     if arguments.dry_run:
         print(format_plan(_look_at(jobs, arguments)))
         return 0
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{out}: cannot be made: {error.strerror or error}.") from error
+    make_folder(out)
+    check_place(out / REPORT)
+    pages = _pages_of(arguments)
+    if pages is not None:
+        make_folder(pages)
+        check_gallery(pages, [job.scan.name for job in jobs])
     with DirectoryLock(out) as lock, console.terminate_as_interrupt():
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
 
@@ -227,10 +230,11 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
         shown, engine = _Progress(bar, sizes, unit=arguments.unit), arguments.engine
         report = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
+    code = _finish(report, out, unit=arguments.unit)
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
-    return _finish(report, out, unit=arguments.unit)
+    return code
 
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
@@ -238,17 +242,13 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     done = {scan.name: scan for scan in report.scans if scan.status in ("converted", "kept")}
     jobs = [job for job in plan.jobs if job.scan.name in done]
     entries = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{folder}: cannot be made: {error.strerror or error}.") from error
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
         name = job.scan.name
         words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
         try:
             cloud = read_results(job.folder)
             entries.append(draw_entry(folder, name, cloud, words=words))
-        except TorchrgError as error:
+        except (TorchrgError, OSError) as error:
             console.warn(f"{name}: no page: {error}")
     print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
 

@@ -172,6 +172,8 @@ def _list_frames(sources: tuple[Path, ...], arguments: Arguments) -> list[Frame]
     ]
     drawn = [picture for picture in pictures if picture is not None]
     console.check_apart([*targets, *drawn], sources)
+    for picture in drawn:
+        check_place(picture)
     return [
         Frame(Scan(str(source), (source,), _size_of(source)), target, picture, arguments)
         for source, target, picture in zip(sources, targets, pictures, strict=True)

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from torchrg.batch.report import format_table
 from torchrg.batch.scans import read_results
-from torchrg.cli.console import parse, warn, warnings_as_lines
+from torchrg.cli.console import check_apart, parse, warn, warnings_as_lines
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path, read_cloud
@@ -88,6 +88,7 @@ def run(argv: list[str]) -> int:
         raise FormatError(f"{file}: expected a folder, as {folder} is one; or give two files.")
     if arguments.csv is not None:
         check_place(arguments.csv)
+        check_apart([arguments.csv], [predicted, truth])
     if of_folders:
         with warnings_as_lines():
             pairs = _pair_scans(predicted, truth).items()

@@ -2,6 +2,7 @@
 
 import os
 import re
+import unicodedata
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -255,3 +256,16 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     ]
     # Names that differ in case or leading zeros only still have one order.
     return (*key, (2, name))
+
+
+def folded_name(name: str) -> str:
+    """Return what names have in common that some file systems take for the same.
+
+    Those of macOS and Windows do not tell case apart, nor how letters with accents are put
+    together, and what is written on others is carried there.
+
+    Example:
+        >>> folded_name("B\u00fcro") == folded_name("bu\u0308RO")
+        True
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())

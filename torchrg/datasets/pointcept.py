@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
+from torchrg.io.files import make_folder
 from torchrg.io.npy import map_array
 from torchrg.structures import PLANE_KINDS, Planes, Segmentation
 
@@ -106,10 +107,7 @@ def write_pointcept_scene(
     _check_kept(place, arrays, kept)
     new = [name for name in arrays if name not in kept]
     table = {"written": new, **describe_planes(segmentation.planes, origin=origin)}
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{place}: cannot be made: {error.strerror or error}.") from error
+    make_folder(place)
     for name in owned - set(arrays):
         (place / f"{name}.npy").unlink(missing_ok=True)
     with ExitStack() as stack:
