@@ -5,8 +5,6 @@ import dataclasses
 import io
 import os
 import re
-import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,6 +16,11 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from torchrg.cli.ending import INTERRUPTED as INTERRUPTED
+from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
+from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
+from torchrg.cli.ending import fail as fail
+from torchrg.cli.ending import warn as warn
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError, TorchrgError
@@ -25,22 +28,7 @@ from torchrg.io import FORMATS, check_output
 from torchrg.io.files import check_place, make_folder
 from torchrg.render.page import check_library
 
-USAGE_ERROR = 2
-SOME_FAILED = 3
-INTERRUPTED = 130
-
 Arguments = TypeVar("Arguments")
-
-
-def fail(message: str, *, code: int = USAGE_ERROR) -> int:
-    """Print one line on stderr and return the exit code."""
-    print(f"torchrg: {' '.join(message.split())}", file=sys.stderr)
-    return code
-
-
-def warn(message: str) -> None:
-    """Print one warning line on stderr."""
-    fail(f"warning: {message}")
 
 
 @contextlib.contextmanager
@@ -161,16 +149,6 @@ def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None
 def num_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def terminate_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send, end the command as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def run_each(

@@ -175,7 +175,7 @@ def run(argv: list[str]) -> int:
     if pages is not None:
         make_folder(pages)
         check_gallery(pages, [job.scan.name for job in jobs])
-    with DirectoryLock(out) as lock, console.terminate_as_interrupt():
+    with DirectoryLock(out) as lock:
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
 
 

@@ -121,8 +121,7 @@ def run(argv: list[str]) -> int:
     frames = _list_frames(sources, arguments)
     if len(frames) == 1:
         return _label_one(frames[0])
-    with console.terminate_as_interrupt():
-        return _label_sequence(frames)
+    return _label_sequence(frames)
 
 
 def list_images(inputs: Sequence[Path]) -> tuple[Path, ...]:

@@ -123,8 +123,7 @@ def run(argv: list[str]) -> int:
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    with console.terminate_as_interrupt():
-        code = console.run_each(_segment, arguments, clouds, outputs, pictures)
+    code = console.run_each(_segment, arguments, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
