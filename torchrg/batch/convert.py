@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.batch.records import RECORD, describe_job, read_record, write_record
+from torchrg.batch.records import RECORD, check_record, describe_job, read_record, write_record
 from torchrg.batch.scans import Converted, Job
 from torchrg.errors import TorchrgError
 from torchrg.io.files import check_place, remove_leftovers
@@ -66,6 +66,7 @@ def convert_scan(job: Job) -> ScanReport:
         description = describe_job(job)
         job.folder.mkdir(parents=True, exist_ok=True)
         check_place(job.folder / RECORD)
+        check_record(job)
         remove_leftovers(job.folder)
         earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)
@@ -76,8 +77,9 @@ def convert_scan(job: Job) -> ScanReport:
         write_record(job, description, converted)
         return converted
 
+    is_new = not job.folder.exists()
     report = report_on(job.scan.name, convert)
-    if report.status == "failed":
+    if report.status == "failed" and is_new:
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
     return report
