@@ -98,6 +98,15 @@ def test_a_second_signal_while_the_first_is_told_adds_no_stack():
     check_interrupted(process, told)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_when_all_is_done_comes_too_late(number):
+    ending = f"import atexit, os\natexit.register(lambda: os.kill(os.getpid(), {int(number)}))\n"
+    process = start("-c", ending + RUN, "never", 0, "--version")
+    shown, told = process.communicate()
+    assert (process.returncode, told) == (0, "")
+    assert shown.startswith("torchrg ")
+
+
 def test_interrupts_that_the_shell_lets_ignore_stay_ignored():
     process = subprocess.Popen(
         [sys.executable, "-c", RUN, "torchrg.errors", str(int(signal.SIGINT)), "--version"],

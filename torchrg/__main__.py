@@ -3,6 +3,8 @@
 import sys
 
 try:
+    import signal
+
     from torchrg import cli
     from torchrg.cli.ending import end_at_once, on_interrupts
 except KeyboardInterrupt:
@@ -14,15 +16,17 @@ except KeyboardInterrupt:
 def main() -> int:
     """Run the command that the arguments of the process name, and return its exit code.
 
-    Ctrl-C and SIGTERM end it with one line at any moment. While modules load, and when the command
-    is done, nothing is being written, and whatever is at work would lose or show an exception; so
-    the process ends on the spot.
+    Ctrl-C and SIGTERM end it with one line at any moment. While modules load nothing is being
+    written, and libraries lose or show exceptions, so the process ends on the spot. When all is
+    done they come too late: what is left is Python's own end.
     """
     try:
         on_interrupts(end_at_once)
         return cli.main()
     except KeyboardInterrupt:
         end_at_once()
+    finally:
+        on_interrupts(signal.SIG_IGN)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def end_at_once(*_: object) -> NoReturn:
     os._exit(INTERRUPTED)
 
 
-def on_interrupts(handler: Callable[..., Any]) -> dict[signal.Signals, Any]:
+def on_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.Signals, Any]:
     """Let interrupts be handled, and return how they were.
 
     Those that are ignored, as in the background of a shell, stay so.
