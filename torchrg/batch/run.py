@@ -7,7 +7,7 @@ import platform
 import re
 import shutil
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from multiprocessing import reduction
@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 from torchrg.batch.convert import ScanReport
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.report import BatchReport, format_table, kept_report
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Scan, Source
+from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import make_mark, sync_folder
@@ -63,20 +64,56 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
 
     Raises:
         ConfigError: If no name matches the pattern, or results would go in among the scans.
-        FormatError: If the source has no scans.
+        FormatError: If the source has no scans, or the results of one have no place of their own.
     """
-    if source.root in out.parents or (source.root == out and not source.in_place):
+    is_among = source.root in out.parents or (source.root == out and not source.in_place)
+    scans = [] if is_among else source.list_scans()
+    if is_among or _is_among_scans(source, scans, out):
         raise ConfigError(
             f"{out}: expected a directory outside {source.root}, so that no result is read as a "
             "scan; choose another."
         )
-    scans = source.list_scans()
+    _check_names(source.root, scans)
     chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
     if not chosen:
         names = ", ".join(scan.name for scan in scans[:5])
         more = f" and {len(scans) - 5:,} more" if len(scans) > 5 else ""
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
     return [Job(source, scan, out) for scan in chosen]
+
+
+def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
+    """Whether results would be read as scans the next time, also through links."""
+    if source.root == out:
+        return False
+    inputs = (Path(os.path.realpath(file)) for scan in scans for file in scan.inputs)
+    return any((out / scan.name).is_relative_to(source.root) for scan in scans) or (
+        not source.root.is_relative_to(out) and any(file.is_relative_to(out) for file in inputs)
+    )
+
+
+def _check_names(root: Path, scans: Sequence[Scan]) -> None:
+    """Refuse scans whose results would share a folder, or take the place of the batch's own files.
+
+    See :func:`torchrg.datasets.folder.folded_name`.
+    """
+    batch_files = {folded_name(name): name for name in (REPORT, LOCK)}
+    taken: dict[str, str] = {}
+    for name in (scan.name for scan in scans):
+        key = folded_name(name)
+        if name.startswith("/") or ".." in name.split("/"):
+            raise FormatError(f"{root}: expected names of scans below a folder, got {name!r}.")
+        if key in taken:
+            raise FormatError(
+                f"{root}: expected a folder for each scan, got one for {taken[key]} and {name}, "
+                "which many file systems take for the same; rename one."
+            )
+        taken[key] = name
+        if (first := key.partition("/")[0]) in batch_files:
+            raise FormatError(
+                f"{root}: expected no scan called {name}, as OUT/{batch_files[first]} is a file "
+                "of the command; rename it."
+            )
 
 
 def make_plan(

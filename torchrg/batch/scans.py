@@ -1,6 +1,5 @@
 """What a batch is made of: scans, where they come from, and the job that converts one."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,9 +8,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.datasets import describe_planes
+from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_arrays
 from torchrg.errors import FormatError
-from torchrg.io import CloudStream, atomic_path
+from torchrg.io import CloudStream
 from torchrg.io.files import make_mark, remove_leftovers
 from torchrg.io.stream import Extent
 from torchrg.structures import FARTHEST, Cloud, Segmentation
@@ -22,6 +21,15 @@ _MIDDLE = (0.25, 0.75)
 _FAR_OFF = 1000
 """Extent of a cloud over that of its middle half, along any axis: float32 has seven digits, so that
 beyond it steps are 1e-4 of where most points are."""
+
+_FIELDS = {
+    "plane": "labels",
+    "normal": "normals",
+    "curvature": "curvature",
+    "color": "color",
+    "superpoint": "superpoints",
+}
+"""Fields of a cloud by the arrays of a folder that hold them."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +187,8 @@ def write_results(
 
     Into a folder that exists; ``coord`` ``(*, 3)`` in the dtype to be written, the segmentation of
     the same leading axes, further ``fields`` by name. ``origin`` is where the origin of the
-    segmentation is, in the coordinates of ``coord``. Returns the names of the files.
+    segmentation is, in the coordinates of ``coord``. Returns the names of the files; those of
+    others are never replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,
@@ -188,10 +197,12 @@ def write_results(
         "plane": segmentation.labels.numpy().astype(np.int32),
         **(fields or {}),
     }
-    for name, values in arrays.items():
-        with atomic_path(folder / f"{name}.npy") as beside:
-            np.save(beside, np.ascontiguousarray(values), allow_pickle=False)
-    table = describe_planes(segmentation.planes, origin=origin)
-    with atomic_path(folder / "planes.json") as beside:
-        beside.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
-    return [*(f"{name}.npy" for name in arrays), "planes.json"]
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    return write_arrays(folder, arrays, describe_planes(segmentation.planes, origin=origin))
+
+
+def read_results(folder: Path) -> Cloud:
+    """Return a converted scan, or any folder in Pointcept's layout, as a cloud with its results."""
+    sample = read_pointcept_scene(folder)
+    fields = {_FIELDS[name]: values.numpy() for name, values in sample.items() if name in _FIELDS}
+    return Cloud(sample["coord"].numpy(), fields, source=str(folder))

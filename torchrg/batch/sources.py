@@ -30,7 +30,7 @@ from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import estimate_points, read_cloud, takes_columns
+from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.structures import Cloud, Segmentation
 
@@ -57,6 +57,7 @@ class FolderSource:
         superpoint: Whether superpoints are written as ``superpoint.npy`` too.
         columns: Names for the columns of text and of bare ``.npy`` arrays; see
             :func:`torchrg.read_cloud`.
+        suffixes: Which files are clouds. Default: all that can be read.
     """
 
     root: Path
@@ -64,6 +65,7 @@ class FolderSource:
     out: Path
     superpoint: bool = False
     columns: tuple[str, ...] | None = None
+    suffixes: tuple[str, ...] = tuple(FORMATS)
     bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4 + 4
 
     @property
@@ -78,7 +80,7 @@ class FolderSource:
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
-        scenes = FolderOfClouds(self.root).scenes
+        scenes = FolderOfClouds(self.root, suffixes=self.suffixes).scenes
         file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
         if file is not None and self.in_place:
             raise ConfigError(

@@ -5,9 +5,7 @@ import dataclasses
 import io
 import os
 import re
-import signal
-import sys
-from collections import Counter
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -18,30 +16,31 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from torchrg.cli.ending import INTERRUPTED as INTERRUPTED
+from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
+from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
+from torchrg.cli.ending import fail as fail
+from torchrg.cli.ending import warn as warn
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
+from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
 from torchrg.io.fields import COLUMNS_RULE, notes_on_results
-from torchrg.io.files import check_place
+from torchrg.io.files import check_place, make_folder
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
-
-USAGE_ERROR = 2
-SOME_FAILED = 3
-INTERRUPTED = 130
 
 Arguments = TypeVar("Arguments")
 
 
-def fail(message: str, *, code: int = USAGE_ERROR) -> int:
-    """Print one line on stderr and return the exit code."""
-    print(f"torchrg: {' '.join(message.split())}", file=sys.stderr)
-    return code
-
-
-def warn(message: str) -> None:
-    """Print one warning line on stderr."""
-    fail(f"warning: {message}")
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Print warnings as single lines."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    for warning in caught:
+        warn(str(warning.message))
 
 
 def parse(
@@ -212,16 +211,6 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@contextlib.contextmanager
-def terminate_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send, end the command as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def run_each(
     write: Callable[..., None],
     arguments: Any,  # noqa: ANN401
@@ -255,7 +244,7 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     an existing directory; several need a directory, which is made.
 
     Raises:
-        FormatError: If there is no input, two results would share a name, or ``out`` cannot be
+        FormatError: If there is no input, two results would share a name, or one cannot be
             written.
     """
     if not inputs:
@@ -267,24 +256,41 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     if given in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
     results = [out / f"{path.stem}{suffix}" for path in inputs]
-    counts = Counter(results)
+    first: dict[str, Path] = {}
     for result, source in zip(results, inputs, strict=True):
-        if counts[result] > 1:
-            raise FormatError(f"{source}: another input has the same name; run them one by one.")
-    out.mkdir(parents=True, exist_ok=True)
+        other = first.setdefault(folded_name(result.name), source)
+        if other is not source:
+            raise FormatError(
+                f"{source}: another input has the same name, {other}, and {out / result.name} is "
+                "one place; give them different directories."
+            )
+    make_folder(out)
+    for result in results:
+        check_place(result)
     return results
 
 
 def check_apart(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     """Raise FormatError if a result would take the place of an input or of another result."""
-    taken = {path.resolve() for path in inputs}
+    taken = {str(path.resolve()) for path in inputs}
+    files = {_file_number(path) for path in inputs} - {None}
     for path in results:
-        if path.resolve() in taken:
+        place = str(path.resolve())
+        if not taken.isdisjoint((place, folded_name(place))) or _file_number(path) in files:
             raise FormatError(
                 f"{path}: expected a place of its own for each result, got one of an input or of "
                 "another result; choose another."
             )
-        taken.add(path.resolve())
+        taken.add(folded_name(place))
+
+
+def _file_number(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from others, whatever the case of its name; None without a file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 DRAWINGS = (".png", ".html")
@@ -304,8 +310,11 @@ def picture_paths(
         raise FormatError(
             f"{picture}: expected a directory for {len(results)} pictures, got a file name."
         )
-    picture.mkdir(parents=True, exist_ok=True)
-    return [picture / f"{path.stem}.png" for path in results]
+    make_folder(picture)
+    pictures = [picture / f"{path.stem}.png" for path in results]
+    for path in pictures:
+        check_place(path)
+    return [*pictures]
 
 
 def check_drawing(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:

@@ -128,8 +128,7 @@ def run(argv: list[str]) -> int:
     frames = _list_frames(sources, arguments)
     if len(frames) == 1:
         return _label_one(frames[0])
-    with console.terminate_as_interrupt():
-        return _label_sequence(frames)
+    return _label_sequence(frames)
 
 
 def list_images(inputs: Sequence[Path]) -> tuple[Path, ...]:
@@ -179,6 +178,8 @@ def _list_frames(sources: tuple[Path, ...], arguments: Arguments) -> list[Frame]
     ]
     drawn = [picture for picture in pictures if picture is not None]
     console.check_apart([*targets, *drawn], sources)
+    for picture in drawn:
+        check_place(picture)
     return [
         Frame(Scan(str(source), (source,), _size_of(source)), target, picture, arguments)
         for source, target, picture in zip(sources, targets, pictures, strict=True)

@@ -42,8 +42,14 @@ from torchrg.io.stream import Extent
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import make_page, write_page
-from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
-from torchrg.render.page import check_library
+from torchrg.render.gallery import (
+    Entry,
+    check_gallery,
+    draw_entry,
+    draw_planes,
+    with_results,
+    write_index,
+)
 from torchrg.structures import Cloud, Segmentation
 from torchrg.transforms import partition_voxels, segment_voxels
 
@@ -121,9 +127,8 @@ def run(argv: list[str]) -> int:
     console.check_apart(outputs, arguments.inputs)
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
-        _check_pages(arguments)
-    with console.terminate_as_interrupt():
-        code = console.run_each(_segment, arguments, clouds, outputs, pictures)
+        _check_pages(arguments, pictures)
+    code = console.run_each(_segment, arguments, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
@@ -131,11 +136,11 @@ def run(argv: list[str]) -> int:
     return code
 
 
-def _check_pages(arguments: Arguments) -> None:
+def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
     """Refuse pages without a directory for them, or without what they need."""
     if arguments.picture is None or not arguments.picture.is_dir():
         raise ConfigError("expected --pages together with --picture DIRECTORY.")
-    check_library()
+    check_gallery(arguments.picture, [path.stem for path in pictures if path is not None])
 
 
 def _page_of(picture: Path) -> Path:

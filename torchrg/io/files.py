@@ -128,12 +128,32 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_place(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be put at a path: its folder exists, and it is no directory itself."""
+    """Check that a file can be put at a path, so that this is not found out after long work.
+
+    Its folder exists and takes files, and what is there already is a file that may be replaced: not
+    a directory or device, and not read-only.
+    """
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
     if not target.parent.is_dir():
         raise FormatError(f"{path}: there is no folder {target.parent}; make it first.")
+    if target.exists() and not target.is_file():
+        raise FormatError(f"{path}: expected a file to write, got a device; name another.")
+    for place in (target.parent, target):
+        if place.exists() and not os.access(place, os.W_OK):
+            raise FormatError(
+                f"{path}: cannot be written: {place} is read-only; write to another place, or make "
+                "it writable."
+            )
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, if it is not there; raise FormatError if it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be made: {error.strerror or error}.") from error
 
 
 def check_file(path: Path) -> int:
