@@ -20,7 +20,7 @@ _MOST_DIGITS = 12
 _NOISE = 4
 """Steps of its type that arithmetic, such as ``integer * scale + offset``, may move a number by."""
 _EXTREME: dict[str, Any] = {"over": "ignore", "under": "ignore", "invalid": "ignore"}
-"""Coordinates of 1e300 and 1e-300 have no digits to speak of, and agree only where equal."""
+"""Coordinates of 1e-300 have no digits to speak of, and agree only where equal."""
 _SAMPLE = 10_000
 """Points that tell where the middle of a cloud is."""
 _FAR = 4.0
