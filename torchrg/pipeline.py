@@ -16,6 +16,10 @@ from torchrg.normals import ESTIMATORS
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.structures import UNLABELED, Neighbors, Segmentation, Superpoints
 
+BYTES_PER_POINT = 1_100
+"""Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
+that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
+
 
 @sequential_operations()
 def segment_planes(

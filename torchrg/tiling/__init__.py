@@ -47,6 +47,15 @@ STAGES = ("points", "order", *TILE_STAGES, "growth", "regions", "planes", "resul
 TILE_SIZE = 300_000
 """Points of a tile unless the caller says. With 150,000 ``classic`` takes 0.05 less time and
 ``consensus``, which looks farther, 0.15 more; larger ones leave the cache of freed memory."""
+BYTES_PER_TILE_POINT = 2_000
+"""Memory that a tile takes for each of its own points, with those around it."""
+BYTES_PER_POINT = 100
+"""Memory that the stages on the whole cloud take for each of its points: the regions of
+``consensus``, or the table of planes, 55, with 150 for each point of the largest region, which may
+be a third of all."""
+BYTES_AT_ONCE, POINTS_AT_ONCE = 250, 1_500_000
+"""Memory beside that for each point up to so many: regions that are measured together, and those
+pages of the neighbours' file that were just read."""
 
 Done = tuple[TileTask, Sequence[Written]]
 """A task that is done, and what it has written."""

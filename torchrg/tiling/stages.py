@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrg._parallel import sequential_operations
 from torchrg.config import PipelineConfig
 from torchrg.errors import FormatError
+from torchrg.io.files import check_space
 from torchrg.neighbors import finite_rows, restore_rows
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.regions import summarize_planes
@@ -95,7 +96,7 @@ def sort_points(files: TileFiles, config: PipelineConfig, tile_size: int) -> Non
     points = points[rows]
     k = max(min(config.normals.k, len(rows)), 1)
     edge_bytes = 0 if config.growing.is_order_free else 5 * k
-    files.check_space(len(rows) * (_ROW_BYTES + 4 * k + edge_bytes))
+    check_space(files.folder, len(rows) * (_ROW_BYTES + 4 * k + edge_bytes), "the work")
     files.save("rows", rows)
     files.save("cloud", points)
     boxes = find_boxes(points.numpy())
