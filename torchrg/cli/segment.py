@@ -23,6 +23,7 @@ from torchrg.batch.tiles import (
     segmented_in_tiles,
 )
 from torchrg.cli import console
+from torchrg.cli.loop import run_each
 from torchrg.config import SuperpointsConfig
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
@@ -126,7 +127,9 @@ def run(argv: list[str]) -> int:
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    code = console.run_each(_segment, arguments, clouds, outputs, pictures)
+    code = run_each(
+        _segment, arguments, [_name_of(cloud) for cloud in clouds], clouds, outputs, pictures
+    )
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
