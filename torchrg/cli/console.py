@@ -194,6 +194,14 @@ def use_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
+def check_engine(limit_memory: float | None, engine: str, ray_address: str | None) -> None:
+    """Refuse what is said about memory and the engine where it makes no sense."""
+    if limit_memory is not None and not limit_memory > 0:
+        raise ConfigError(f"expected --limit-memory > 0, in GB, got {limit_memory}.")
+    if ray_address is not None and engine != "ray":
+        raise ConfigError("expected --ray-address together with --engine ray.")
+
+
 @contextlib.contextmanager
 def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
     """Show a progress bar on a terminal; what is yielded is called as each stage begins."""

@@ -204,10 +204,7 @@ def _check(arguments: Arguments) -> None:
     """Refuse values that are out of range, or do not go together."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
-    if arguments.limit_memory is not None and not arguments.limit_memory > 0:
-        raise ConfigError(f"expected --limit-memory > 0, in GB, got {arguments.limit_memory}.")
-    if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
+    console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
     if _pages_of(arguments) is not None:
         check_library()
 
@@ -283,7 +280,7 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
         console.warn(str(error))
     state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
     more = f"{state}, {out / REPORT} says more."
-    code = finish(report, out, unit="scan", failed=more, told=True)
+    code = finish(report, out, unit="scan", failed=more)
     if code == 0:
         print(f"{state} -> {out}")
     return code

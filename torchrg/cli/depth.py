@@ -20,7 +20,7 @@ from torchrg.batch.scans import Scan
 from torchrg.batch.sources import RGBDSource, num_pixels
 from torchrg.batch.task import Converted, TaskReport, report_on
 from torchrg.cli import console
-from torchrg.cli.loop import finish, run_with_bar
+from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.datasets.folder import listed
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
 from torchrg.depth import (
@@ -282,9 +282,10 @@ def _label_sequence(jobs: Sequence[FrameJob], arguments: Arguments) -> int:
         started = run_local(frames, workers=workers, lock=lock) if workers > 1 else run_here(frames)
         report = run_with_bar(plan, started, engine="local", workers=workers, unit="frame")
         lock.remove()
-    for frame in report.complete:
+    for frame in report.scans:
         for warning in frame.warnings:
             console.warn(f"{frame.name}: {warning}")
+        tell_failure(frame)
     code = finish(report, arguments.out, unit="frame")
     num_new = len(report.with_status("converted"))
     print(

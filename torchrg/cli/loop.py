@@ -40,7 +40,7 @@ def run_each(
     report = run_tasks(names, reports(), on_report=tell_failure)
     if report.interrupted:
         raise KeyboardInterrupt
-    return finish(report, arguments.out, told=True)
+    return finish(report, arguments.out, again="The same command begins anew.")
 
 
 def run_with_bar(
@@ -80,22 +80,23 @@ def tell_failure(report: TaskReport | None) -> None:
 
 
 def finish(
-    report: BatchReport, out: Path, *, unit: str = "input", failed: str = "", told: bool = False
+    report: BatchReport,
+    out: Path,
+    *,
+    unit: str = "input",
+    failed: str = "",
+    again: str = "The same command goes on from here.",
 ) -> int:
-    """Tell which tasks failed and what is left to do, and return the exit code.
+    """Say what is left to do where not all is complete, and return the exit code.
 
-    ``failed`` replaces what is said where some failed; those that are ``told`` are not again.
+    ``failed`` replaces what is said where some failed, and ``again`` how to go on.
     """
-    for task in () if told else report.scans:
-        tell_failure(task)
     num_done, num_tasks = len(report.complete), len(report.scans)
     state = f"{num_done:,} of {num_tasks:,} {unit}s are complete"
-    again = "same command goes on from here."
     if report.disk_full:
-        message = f"{out}: the disk is full; {state}. Make room, and the {again}"
-        return fail(message, code=SOME_FAILED)
+        return fail(f"{out}: the disk is full; {state}. Make room. {again}", code=SOME_FAILED)
     if report.interrupted:
-        return fail(f"interrupted; {state}. The {again}", code=INTERRUPTED)
+        return fail(f"interrupted; {state}. {again}", code=INTERRUPTED)
     if num_done < num_tasks:
         others = f"{num_tasks - num_done} of {num_tasks} inputs failed, the others are written."
         return fail(failed or others, code=SOME_FAILED)

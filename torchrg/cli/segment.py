@@ -116,7 +116,7 @@ def run(argv: list[str]) -> int:
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
     console.use_threads(arguments.threads)
-    _check_memory(arguments)
+    console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
@@ -161,15 +161,6 @@ def _refuse_images(argv: list[str]) -> None:
                 f"segment: expected point clouds, got {what}{argument}; use: torchrg depth {name} "
                 "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
             )
-
-
-def _check_memory(arguments: Arguments) -> None:
-    """Refuse what is said about memory and the engine where it makes no sense."""
-    limit = arguments.limit_memory
-    if limit is not None and not limit > 0:
-        raise ConfigError(f"expected --limit-memory > 0, in GB, got {limit}.")
-    if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
 
 
 def _segment(
