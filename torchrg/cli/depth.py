@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 import tyro
@@ -54,7 +54,8 @@ class Arguments:
     """Label the planes of depth images, or of organised clouds taken as such.
 
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
-    beside it, or as a cloud in camera coordinates. Frames of a sequence are labelled side by side.
+    beside it, or as a cloud in camera coordinates. Frames of a sequence are labelled side by side,
+    and those that are done already are not done again.
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -77,22 +78,6 @@ class Arguments:
     threads: int | None = None
     """Threads to use where there is no second process. Default: as torch decides, usually one a
     core."""
-
-
-class Labelled(NamedTuple):
-    """What was found in an image."""
-
-    shape: tuple[int, int]
-    num_seen: int
-    num_labelled: int
-    num_planes: int
-    notes: tuple[str, ...] = ()
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a user should know."""
-        none = () if self.num_planes else ("no plane found: no region is large enough",)
-        return tuple(f"{note}." for note in (*self.notes, *none))
 
 
 @dataclass(frozen=True)
@@ -122,7 +107,7 @@ class FrameJob(Job):
         def convert(begin: Callable[[str], None]) -> Converted:
             begin("planes")
             self.clean()
-            return self.converted(self.label())
+            return self.label()[0]
 
         return report_on(self.name, convert)
 
@@ -132,43 +117,43 @@ class FrameJob(Job):
             if path is not None:
                 remove_leftovers(path.resolve().parent, self.mark)
 
-    def converted(self, found: Labelled) -> Converted:
-        """Return what the record says of the results."""
-        height, width = found.shape
-        files = ("labels",) if self.picture is None else ("labels", "picture")
-        return Converted(height * width, found.num_planes, files, warnings=found.warnings)
-
-    def label(self) -> Labelled:
-        """Segment the image and write its result.
+    def label(self) -> tuple[Converted, str]:
+        """Segment the image and write its result; return what was found, also in words.
 
         Raises:
             TorchrgError: If the image cannot be read, or a result not be written.
         """
-        target, alone = self.target, self.target.suffix.lower() in (".png", ".npz")
-        description = self.describe() if _is_png(target) else {}
+        target, is_labels = self.target, _is_png(self.target)
+        description = self.describe() if is_labels else {}
         cloud, depth, intrinsics = _read_frame(self.inputs[0], self.source)
-        check_place(target) if _is_png(target) else check_output(target, cloud)
+        check_place(target) if is_labels else check_output(target, cloud)
         # Results are about the cloud's origin.
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = -torch.from_numpy(cloud.origin)
         seg = segment_depth(depth, intrinsics, self.source.settings, pose=pose)
-        found = Labelled(
-            (depth.shape[0], depth.shape[1]),
-            int((depth > 0).sum()),
-            int((seg.labels >= 0).sum()),
-            len(seg.planes.count),
-            (*cloud.notes, *([] if alone else notes_on_results(cloud.fields, RESULT_FIELDS))),
-        )
+        notes, num_planes = [*cloud.notes], len(seg.planes.count)
+        if not is_labels and target.suffix.lower() != ".npz":
+            notes += notes_on_results(cloud.fields, RESULT_FIELDS)
+        if num_planes == 0:
+            notes.append("no plane found: no region is large enough")
+        files = ("labels",) if self.picture is None else ("labels", "picture")
+        warnings = tuple(f"{note}." for note in notes)
+        found = Converted(depth.numel(), num_planes, files, warnings=warnings)
         with marked_parts(self.mark):
             if self.picture is not None:
                 colors = color_planes(seg.labels, _thinned(cloud.points.view(*depth.shape, 3)))
                 write_png(self.picture, colors * (depth > 0)[..., None])
-            if _is_png(target):
+            if is_labels:
                 write_png(target, seg.labels + 1)
-                write_record(self, description, self.converted(found))
+                write_record(self, description, found)
             else:
                 _write_cloud(self, cloud, seg)
-        return found
+        num_seen, (height, width) = int((depth > 0).sum()), depth.shape
+        share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
+        return found, (
+            f"{width} x {height} pixels, {num_seen:,} with depth, {num_planes:,} planes, "
+            f"{share:.1f} % of these labelled"
+        )
 
 
 def run(argv: list[str]) -> int:
@@ -255,16 +240,10 @@ def _size_of(source: Path) -> int:
 def _label_one(job: FrameJob) -> int:
     """Label one image here, and print one line about it."""
     begin = time.perf_counter()
-    found = job.label()
+    found, words = job.label()
     for warning in found.warnings:
         console.warn(f"{job.name}: {warning}")
-    height, width = found.shape
-    share = 100 * found.num_labelled / max(found.num_seen, 1)
-    print(
-        f"{job.name}: {width} x {height} pixels, {found.num_seen:,} with depth, "
-        f"{found.num_planes:,} planes, {share:.1f} % of these labelled, "
-        f"{time.perf_counter() - begin:.1f} s -> {job.target}"
-    )
+    print(f"{job.name}: {words}, {time.perf_counter() - begin:.1f} s -> {job.target}")
     return 0
 
 
