@@ -8,7 +8,7 @@ import pytest
 import trace_path
 
 trace = functools.cache(trace_path.trace)
-README = Path(__file__).parents[1] / "README.md"
+README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.mark.parametrize("preset", trace_path.LONGEST)

@@ -11,7 +11,7 @@ import torch
 
 from torchrg.scenes import make_room
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+SCRIPTS = Path(__file__).parents[2] / "scripts"
 VARIANTS = ("pca", "irls", "jet", "detmm", "paper", "consensus")
 METHODS = ("pcl", "classic", "detmm", "printed", "paper", "consensus")
 
