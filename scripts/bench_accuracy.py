@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from reproduction.scenes import DepthFrame, cameras_around, render_depth
 from torch import Tensor
 from tqdm import tqdm
 
 import torchrg
+from tests.made import DepthFrame, cameras_around, render_depth
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points
 from torchrg.metrics import score_labels, score_voxels

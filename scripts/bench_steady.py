@@ -22,10 +22,10 @@ from pathlib import Path
 from statistics import median
 
 import torch
-from reproduction.scenes import cameras_around, render_depth
 from tqdm import tqdm
 
 import torchrg
+from tests.made import cameras_around, render_depth
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 
 PRESETS = ("classic", "paper", "consensus")

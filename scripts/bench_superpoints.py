@@ -25,10 +25,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from reproduction.plotting import settings
-from reproduction.scenes import make_kinect_room, scan_scene
 from torch import Tensor
 from tqdm import tqdm
 
+from tests.made import make_kinect_room, scan_scene
 from torchrg import make_superpoints, read_cloud, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.metrics import PartitionScore, score_partition

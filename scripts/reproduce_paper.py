@@ -19,6 +19,9 @@ from pathlib import Path
 
 import matplotlib as mpl
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+
 from reproduction import method, normals, readme, segmentation, study, times
 from reproduction.cells import Folder, Record
 from reproduction.clouds import TITLES

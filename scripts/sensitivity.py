@@ -21,9 +21,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from reproduction.scenes import make_shape
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+
+from tests.made import make_shape
 from torchrg import load_config
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels, score_normals

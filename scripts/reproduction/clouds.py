@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from reproduction.paper_numbers import POINTS
-from reproduction.scenes import (
+from tests.made import (
     HALL_LAYOUT,
     KINECT_LAYOUT,
     StoreyLayout,

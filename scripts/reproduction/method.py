@@ -12,8 +12,8 @@ from reproduction.cells import Record
 from reproduction.criteria import make_figure5
 from reproduction.plotting import settings
 from reproduction.runs import Run
-from reproduction.scenes import make_shape
 from reproduction.sections import figure, section
+from tests.made import make_shape
 from torchrg import estimate_normals
 
 NORMALS = (

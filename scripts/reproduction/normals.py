@@ -19,8 +19,8 @@ from reproduction.normal_tables import (
     where,
 )
 from reproduction.runs import Run
-from reproduction.scenes import SHAPES, make_shape
 from reproduction.sections import Block, figure, section, text
+from tests.made import SHAPES, make_shape
 from torchrg.config import NormalsConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_normals

@@ -4,8 +4,8 @@ import pickle
 
 import pytest
 import torch
-from reproduction.scenes import cameras_around, render_depth
 
+from tests.made import cameras_around, render_depth
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, ShapeError

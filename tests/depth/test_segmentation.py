@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from reproduction.scenes import cameras_around, render_depth
-from reproduction.scenes.cameras import KINECT_LAYOUT
 
+from tests.made import cameras_around, render_depth
+from tests.made.cameras import KINECT_LAYOUT
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import find_intrinsics, make_intrinsics
 from torchrg.errors import ShapeError

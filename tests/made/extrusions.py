@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.scenes.geometry import Array, Frame, box_around
-from torchrg.scenes.surfaces import Cone, Plane, Surface, plane_of, rectangle
+from torchrg.scenes import Array, Cone, Frame, Surface, rectangle
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +122,10 @@ class Sheet:
     outline: Outline
 
     @property
-    def plane(self) -> Plane:
+    def plane(self) -> tuple[Array, float]:
         """Normal and offset of its plane."""
-        return plane_of(self.frame)
+        normal = self.frame.axes[2]
+        return normal, float(np.vecdot(normal, self.frame.origin))
 
     @property
     def area(self) -> float:
@@ -140,7 +140,8 @@ class Sheet:
             self.outline.corners.max(axis=0),
         )
         box = np.array([(x, y, 0) for x in (left, right) for y in (low, high)])
-        return box_around(self.frame.to_world(box))
+        corners = self.frame.to_world(box)
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return points spread evenly over it, shape ``(count, 3)``."""

@@ -9,11 +9,18 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from reproduction.scenes.rays import cast_rays
+from tests.made.rays import cast_rays
 from torchrg.errors import ConfigError
-from torchrg.scenes import RoomLayout, Scene, SceneModel, build_room
-from torchrg.scenes.geometry import Array, Frame, unit
-from torchrg.scenes.scene import label_points, seeded_generator
+from torchrg.scenes import (
+    Array,
+    Frame,
+    RoomLayout,
+    Scene,
+    SceneModel,
+    build_room,
+    label_points,
+    unit,
+)
 from torchrg.structures import UNLABELED
 
 Sensor = Literal["exact", "kinect"]
@@ -147,7 +154,7 @@ def cameras_around(
         >>> len(cameras_around(build_room(), 5))
         5
     """
-    rng = seeded_generator(seed, _CAMERAS)
+    rng = np.random.default_rng([seed, _CAMERAS])
     headings = rng.random() * 2 * np.pi + _GOLDEN_ANGLE * np.arange(num_cameras)
     drops = rng.random(num_cameras) * _STEEPEST
     cameras = []
@@ -222,7 +229,7 @@ def render_depth(
         normals[rows] = camera.frame.vectors_to_local(surface.normals_at(points))
     depth = np.where(faces == UNLABELED, 0, exact)
     if sensor == "kinect":
-        depth = _as_kinect(depth, camera.fx, seeded_generator(seed, _SENSOR_NOISE))
+        depth = _as_kinect(depth, camera.fx, np.random.default_rng([seed, _SENSOR_NOISE]))
     seen = depth > 0
     return DepthFrame(
         depth=torch.from_numpy(depth.astype(np.float32)),
@@ -296,7 +303,7 @@ def fuse_frames(
             f"fuse_frames: expected num_points in [1, {sum(counts)}], the pixels with depth, "
             f"got {num_points}; take fewer points or more frames."
         )
-    chosen = np.sort(seeded_generator(seed, _FUSION).permutation(sum(counts))[:num_points])
+    chosen = np.sort(np.random.default_rng([seed, _FUSION]).permutation(sum(counts))[:num_points])
     ends = np.cumsum([0, *counts])
     rows = [
         pixels[chosen[(chosen >= start) & (chosen < end)] - start]
@@ -306,7 +313,7 @@ def fuse_frames(
     points = np.concatenate([places for places, _, _ in fused])
     normals = np.concatenate([outwards for _, outwards, _ in fused])
     labels = np.concatenate([faces for _, _, faces in fused])
-    order = seeded_generator(seed, _FUSION + 1).permutation(num_points)
+    order = np.random.default_rng([seed, _FUSION + 1]).permutation(num_points)
     return label_points(
         model,
         points[order].astype(np.float32),

@@ -4,17 +4,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reproduction.scenes.extrusions import Outline, extrude
+from tests.made.extrusions import Outline, extrude
 from torchrg.errors import ConfigError
-from torchrg.scenes import Scene, SceneModel, sample_scene
-from torchrg.scenes.furniture import block
-from torchrg.scenes.geometry import Array, Frame, unit
-from torchrg.scenes.scene import NoiseDirection, Part
-from torchrg.scenes.surfaces import Cone, Flat, Ring, Surface, rectangle
+from torchrg.scenes import (
+    Array,
+    Cone,
+    Flat,
+    Frame,
+    Part,
+    Ring,
+    Scene,
+    SceneModel,
+    Surface,
+    block,
+    rectangle,
+    sample_scene,
+    unit,
+)
 
 _NODES = 96
 """Of the quadrature for the area."""
@@ -177,7 +188,7 @@ def make_shape(
     noise_fraction: float = 0.0,
     seed: int = 0,
     *,
-    noise_direction: NoiseDirection = "isotropic",
+    noise_direction: Literal["normal", "isotropic"] = "isotropic",
 ) -> Scene:
     """Make a cloud of a closed shape of about unit size with exact outward normals.
 

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import Scene, SceneModel
-from torchrg.scenes.geometry import Array, unit
-from torchrg.scenes.scene import NOISE, PLACES, label_points, seeded_generator, to_float32
-from torchrg.scenes.surfaces import FULL_CIRCLE, AngleRange, Cone, Flat, Ring
+from torchrg.scenes import Array, Cone, Flat, Ring, Scene, SceneModel, label_points, unit
 from torchrg.structures import UNLABELED
+
+_PLACES, _NOISE = range(2)
+"""What random numbers are drawn for: the same places whatever the noise."""
 
 _FLAT_SLACK = 1e-9
 """Rays through the seam of two faces must not slip between them; metres."""
@@ -114,7 +114,7 @@ def scan_scene(model: SceneModel, num_points: int, *, noise: float = 0.0, seed: 
     Raises:
         ConfigError: If nothing can be seen.
     """
-    rng = seeded_generator(seed, PLACES)
+    rng = np.random.default_rng([seed, _PLACES])
     shares = np.diff(np.arange(len(model.viewpoints) + 1) * num_points // len(model.viewpoints))
     scans = [
         _scan(model, viewpoint, int(share), rng)
@@ -125,9 +125,11 @@ def scan_scene(model: SceneModel, num_points: int, *, noise: float = 0.0, seed: 
     for face, surface in enumerate(model.surfaces):
         rows = np.flatnonzero(labels == face)
         outwards[rows] = surface.normals_at(places[rows])
-    points, normals = to_float32(places), to_float32(outwards)
+    points, normals = places.astype(np.float32), outwards.astype(np.float32)
     if noise > 0:
-        shake = seeded_generator(seed, NOISE).standard_normal((num_points, 1), dtype=np.float32)
+        shake = np.random.default_rng([seed, _NOISE]).standard_normal(
+            (num_points, 1), dtype=np.float32
+        )
         points += np.float32(noise) * (shake * normals)
     return label_points(model, points, labels, normals)
 
@@ -275,7 +277,7 @@ def solve_quadratic(a: Array, b: Array, c: Array) -> list[Array]:
         return [far / a, c / far]
 
 
-def _is_within(x: Array, y: Array, angles: AngleRange) -> NDArray[np.bool_]:
+def _is_within(x: Array, y: Array, angles: tuple[float, float]) -> NDArray[np.bool_]:
     """Return which directions are in a range of angles, both ends included."""
-    beyond = np.mod(np.arctan2(y, x) - angles[0] + _SLACK, FULL_CIRCLE)
+    beyond = np.mod(np.arctan2(y, x) - angles[0] + _SLACK, 2 * np.pi)
     return beyond <= angles[1] - angles[0] + 2 * _SLACK

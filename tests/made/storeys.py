@@ -5,13 +5,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import RoomLayout, Scene, SceneModel, sample_scene
-from torchrg.scenes.furniture import SIDES, between, block
-from torchrg.scenes.geometry import Frame, Triple
-from torchrg.scenes.rooms import free_places, furnish
-from torchrg.scenes.scene import Part, seeded_generator
-from torchrg.scenes.shells import passage, room_walls
-from torchrg.scenes.surfaces import Flat, Hole
+from torchrg.scenes import (
+    Flat,
+    Frame,
+    Part,
+    RoomLayout,
+    Scene,
+    SceneModel,
+    block,
+    free_places,
+    furnish,
+    passage,
+    room_walls,
+    sample_scene,
+)
 
 HALL_LAYOUT = RoomLayout(
     size=(24.0, 2.4, 2.7),
@@ -86,7 +93,7 @@ class StoreyLayout:
 class StoreyRoom:
     """A room along the hallway; lengths along it are those of the world's first axis."""
 
-    size: Triple
+    size: tuple[float, float, float]
     left: float
     hall_wall: int
     hall_width: float
@@ -102,7 +109,7 @@ class StoreyRoom:
         return Frame.upright(np.array([self.left, self.hall_width + self.thickness, 0]))
 
     @property
-    def doorway(self) -> Hole:
+    def doorway(self) -> tuple[float, float, float, float]:
         """Hole in the room's first wall, which starts at its right end."""
         left, right, top = self.door
         return self.size[0] - right, self.size[0] - left, 0.0, top
@@ -112,7 +119,7 @@ class StoreyRoom:
         ends = self.frame.to_world(np.array([(x, 0, 0) for x in self.door[:2]]))[:, 0]
         return float(ends.min()), float(ends.max())
 
-    def hall_doorway(self, length: float) -> Hole:
+    def hall_doorway(self, length: float) -> tuple[float, float, float, float]:
         """Return the hole in the hallway's wall; its first wall starts at the far end."""
         left, right = self.span()
         if self.hall_wall == HALL_WALLS[0]:
@@ -132,10 +139,10 @@ def draw_rooms(
     rooms: list[StoreyRoom] = []
     for number in range(count):
         side, first = HALL_WALLS[number % 2], number < 2
-        left = between(rng, 0.1, 0.4) if first else rooms[-2].left + rooms[-2].size[0]
-        left += 0 if first else between(rng, *layout.wall_thickness)
-        width, door_width = between(rng, *layout.room_width), between(rng, 0.85, 1.0)
-        door_left = between(rng, 0.35, 0.5)
+        left = rng.uniform(0.1, 0.4) if first else rooms[-2].left + rooms[-2].size[0]
+        left += 0 if first else rng.uniform(*layout.wall_thickness)
+        width, door_width = rng.uniform(*layout.room_width), rng.uniform(0.85, 1.0)
+        door_left = rng.uniform(0.35, 0.5)
         if rng.random() < 0.5:
             door_left = width - door_left - door_width
         rooms.append(
@@ -194,10 +201,10 @@ def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneM
         >>> build_storey().surfaces[0].kind
         'floor'
     """
-    layout, rng = layout or StoreyLayout(), seeded_generator(seed, _STOREY)
+    layout, rng = layout or StoreyLayout(), np.random.default_rng([seed, _STOREY])
     width = layout.hall.size[1]
     rooms = draw_rooms(layout, width, rng)
-    length = max(room.left + room.size[0] for room in rooms) + between(rng, 0.2, 0.5)
+    length = max(room.left + room.size[0] for room in rooms) + rng.uniform(0.2, 0.5)
     hall_layout = replace(layout.hall, size=(length, width, layout.hall.size[2]))
     hall = Frame.upright(np.zeros(3))
     walls = room_walls(hall, hall_layout.size)
@@ -233,8 +240,8 @@ def _open_door(room: StoreyRoom, rng: np.random.Generator) -> Part:
     """Return the leaf of an open door, inside the room beside the doorway."""
     left, right, top = room.door
     hinge = left - 0.1 if left < room.size[0] / 2 else right + 0.1
-    frame = room.frame.moved(hinge, 0.05 + (right - left) / 2, between(rng, 0.01, 0.03))
-    ajar = Frame.upright(np.zeros(3), between(rng, -6, 6)).inside(frame)
+    frame = room.frame.moved(hinge, 0.05 + (right - left) / 2, rng.uniform(0.01, 0.03))
+    ajar = Frame.upright(np.zeros(3), rng.uniform(-6, 6)).inside(frame)
     size = (_DOOR_LEAF, right - left, top - 0.04)
-    names = dict.fromkeys((*SIDES[2:], "bottom", "top"), "door edge")
+    names = dict.fromkeys(("front", "back", "bottom", "top"), "door edge")
     return block("door", ajar, size, kinds=names)
