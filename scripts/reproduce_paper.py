@@ -54,9 +54,12 @@ def main() -> None:
         folder.write(f"parts/{name}.json", json.dumps(part, indent=1))
         print(f"== {name}: {time.perf_counter() - begin:.0f} s", flush=True)
     report = write_report(folder, list(PARTS), quick=arguments.quick)
-    print(f"Look at {folder.path / 'report.html'} (also .md, .json)")
+    print(f"Look at {folder.path / 'report.html'} (also .json)")
     if arguments.readme:
-        readme.update(report)
+        try:
+            readme.update(report)
+        except ValueError as error:
+            sys.exit(f"reproduce_paper.py: {error}")
 
 
 def _parse() -> argparse.Namespace:

@@ -45,6 +45,8 @@ SYNPEB_MIN_SIZE = 10
 """Points of the smallest region, and of the smallest face, as smaller ones are void there."""
 SYNPEB_VOID = 3
 """Label of SynPEB's points of no plane."""
+EVOPS = ("precision", "recall", "mean_iou")
+"""Indices of its protocol."""
 VOXEL_SIZE = 0.05
 """Side of the voxels, in metres."""
 
@@ -77,18 +79,12 @@ np.save(sys.argv[2], labels)
 
 
 class Labelled(NamedTuple):
-    """A cloud with its truth.
+    """A cloud with its truth."""
 
-    Attributes:
-        points: Shape ``(N, 3)``.
-        truth: Shape ``(N,)``, -1 for points of no plane.
-        min_size: Points of the smallest region.
-        frame: The depth image that the points are of, in the order of its pixels with depth.
-    """
-
-    points: Tensor
-    truth: Tensor
-    min_size: int = MIN_SIZE
+    points: Tensor  # shape ``(N, 3)``
+    truth: Tensor  # shape ``(N,)``, -1 for points of no plane
+    min_size: int = MIN_SIZE  # points of the smallest region
+    # The depth image that the points are of, in the order of its pixels with depth.
     frame: DepthFrame | None = None
 
 
@@ -98,8 +94,6 @@ Clouds = Sequence[Labelled]
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Score segmentations."""
-
     programs: Path | None = None
     """Folder of the program pclrg."""
     open3d_python: str | None = None
@@ -110,7 +104,6 @@ class Case(Benchmark):
     """Share of the points."""
 
     def clouds(self) -> Mapping[str, Callable[[], Clouds]]:
-        """Return rooms, frames and the scan."""
         rooms = {f"room, {1000 * noise:g} mm": (POINTS, noise) for noise in NOISES}
         rooms |= {f"room, {number:,} points": (number, 0.003) for number in DENSITIES}
         makers: dict[str, Callable[[], Clouds]] = {
@@ -124,7 +117,6 @@ class Case(Benchmark):
         return makers
 
     def contenders(self) -> Mapping[str, Callable[[Clouds], Figures | None]]:
-        """Return presets, depth images, and what else is there."""
         runs: dict[str, Callable[[Labelled], Tensor]] = {
             name: partial(_run_preset, name) for name in PRESETS
         }
@@ -216,15 +208,9 @@ def _score(cloud: Labelled, labels: Tensor) -> Figures:
     voxels = score_voxels(cloud.points, labels, cloud.truth, voxel_size=VOXEL_SIZE)
     shares = ("correct", "over_segmented", "under_segmented", "missed", "noise")
     return {
-        "regions": found.regions,
-        "faces": found.faces,
-        "mean best IoU": found.mean_best_iou,
-        "recall 50": found.recall_iou50,
-        "voxel P": voxels.precision,
-        "voxel R": voxels.recall,
-        "voxel F1": voxels.f1,
-        **{name.replace("_", "-"): getattr(found, name) / max(found.faces, 1) for name in shares},
-        "EVOPS P": found.evops_precision,
-        "EVOPS R": found.evops_recall,
-        "EVOPS IoU": found.evops_mean_iou,
+        **{name: getattr(found, name) for name in ("regions", "faces", "mean_best_iou")},
+        "recall_iou50": found.recall_iou50,
+        **{f"voxel {name}": getattr(voxels, name) for name in ("precision", "recall", "f1")},
+        **{name: getattr(found, name) / max(found.faces, 1) for name in shares},
+        **{f"EVOPS {name}": getattr(found, f"evops_{name}") for name in EVOPS},
     }

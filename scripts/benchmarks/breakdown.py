@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Figures, Results, markdown, medians
+from tests.made import OUTLIERS, contaminated
 from torchrg.linalg import covariance, eigh3, unsigned_angle_deg
 from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
 
-K = 50
+SEED = 0
 SHARES = (0.0, 0.1, 0.3, 0.45)
 FITS: dict[str, Callable[[Tensor], Tensor]] = {
     "PCA": lambda patches: covariance(patches)[1],
@@ -31,21 +32,19 @@ FITS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Measure the breakdown of robust fits."""
-
     patches: int = 200
     """Of each kind and share of outliers."""
 
     def clouds(self) -> Mapping[str, Callable[[], tuple[Tensor, Tensor]]]:
-        """Return neighbourhoods by kind and share of their outliers."""
         return {
-            f"{kind} {share:.0%}": partial(contaminate, kind, share, self.patches)
-            for kind in ("cluster", "shell", "far")
+            f"{kind} {share:.0%}": lambda kind=kind, share=share: contaminated(
+                kind, share, torch.Generator().manual_seed(SEED), self.patches
+            )
+            for kind in OUTLIERS
             for share in SHARES
         }
 
     def contenders(self) -> Mapping[str, Callable[[tuple[Tensor, Tensor]], Figures]]:
-        """Return the fits."""
         return {name: partial(_angles, fit) for name, fit in FITS.items()}
 
     def report(self, results: Results) -> str:
@@ -57,24 +56,6 @@ class Case(Benchmark):
         names = next(iter(results.values()))
         title = "Angle of the normal, degrees: median / 90th percentile\n\n"
         return title + markdown(["outliers", *names], rows)
-
-
-def contaminate(kind: str, share: float, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Return noisy planes of 50 points, turned at random, a share outliers, and their normals."""
-    draw = torch.Generator().manual_seed(seed)
-    patches = torch.rand(count, K, 3, generator=draw) - 0.5
-    patches[..., 2] = 0.01 * torch.randn(count, K, generator=draw)
-    number = round(share * K)
-    normal = torch.randn(count, number, 3, generator=draw)
-    if kind == "cluster":
-        outliers = torch.tensor([0.2, 0.1, 0.4]) + 0.05 * normal
-    elif kind == "shell":
-        outliers = 0.5 * normal / normal.norm(dim=-1, keepdim=True)
-    else:
-        outliers = torch.tensor([5.0, 5.0, 10.0]) + normal
-    patches[:, :number] = outliers
-    turn = torch.linalg.qr(torch.randn(count, 3, 3, generator=draw)).Q
-    return patches @ turn, turn[:, 2]
 
 
 def _angles(fit: Callable[[Tensor], Tensor], cloud: tuple[Tensor, Tensor]) -> Figures:

@@ -30,14 +30,14 @@ from torchrg.scenes import make_room
 
 S3DIS_POINTS = 273_000_000
 CLASSES = ("wall", "table", "chair", "bookcase", "board", "door", "window", "clutter")
+REPORTED = ("points", "seconds", "points_per_second", "points_per_second_of_a_worker")
+"""Fields of the command's own report."""
 PROMISED_BYTES, PROMISED_BYTES_A_POINT = 2e9, 1200.0
 """What a worker may take at most."""
 
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Time the conversion of a data set."""
-
     rooms: int = 24
     smallest: int = 100_000
     """Points of the first room."""
@@ -50,11 +50,9 @@ class Case(Benchmark):
     """Keeps the tree and the results."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
-        """Return the tree."""
         return {f"{self.rooms} rooms, {self.preset}": self._make_tree}
 
     def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
-        """Return numbers of workers, and Ray."""
         return {
             "1": partial(self._convert, ["--workers", "1"]),
             "2": partial(self._convert, ["--workers", "2"]),
@@ -103,13 +101,9 @@ class Case(Benchmark):
         ]
         shares = [s["peak_memory"] / p for s, p in zip(report["scans"], promised, strict=True)]
         return {
-            "points": report["points"],
-            "seconds": report["seconds"],
+            **{name: report[name] for name in REPORTED},
             "with start and checks": seconds,
-            "points a second": report["points_per_second"],
             "minutes for S3DIS": S3DIS_POINTS / report["points_per_second"] / 60,
-            "of a worker in": report["points_per_second_of_a_worker"],
-            "seconds in": report["stage_seconds"],
             "GB": report["peak_memory"] / 1e9,
             "of what is promised": max(shares),
             "sha256": _digest(out),

@@ -23,8 +23,6 @@ STRIDE = 7919
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Time a DataLoader."""
-
     threads: int = 1
     crops: int = 60
     num_points: int = 10_000
@@ -33,12 +31,10 @@ class Case(Benchmark):
     workers: tuple[int, ...] = (0, 1, 2)
 
     def clouds(self) -> Mapping[str, Callable[[], "Crops"]]:
-        """Return the crops."""
         title = f"{self.crops} crops of {self.num_points:,} points, {self.preset}"
         return {title: lambda: Crops(self.crops, self.num_points, self.preset)}
 
     def contenders(self) -> Mapping[str, Callable[["Crops"], Figures]]:
-        """Return the numbers of workers, and how they start."""
         runs = {"0 workers": partial(_load_all, 0, None)} if 0 in self.workers else {}
         for start in ("fork", "spawn"):
             for number in filter(None, self.workers):
@@ -55,13 +51,7 @@ class Case(Benchmark):
 
 
 class Crops(Dataset[dict[str, Tensor]]):
-    """Parts of a made room, each the points nearest to one of them.
-
-    Args:
-        count: Number of crops.
-        num_points: Points of each.
-        preset: Settings of the transform.
-    """
+    """Parts of a made room, each the points nearest to one of them."""
 
     def __init__(self, count: int, num_points: int, preset: str) -> None:
         self.room = make_room(40 * num_points, 0.003, 7).points

@@ -49,8 +49,6 @@ def pcl_command(program: Path, cloud: Path, labels: Path, min_size: int = MIN_SI
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Compare torchrg with PCL, CGAL and Open3D."""
-
     rounds: int = 3
     programs: Path | None = None
     """Folder of the programs pclrg and cgaln."""
@@ -60,13 +58,11 @@ class Case(Benchmark):
     """Points of made rooms, in random order and in that of a space-filling curve."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
-        """Return scans and rooms, as folders of files that the contenders read."""
         rooms = [f"room {size} {order}" for size in self.sizes for order in ("random", "sorted")]
         names = [*map(str, self.scans), *rooms]
         return {Path(name).stem: partial(cloud_files, name) for name in names}
 
     def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
-        """Return those that are installed."""
         runs: dict[str, Callable[[Path], Figures]] = {
             f"torchrg-{preset}": partial(_run_warm, f"preset {preset}") for preset in PRESETS
         }

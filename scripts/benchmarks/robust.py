@@ -41,8 +41,6 @@ cat(seconds / length(starts) * 1e6)
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Time robust estimators."""
-
     rounds: int = 3
     scan: Path | None = None
     """A scan to take neighbourhoods from."""
@@ -51,7 +49,6 @@ class Case(Benchmark):
     """Neighbourhoods that other implementations get."""
 
     def clouds(self) -> Mapping[str, Callable[[], Tensor]]:
-        """Return neighbourhoods at edges: of a scan, a made room, with ties, and exact ones."""
         few = max(self.patches // 4, 1)
         sets = {
             "edges of a made room": lambda: edge_rich_patches(self._room(0.003), self.patches),
@@ -72,7 +69,6 @@ class Case(Benchmark):
         return torchrg.scenes.make_room(num_points, noise, seed=0).points
 
     def contenders(self) -> Mapping[str, Callable[[Tensor], Figures]]:
-        """Return the estimators, slow ones on a tenth or a hundredth, and others on a sample."""
         runs: dict[str, Callable[[Tensor], Figures]] = {
             "Qn, a row of 50": lambda patches: _time(qn, _rows(patches)),
             "Qn above a threshold, a row": lambda patches: _time(

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 
 import torch
 
@@ -33,8 +33,6 @@ WARM_UP = 5000
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Time torchrg beside other work."""
-
     rounds: int = 5
     work: tuple[str, ...] = (*FRAMES, *PRESETS)
     """Presets, and kinds of depth frames."""
@@ -42,7 +40,6 @@ class Case(Benchmark):
     """Points of the room."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
-        """Return the processes that work on each frame, or on a room by each preset."""
         keys = [(name, size) for name in self.work for size in (self.sizes, (0,))[name in FRAMES]]
         return {
             f"{name}, {size:,} points" if size else name: partial(Workers, name, size, self.threads)
@@ -50,13 +47,12 @@ class Case(Benchmark):
         }
 
     def contenders(self) -> Mapping[str, Callable[["Workers"], Figures]]:
-        """Return the conditions under which they work."""
         return {
-            "alone": lambda workers: workers.first.run() | {"points": workers.size},
+            "alone": lambda workers: workers.get().run() | {"points": workers.size},
             "twice": _run_both,
             "beside one": lambda workers: _run_beside(workers, 1),
             "beside two": lambda workers: _run_beside(workers, 2),
-            "one thread": lambda workers: workers.single.run(),
+            "one thread": lambda workers: workers.get(threads=1).run(),
         }
 
     def report(self, results: Results) -> str:
@@ -82,36 +78,26 @@ class Workers(contextlib.ExitStack):
     def __init__(self, name: str, size: int, threads: int) -> None:
         super().__init__()
         self.name, self.size, self.threads = name, size, threads
+        self._found: dict[tuple[int, int], Worker] = {}
 
-    def _start(self, threads: int) -> Worker:
-        worker = Worker("benchmarks.steady:prepare", self.name, self.size, threads=threads)
-        return self.enter_context(worker)
-
-    @cached_property
-    def first(self) -> Worker:
-        """One process."""
-        return self._start(self.threads)
-
-    @cached_property
-    def second(self) -> Worker:
-        """Another."""
-        return self._start(self.threads)
-
-    @cached_property
-    def single(self) -> Worker:
-        """One with one thread."""
-        return self._start(1)
+    def get(self, number: int = 0, threads: int | None = None) -> Worker:
+        """Return one of several with so many threads."""
+        key = (number, threads or self.threads)
+        if key not in self._found:
+            worker = Worker("benchmarks.steady:prepare", self.name, self.size, threads=key[1])
+            self._found[key] = self.enter_context(worker)
+        return self._found[key]
 
 
 def _run_both(workers: Workers) -> Figures:
-    pair = (workers.first, workers.second)
+    pair = (workers.get(0), workers.get(1))
     for worker in pair:
         worker.begin()
     return max((worker.wait() for worker in pair), key=lambda figures: figures["seconds"])
 
 
 def _run_beside(workers: Workers, number: int) -> Figures:
-    first = workers.first
+    first = workers.get()
     with _busy(number):
         return first.run()
 

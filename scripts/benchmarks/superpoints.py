@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Figures, Results, markdown
-from tests.made import make_kinect_room, scan_scene
+from tests.made import in_pieces, make_kinect_room, objects_of, on_voxels, scan_scene
 from torchrg import make_superpoints, read_cloud, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.metrics import score_partition
@@ -41,8 +41,8 @@ PEER_STRENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 LAYOUT = RoomLayout(
     size=(9.0, 7.0, 2.8), num_tables=5, num_columns=1, num_round_tables=1, num_balls=1, num_lamps=1
 )
-NUM_PIECES = 40
-"""Pieces that a room is put together from."""
+NOISE = 0.003
+"""Metres."""
 SPARE = 8
 """Points that a room has before pieces are thinned, for one that is left."""
 SHOWN = ("asa", "oracle_miou", "boundary_recall")
@@ -68,8 +68,6 @@ Labelled = tuple[Tensor, Tensor, str]
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Score superpoints."""
-
     parts: tuple[Path, ...] = ()
     """Rooms with parts."""
     points: int = 300_000
@@ -82,17 +80,12 @@ class Case(Benchmark):
     """Python that the peer runs in."""
 
     def clouds(self) -> Mapping[str, Callable[[], Labelled]]:
-        """Return rooms with parts, then made ones."""
         makers: dict[str, Callable[[], Labelled]] = {
             path.stem: partial(_read_parts, path) for path in self.parts
         }
-        for key in self.made:
-            name, make = CLOUDS[key]
-            makers[name] = lambda name=name, make=make: (*make(self.points), name)
-        return makers
+        return makers | {CLOUDS[key][0]: partial(_make, key, self.points) for key in self.made}
 
     def contenders(self) -> Mapping[str, Callable[[Labelled], Figures | None]]:
-        """Return torchrg, and the peer if it is there."""
         runs: dict[str, Callable[[Labelled], Figures | None]] = {
             OURS: lambda cloud: _score(cloud, *_run_ours(cloud[0], None)),
             VOXELLED: lambda cloud: (
@@ -135,51 +128,29 @@ class Case(Benchmark):
         return f"{markdown(['cloud', 'superpoints', *SHOWN], rows)}\n\n{markdown(head, taken)}"
 
 
-def _with_objects(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Return a scene with objects in place of faces."""
-    objects = torch.cat([scene.objects, torch.tensor([UNLABELED])])
-    return scene.points, objects[scene.labels]
-
-
-def _voxelled_room(num_points: int) -> tuple[Tensor, Tensor]:
-    """Return one point of each voxel of a room."""
-    points, truth = _with_objects(make_room(2 * num_points, noise=0.003, seed=11, layout=LAYOUT))
-    rows = sample_voxels(points, VOXEL).rows
-    return points[rows], truth[rows]
-
-
-def _room_of_pieces(num_points: int) -> tuple[Tensor, Tensor]:
-    """Return a room cut into boxes that keep equally many points each, as S3DIS is put together."""
-    scene = make_room(SPARE * num_points, noise=0.003, seed=12, layout=LAYOUT)
-    points, truth = _with_objects(scene)
-    rng = np.random.default_rng(12)
-    places, pieces = points.numpy(), [np.arange(len(points))]
-    while len(pieces) < NUM_PIECES:
-        longest = int(np.argmax([np.ptp(places[rows], axis=0).max() for rows in pieces]))
-        rows = pieces.pop(longest)
-        column = places[rows, int(np.argmax(np.ptp(places[rows], axis=0)))]
-        below = column <= column.min() + np.ptp(column) * rng.uniform(0.25, 0.75)
-        pieces += [rows[below], rows[~below]]
-    share = num_points // NUM_PIECES
-    kept = torch.from_numpy(np.concatenate([rng.permutation(rows)[:share] for rows in pieces]))
-    return points[kept], truth[kept]
-
-
-CLOUDS: dict[str, tuple[str, Callable[[int], tuple[Tensor, Tensor]]]] = {
-    "voxels": ("room on voxels of 3 cm", _voxelled_room),
-    "pieces": (PIECES, _room_of_pieces),
+CLOUDS: dict[str, tuple[str, Callable[[int], Scene]]] = {
+    "voxels": (
+        "room on voxels of 3 cm",
+        lambda size: on_voxels(make_room(2 * size, NOISE, 11, layout=LAYOUT), VOXEL),
+    ),
+    "pieces": (
+        PIECES,
+        lambda size: in_pieces(make_room(SPARE * size, NOISE, 12, layout=LAYOUT), size),
+    ),
     "scan": (
         "scan near and far",
-        lambda num_points: _with_objects(
-            scan_scene(build_room(13, layout=LAYOUT), num_points, noise=0.003, seed=13)
-        ),
+        lambda size: scan_scene(build_room(13, layout=LAYOUT), size, noise=NOISE, seed=13),
     ),
-    "frames": (
-        "depth frames fused",
-        lambda num_points: _with_objects(make_kinect_room(num_points, num_frames=8, seed=14)),
-    ),
+    "frames": ("depth frames fused", lambda size: make_kinect_room(size, num_frames=8, seed=14)),
 }
 """What the made clouds are, and what makes them."""
+
+
+def _make(key: str, num_points: int) -> Labelled:
+    """Return a made cloud with its objects."""
+    name, make = CLOUDS[key]
+    scene = make(num_points)
+    return scene.points, objects_of(scene), name
 
 
 def _read_parts(path: Path) -> Labelled:

@@ -38,8 +38,6 @@ RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 
 @dataclass(frozen=True)
 class Case(Benchmark):
-    """Compare tiles on disk with arrays in memory."""
-
     points: int = 1_000_000
     presets: tuple[str, ...] = ("classic",)
     limit_memory: float = 3.0
@@ -50,11 +48,9 @@ class Case(Benchmark):
     """Folder of buildings, results in memory, and tiles."""
 
     def clouds(self) -> Mapping[str, Callable[[], Path]]:
-        """Return the file of the building."""
         return {f"{self.points:,} points": self._building}
 
     def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
-        """Return each preset in memory, then in tiles."""
         return {
             f"{preset} {mode}": partial(self._run, mode, preset)
             for preset in self.presets

@@ -1,4 +1,4 @@
-"""Shapes, halls, storeys, laser scans and depth cameras: scenes that tests and scripts need.
+"""Shapes, halls, storeys, laser scans, depth cameras: scenes that tests and scripts need.
 
 To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
 each a face, and solids that hide what is inside them) and places where a scanner may stand.
@@ -17,7 +17,15 @@ from tests.made.cameras import (
     make_kinect_room,
     render_depth,
 )
+from tests.made.patches import OUTLIERS, contaminated
 from tests.made.rays import cast_rays, scan_scene
+from tests.made.samples import (
+    CURVED_LAYOUT,
+    in_pieces,
+    objects_of,
+    on_voxels,
+    quantised_frame,
+)
 from tests.made.shapes import SHAPES, make_shape
 from tests.made.storeys import (
     HALL_LAYOUT,
@@ -27,8 +35,10 @@ from tests.made.storeys import (
 )
 
 __all__ = [
+    "CURVED_LAYOUT",
     "HALL_LAYOUT",
     "KINECT_LAYOUT",
+    "OUTLIERS",
     "SHAPES",
     "Camera",
     "DepthFrame",
@@ -36,10 +46,15 @@ __all__ = [
     "build_storey",
     "cameras_around",
     "cast_rays",
+    "contaminated",
     "fuse_frames",
+    "in_pieces",
     "make_kinect_room",
     "make_shape",
     "make_storey",
+    "objects_of",
+    "on_voxels",
+    "quantised_frame",
     "render_depth",
     "scan_scene",
 ]

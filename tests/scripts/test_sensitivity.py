@@ -58,15 +58,22 @@ def test_what_moves_is_put_back_and_what_matters_is_found(tiny):
 
 
 def test_the_script_prints_a_table_and_leaves_out_parts_that_are_not_there(
-    tiny, monkeypatch, capsys
+    tiny, monkeypatch, capsys, tmp_path
 ):
     monkeypatch.setattr(sensitivity, "make_cases", lambda parts, quick: [tiny])
+    out = tmp_path / "found.json"
     arguments = ["sensitivity.py", "--parts", "nowhere.pcd", "--only", "FLAT_LIMIT"]
-    monkeypatch.setattr("sys.argv", arguments)
+    monkeypatch.setattr("sys.argv", [*arguments, "--out", str(out)])
     sensitivity.main()
     shown = capsys.readouterr()
     assert "nowhere.pcd" in shown.err
-    assert shown.out.splitlines()[-1].startswith("FLAT_LIMIT")
-    monkeypatch.setattr("sys.argv", [*arguments, "--json"])
-    sensitivity.main()
-    assert json.loads(capsys.readouterr().out)[0]["constant"] == "FLAT_LIMIT"
+    assert shown.out.splitlines()[-1].startswith("| FLAT_LIMIT | 1.05 |")
+    (found,) = json.loads(out.read_text())["findings"]
+    assert found["constant"] == "FLAT_LIMIT"
+
+
+def test_what_is_kept_is_of_the_constants_as_they_are():
+    kept = json.loads(Path(sensitivity.__file__).with_name("sensitivity.json").read_text())
+    assert [(one["constant"], one["value"]) for one in kept["findings"]] == [
+        (constant.title, constant.value) for constant in sensitivity.read_table()
+    ]
