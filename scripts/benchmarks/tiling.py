@@ -47,29 +47,29 @@ class Case(Benchmark):
     work: Path = Path("build/bench_tiling")
     """Folder of buildings, results in memory, and tiles."""
 
-    def clouds(self) -> Mapping[str, Callable[[], Path]]:
+    def clouds(self) -> Mapping[str, Callable[[], str]]:
         return {f"{self.points:,} points": self._building}
 
-    def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
+    def contenders(self) -> Mapping[str, Callable[[str], Figures]]:
         return {
             f"{preset} {mode}": partial(self._run, mode, preset)
             for preset in self.presets
             for mode in ("memory", "tiles")
         }
 
-    def _run(self, mode: str, preset: str, path: Path) -> Figures:
+    def _run(self, mode: str, preset: str, path: str) -> Figures:
         settings = [self.tile_size, self.limit_memory] if mode == "tiles" else []
         target = f"benchmarks.tiling:prepare_{mode}"
-        with Worker(target, str(path), preset, *settings, threads=self.threads) as worker:
+        with Worker(target, path, preset, *settings, threads=self.threads) as worker:
             taken = worker.run()
         return taken | {f"us_{k}": 1e6 * taken[k] / self.points for k in ("seconds", "cpu")}
 
-    def _building(self) -> Path:
+    def _building(self) -> str:
         """Return the file with the points of as many rooms as they fill."""
         self.work.mkdir(parents=True, exist_ok=True)
         path = self.work / f"building_{self.points}.npy"
         if path.exists():
-            return path
+            return str(path)
         beside = path.with_suffix(".part.npy")
         shape = (self.points, 3)
         points = np.lib.format.open_memmap(beside, mode="w+", dtype=np.float32, shape=shape)
@@ -79,7 +79,7 @@ class Case(Benchmark):
             place = np.array([number % width, number // width, 0], dtype=np.float32) * ROOM_METRES
             points[start : start + count] = make_room(count, seed=number).points.numpy() + place
             points.flush()
-        return beside.replace(path)
+        return str(beside.replace(path))
 
 
 def _result_folder(path: Path, preset: str) -> Path:
