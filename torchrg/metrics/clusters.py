@@ -26,13 +26,13 @@ from torchrg.neighbors import canonical_order
 from torchrg.structures import UNLABELED
 
 _COINCIDENT = 1e-12
-"""Radians: closer centres, or directions of different clusters, differ by rounding only."""
+"""Radians. Closer centres, or closer directions of two clusters, differ by rounding alone."""
 _MAX_CELLS = 4096
-"""From so many cells on, the closest pair is searched by trees instead of a grid."""
+"""With more cells than this, the closest pair is searched in trees instead of a grid."""
 _FINEST_LEVEL = 50
-"""Cells of this level are as small as the rounding of coordinates."""
+"""Divisions after which cells are as small as the rounding of coordinates."""
 _QUERIES = 65536
-"""Directions that are looked up in a tree at a time: each shortens the search of the next."""
+"""Directions that are looked up in a tree at a time. Each time shortens the search of the next."""
 
 
 class ClusterScore(NamedTuple):

@@ -14,7 +14,7 @@ from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
 
 _MATCH_IOU, _PART_IOU = 0.75, 0.2
-"""Least IoU of a match and of an overlap in part, as in the EVOPS benchmark. Above 0.5 matches are
+"""Least IoU of a match, and of a partial overlap, as in the EVOPS benchmark. Above 0.5 a match is
 one to one."""
 
 
