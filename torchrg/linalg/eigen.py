@@ -126,11 +126,11 @@ def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     r"""Return eigenvalues and the first eigenvector of positive semi-definite 3x3 matrices.
 
-    A third of the time of :func:`eigh3`, and more accurate for matrices of thin neighbourhoods: the
-    smallest root of the characteristic polynomial by Newton's method from 0, which it approaches
-    from one side, then a column of the adjugate of :math:`A - \lambda I`, both in double
-    precision. Where the first two eigenvalues are equal to rounding, it is any vector across the
-    third eigenvector.
+    It takes a third of the time of :func:`eigh3` and is more accurate for matrices of thin
+    neighbourhoods. Newton's method from 0 approaches the smallest root of the characteristic
+    polynomial from one side; a column of the adjugate of :math:`A - \lambda I` is the eigenvector.
+    Both are found in double precision. Where the first two eigenvalues are equal to rounding, it is
+    any vector across the third eigenvector.
 
     Returns ascending eigenvalues ``(*, 3)``, not negative, right to 1e-8 of the largest or to
     rounding, and unit eigenvectors of the first ``(*, 3)``, of arbitrary sign.

@@ -219,8 +219,8 @@ def closest_between(directions: Tensor, clusters: Tensor) -> float:
     """Return the smallest angle between directions of different clusters, for eq. (15).
 
     Exact for clouds of any size, by two searches. A grid on the sphere, made finer step by step,
-    drops the cells that are farther from every other cluster than two points known to be close;
-    it settles clusters that stand apart. What is left where many clusters overlap goes to
+    drops the cells that are farther from every other cluster than two points known to be close.
+    Clusters that stand apart need no more. What is left where many clusters overlap goes to
     kd-trees: the numbers of different clusters differ in one binary digit at least, so for each
     digit the directions are split by it and the closest pair across the split is found.
 

@@ -209,7 +209,7 @@ def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegComp
     split = _wholes(faces, in_face, of_region, table.overlaps, table.face_sizes, threshold)
     merged = _wholes(regions, in_region, of_face, table.overlaps, table.region_sizes, threshold)
 
-    # Two classes can only meet in a correct pair, so each pair settles its own conflict.
+    # Two classes can only meet in a correct pair, so each pair decides its own conflict.
     over, under = split[faces], merged[regions]
     correct = both & (fit >= over) & (fit >= under)
     is_split, is_merged = split > 0, merged > 0
