@@ -19,6 +19,7 @@ import tyro
 from playwright.sync_api import Browser, sync_playwright
 
 from torchrg.render import make_page, write_page
+from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -85,7 +86,7 @@ def main(arguments: Arguments) -> None:
         for num_points in arguments.sizes:
             cloud, path = make_cloud(num_points), Path(folder) / "page.html"
             begin = time.process_time()
-            write_page(path, make_page(cloud))
+            write_page(path, make_page(Result(cloud)))
             seconds = time.process_time() - begin
             opened, some, every = frames_a_second(browser, path, arguments.seconds)
             print(

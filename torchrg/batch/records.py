@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 import torch
 
+from torchrg import version
 from torchrg.batch.scans import Converted, Job
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
@@ -36,10 +37,8 @@ def describe_run(
 
 def describe_versions() -> dict[str, str]:
     """Return the versions of what decides a result."""
-    from torchrg import __version__
-
     return {
-        "torchrg": __version__,
+        "torchrg": version.__version__,
         "torch": str(torch.__version__),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
