@@ -25,6 +25,7 @@ from torchrg.io.npy import map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.regions import summarize_planes
+from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.superpoints import main_planes
 from torchrg.structures import (
     PLANE_COLUMNS,
@@ -58,11 +59,11 @@ _KINDS = {
 """NumPy's kinds of numbers of a field, and shape of a row."""
 _FOUND = ("labels", "normals", "curvature", "sharp", "valid")
 """What a segmentation says of each point."""
-_MOST_SEARCHED = 200_000
+_MOST_SEARCHED = 100_000
 """Points of a random sample that tell which planes meet where no result says it."""
 _NEIGHBORS = 50
-"""As many neighbours as :class:`torchrg.config.NormalsConfig` takes: of a cloud that is not sampled
-the same planes meet as in its result."""
+"""As many neighbours as normals are estimated from by default: of a cloud that is not sampled the
+same planes meet as in its result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +114,11 @@ class Result:
             .reshape(len(cloud), *_KINDS[name][1])
             for name in _FOUND
         }
-        plane = None if superpoints is None else superpoints.plane
-        found |= {} if superpoints is None else superpoints.by_level()
+        if superpoints is not None:
+            found |= superpoints.by_level()
         labelled = replace(cloud, fields=put_results(cloud.fields, found))
-        return cls(labelled, segmentation.planes, plane)
+        plane_of_superpoint = None if superpoints is None else superpoints.plane
+        return cls(labelled, segmentation.planes, plane_of_superpoint)
 
     @cached_property
     def fields(self) -> dict[str, Tensor]:
@@ -166,19 +168,25 @@ class Result:
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):
             return table
         rows = finite_rows(self.cloud.points)
-        points, labels, normals = self.cloud.points[rows], self.labels[rows], self._normals[rows]
-        if table is None:
-            table = summarize_planes(points, normals, labels)
-            has_normals = "normals" in self.fields
-            table = table._replace(curved=table.curved & has_normals)
-        if len(table.count) == 0:
-            return table
         some = torch.from_numpy(np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED])
-        some = some.sort().values
-        sampled, kept = number_labels(labels[some])
-        neighbors = search_knn(points[some], min(_NEIGHBORS, len(some)), canonical=True)
-        met = summarize_planes(points[some], normals[some], kept, neighbors=neighbors).adjacency
-        return table._replace(adjacency=met and met._replace(pairs=sampled[met.pairs]))
+        some = rows[some.sort().values]
+        points, (present, labels) = self.cloud.points[some], number_labels(self.labels[some])
+        neighbors = None
+        if len(present):
+            neighbors = search_knn(points, min(_NEIGHBORS, len(some)), canonical=True)
+        if table is None:
+            has_normals = "normals" in self.fields
+            cloud = (self.cloud.points, self._normals, self.labels)
+            whole = neighbors if has_normals and len(some) == len(rows) else None
+            table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
+            table = table._replace(curved=table.curved & has_normals)
+        if neighbors is None or table.adjacency is not None:
+            return table
+        normal, rms = (column[present].double() for column in (table.normal, table.rms))
+        curved, dtype = table.curved[present], table.rms.dtype
+        met = find_adjacency(points, labels, neighbors, normal, rms, curved=curved)
+        sizes = (size.to(dtype) for size in (met.boundary_length, met.dihedral_deg))
+        return table._replace(adjacency=PlaneAdjacency(present[met.pairs], *sizes))
 
     @property
     def _normals(self) -> Tensor:
