@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
-from torchrg.io.fields import put_results
+from torchrg.io.fields import are_whole, put_results
 from torchrg.io.npy import map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
@@ -261,6 +261,13 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         cloud, beside = _read_folder(source)
     else:
         cloud = read_cloud(source, columns=columns)
+        # Text has one kind of numbers for all.
+        whole = {
+            name: values.astype(np.int64)
+            for name, values in cloud.fields.items()
+            if name.startswith("superpoints") and values.dtype.kind == "f" and are_whole(values)
+        }
+        cloud = replace(cloud, fields={**cloud.fields, **whole})
         beside = read_beside(source) if source.suffix.lower() == ".npz" else {}
     planes = beside.get("plane_of_superpoint")
     result = Result(
