@@ -37,8 +37,9 @@ from torchrg.structures import (
     Superpoints,
 )
 
-PLANES_FILE, RECORD_FILE = "planes.json", "provenance.json"
-"""The table of planes and the record of how it was made, in a folder of arrays."""
+PLANES_FILE, RECORD = "planes.json", "provenance.json"
+"""Table of planes, and record of how they were made, in a folder of arrays. The record is written
+last, so that a scan without it is not done."""
 _FOLDER_FIELDS = {
     "plane": "labels",
     "normal": "normals",
@@ -303,8 +304,8 @@ def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
     grid = coord.shape[:2] if coord.ndim == 3 else None
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder))
     beside: dict[str, NDArray[Any]] = {}
-    if (folder / RECORD_FILE).is_file():
-        beside["provenance"] = np.array((folder / RECORD_FILE).read_text(encoding="utf-8"))
+    if (folder / RECORD).is_file():
+        beside["provenance"] = np.array((folder / RECORD).read_text(encoding="utf-8"))
     if (folder / PLANES_FILE).is_file():
         try:
             table = json.loads((folder / PLANES_FILE).read_text(encoding="utf-8"))

@@ -15,9 +15,7 @@ from torchrg.batch.scans import Converted, Job
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-
-RECORD = "provenance.json"
-"""Written last beside the results of a scan, so that a scan without it is not done."""
+from torchrg.result import RECORD as RECORD
 
 
 def describe_run(
