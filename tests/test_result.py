@@ -281,12 +281,19 @@ def test_without_labels_there_is_no_table(tmp_path, cloud):
     assert len(result.names) == 0
 
 
-@pytest.mark.parametrize("change", ["labels", "shape", "kind", "pairs", "missing"])
+@pytest.mark.parametrize(
+    "change", ["labels", "huge", "shape", "kind", "pairs", "number", "missing"]
+)
 def test_a_table_that_is_not_of_the_labels_is_left_out(tmp_path, cloud, seg, change):
     torchrg.write_cloud(tmp_path / "a.npz", cloud, seg)
     arrays = dict(np.load(tmp_path / "a.npz"))
     if change == "labels":
         arrays["labels"][arrays["labels"] == 0] = -1
+    elif change == "huge":
+        arrays["labels"] = np.where(arrays["labels"] < 0, -7, arrays["labels"] * 10**15)
+    elif change == "number":
+        arrays["plane_count"] = np.array(7)
+        arrays["plane_of_superpoint"] = np.array(["a"])
     elif change == "shape":
         arrays["plane_axes"] = arrays["plane_axes"][:, 0]
     elif change == "kind":
@@ -307,7 +314,9 @@ def test_a_table_that_is_not_of_the_labels_is_left_out(tmp_path, cloud, seg, cha
 def test_a_table_of_others_in_a_folder_is_left_out(tmp_path, cloud, seg, content):
     write_pointcept_scene(tmp_path, {"coord": cloud.coordinates}, seg)
     (tmp_path / "planes.json").write_text(content)
+    (tmp_path / "provenance.json").write_bytes(b"\xff[]")
     result = torchrg.read_result(tmp_path)
+    assert result.provenance == {}
     assert result.table is None
     assert "table of planes left out" in result.cloud.notes[0]
     assert torch.equal(result.planes.count, seg.planes.count)

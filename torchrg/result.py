@@ -270,10 +270,10 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         }
         cloud = replace(cloud, fields={**cloud.fields, **whole})
         beside = read_beside(source) if source.suffix.lower() == ".npz" else {}
-    planes = beside.get("plane_of_superpoint")
+    planes = beside.get("plane_of_superpoint", np.zeros(()))
     result = Result(
         cloud,
-        plane_of_superpoint=None if planes is None else torch.from_numpy(planes),
+        plane_of_superpoint=torch.from_numpy(planes) if planes.dtype == np.int64 else None,
         provenance=_record(str(beside.get("provenance", ""))),
     )
     if "plane_count" not in beside:
@@ -281,9 +281,11 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
     try:
         normals = result.fields.get("normals", cloud.points)
         table = Planes.from_arrays(beside, cloud.origin, normals.dtype)
-        if torch.equal(torch.bincount(result.fields["labels"].long() + 1)[1:], table.count):
+        sizes = torch.bincount(result.labels + 1, minlength=1)[1:]
+        named = torch.equal(result.names, torch.arange(len(sizes)))
+        if named and torch.equal(sizes, table.count):
             return replace(result, table=table)
-    except (LookupError, ValueError, RuntimeError):
+    except (LookupError, ValueError, TypeError):
         # A table of an older version, or of another program that has arrays of these names.
         pass
     note = "its table of planes left out, as it is not that of its labels"
@@ -305,11 +307,11 @@ def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder))
     beside: dict[str, NDArray[Any]] = {}
     if (folder / RECORD).is_file():
-        beside["provenance"] = np.array((folder / RECORD).read_text(encoding="utf-8"))
+        beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
     if (folder / PLANES_FILE).is_file():
         try:
-            table = json.loads((folder / PLANES_FILE).read_text(encoding="utf-8"))
-            beside |= _arrays_of(table)
+            text = (folder / PLANES_FILE).read_text(encoding="utf-8")
+            beside |= _arrays_of(json.loads(text))
         except (LookupError, ValueError, TypeError, AttributeError):
             beside["plane_count"] = np.zeros(0)
     return cloud, beside
@@ -333,10 +335,8 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
             Default: they are the same.
 
     Returns:
-        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and ``normal``,
-        ``offset`` (``normal . x = offset``), ``centroid``, ``area``, ``count``, ``rms``,
-        ``extent``, ``axes``, ``center``, ``curved``; ``kind`` and ``outline`` (rings of points)
-        where they are known.
+        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
+        :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
         ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
 
     Example:

@@ -268,9 +268,9 @@ class Planes(NamedTuple):
         columns |= {name: columns[name] - origin for name in ("centroid", "center")}
         table = cls._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), None, None, None])
         if "plane_kind" in arrays:
-            words = read("plane_kind", "U", (num_planes,)).tolist()
-            kinds = torch.tensor([PLANE_KINDS.index(word) for word in words], dtype=torch.int64)
-            table = table._replace(kind=kinds)
+            words = read("plane_kind", "U", (num_planes,))
+            kinds = [PLANE_KINDS.index(word) for word in words]
+            table = table._replace(kind=torch.tensor(kinds, dtype=torch.int64))
         if "adjacency_pairs" in arrays:
             num_pairs = len(arrays["adjacency_pairs"])
             pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
