@@ -212,22 +212,6 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
         rings = (torch.from_numpy(r) for r in trace_outline(part.numpy(), float(width[place])))
         outlines[own] = tuple(center[place] + ring @ axes[place] for ring in rings)
     return outlines
-    rows = rows[:_OUTLINE_POINTS]
-    numbers, labels = number_labels(result.labels[rows])
-    segments = Segments(labels)
-    axes, center = planes.axes[numbers].double(), planes.center[numbers].double()
-    centered = torch.stack(segments.take_about(result.cloud.points[rows], center), dim=1)
-    u, v = ((centered * segments.spread(axis)).sum(dim=1) for axis in axes.unbind(dim=1))
-    along = torch.eye(2, dtype=torch.float64).expand(len(numbers), 2, 2)
-    boxes = Rectangles(planes.extent[numbers].double(), along, torch.zeros_like(center[:, :2]))
-    width = covered_areas(segments, u, v, boxes)[1]
-    places = torch.stack([u, v], dim=1).split(segments.counts.tolist())
-    for own, part, size, number in zip(
-        numbers.tolist(), places, width.tolist(), range(len(numbers)), strict=True
-    ):
-        rings = (torch.from_numpy(ring) for ring in trace_outline(part.numpy(), size))
-        outlines[own] = tuple(center[number] + ring @ axes[number] for ring in rings)
-    return outlines
 
 
 def sides_of_planes(
