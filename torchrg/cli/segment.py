@@ -46,9 +46,9 @@ from torchrg.render.gallery import (
     check_gallery,
     draw_entry,
     draw_planes,
-    with_results,
     write_index,
 )
+from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation
 from torchrg.transforms import partition_voxels, segment_voxels
 
@@ -330,7 +330,7 @@ def _segment_whole(
         provenance["voxel"] = voxel
     write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
-        result = with_results(cloud, seg, parts)
+        result = Result.of(cloud, seg, parts)
         if arguments.pages:
             draw_entry(picture.parent, picture.stem, result)
         elif console.is_page(picture):
