@@ -20,15 +20,21 @@ from torchrg.errors import FormatError
 from torchrg.neighbors import finite_rows, restore_rows
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.regions import summarize_planes
-from torchrg.regions.edges import EdgeLists, GrowingCloud, find_coded_edges, find_edges
+from torchrg.regions.edges import (
+    EDGE_STEPS,
+    EdgeLists,
+    GrowingCloud,
+    find_coded_edges,
+    find_edges,
+)
 from torchrg.regions.growth import (
     checked_cloud,
     grow_first_in_first_out,
     grow_rest,
     growing_order,
-    leaves_enough,
-    settle_regions,
-    spreading,
+    label_regions,
+    may_grow_without_seeds,
+    seeds_in_order,
 )
 from torchrg.structures import (
     UNLABELED,
@@ -43,9 +49,6 @@ from torchrg.tiling.files import TileFiles, Written, reading, released
 from torchrg.tiling.growth import Condensed, condense, join_condensed
 from torchrg.tiling.neighbors import search_tile
 from torchrg.tiling.parts import Part, cut_part
-
-_GROWTH_STEPS = 2
-"""Steps from neighbour to neighbour that decide an edge: the neighbours of both of its ends."""
 
 _ROW_BYTES = 150
 """Of a point on disk beside its neighbours and edges: coordinates, normals, results."""
@@ -208,13 +211,13 @@ def _growing_points(files: TileFiles) -> Tensor:
 
 
 def _connect(files: TileFiles, tile: slice, number: int, config: PipelineConfig) -> None:
-    part = cut_part(files.map("neighbors"), tile, _GROWTH_STEPS)
+    part = cut_part(files.map("neighbors"), tile, EDGE_STEPS)
     points, normals, curvature, valid, residual_rms = (
         files.map(name)[part.rows]
         for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
     )
     cloud = checked_cloud(
-        config.growing, points, normals, curvature, part.neighbors, valid, None, residual_rms
+        config.growing, points, normals, curvature, part.neighbors, valid, residual_rms
     )
     if cloud.reach is not None:
         files.write("reach", tile.start, cloud.reach[part.own])
@@ -227,7 +230,7 @@ def _connect(files: TileFiles, tile: slice, number: int, config: PipelineConfig)
         files.save(f"edges_{number}", edges.targets)
         files.write("counts", tile.start, np.diff(edges.starts))
         return
-    found, others = find_edges(cloud, config.growing, limit, spare=0, chunk_size=config.chunk_size)
+    found, others = find_edges(cloud, config.growing, limit, chunk_size=config.chunk_size)
     condensed = condense(found, part)
     files.write("components", tile.start, condensed.components)
     files.save(f"sources_{number}", condensed.sources)
@@ -272,7 +275,7 @@ def finish_regions(files: TileFiles, config: PipelineConfig) -> None:
             _growing_points(files),
             reach=None if config.growing.plane_reach is None else files.load("reach"),
         )
-        labels = settle_regions(cloud, files.load("heads"), config.growing, config.chunk_size)
+        labels = label_regions(cloud, files.load("heads"), config.growing, config.chunk_size)
     files.save("labels", labels)
     files.note("regions")
 
@@ -307,8 +310,8 @@ def _grow_in_any_order(files: TileFiles, config: PipelineConfig) -> NDArray[np.i
         )
         for number in range(len(bounds) - 1)
     ]
-    heads = join_condensed(parts, spreading(order, files.load("curvature"), limit))
-    if leaves_enough(files.known("order")["k"], config.growing):
+    heads = join_condensed(parts, seeds_in_order(order, files.load("curvature"), limit))
+    if may_grow_without_seeds(files.known("order")["k"], config.growing):
         starts = _join_edges(files)
         heads = grow_rest(heads, EdgeLists(starts, files.load("edges").numpy()), order)
     return heads
