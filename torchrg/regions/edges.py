@@ -51,6 +51,7 @@ class GrowingCloud(NamedTuple):
         colors: Shape ``(N, C)``, floating point, or None.
         max_color_distance: Largest difference of colours across which regions grow.
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0.
+        angle_share: Share of the largest angle between normals across which regions grow.
     """
 
     points: Tensor
@@ -62,6 +63,17 @@ class GrowingCloud(NamedTuple):
     colors: Tensor | None = None
     max_color_distance: float = math.inf
     signed_normals: bool = False
+    angle_share: float = 1.0
+
+
+def is_order_free(config: GrowingConfig) -> bool:
+    """Tell whether what a claimed point does next depends on itself, not on who claimed it."""
+    return config.seed_rule == "curvature" and not promotes_late(config)
+
+
+def promotes_late(config: GrowingConfig) -> bool:
+    """Tell whether any edge of its region makes a point a seed, not only that which claimed it."""
+    return config.connectivity is not None and config.connectivity_scope == "seed"
 
 
 class EdgeLists(NamedTuple):
@@ -91,7 +103,7 @@ def find_coded_edges(
     """
     shared = _shared_neighbors(cloud, config)
     indices = cloud.neighbors.indices
-    claims = np.empty(indices.shape, dtype=bool) if config.promotes_late else None
+    claims = np.empty(indices.shape, dtype=bool) if promotes_late(config) else None
 
     def find(rows: slice) -> _Edges:
         joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
@@ -169,7 +181,8 @@ def accept_edges(
     the edges that it is asked for.
     """
     joins = are_valid(cloud, rows)
-    joins &= within_angle(cloud, rows, config.max_angle_deg, signed=cloud.signed_normals)
+    max_angle_deg = cloud.angle_share * config.max_angle_deg
+    joins &= within_angle(cloud, rows, max_angle_deg, signed=cloud.signed_normals)
     if config.max_distance is not None:
         joins &= within_distance(cloud, rows, cloud.points, config.max_distance)
     if cloud.colors is not None:

@@ -3,7 +3,6 @@
 import math
 from array import array
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,16 +14,17 @@ from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_op
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
+from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import (
     EdgeLists,
     GrowingCloud,
     find_coded_edges,
     find_edges,
+    is_order_free,
     neighborhood_radii,
 )
-from torchrg.regions.faces import cut_bridges
-from torchrg.regions.planes import LEAST_FITTED
-from torchrg.regions.refine import refine_regions
+from torchrg.regions.fit import LEAST_FITTED, RegionFits
+from torchrg.regions.repair import refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 _LONG_QUEUE = 32
@@ -120,8 +120,7 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    roots = torch.from_numpy(grow(cloud, config, chunk_size)).to(cloud.points.device)
-    labels = label_regions(cloud, roots, config, chunk_size)
+    labels = label_regions(cloud, grow(cloud, config, chunk_size), config, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 
@@ -137,18 +136,15 @@ def label_regions(
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
         least = min(least, max(least // 2, LEAST_FITTED))
-    labels = number_by_size(roots, least)
+    labels, fits = number_by_size(roots, least), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
-
-        def grow_within(part: GrowingCloud, share: float) -> Tensor:
-            part, strict = _within_share(part, config, share)
-            found = torch.from_numpy(grow(part, strict, chunk_size)).to(part.points.device)
-            return number_by_size(found, config.min_size)
-
-        labels = cut_bridges(cloud, labels, config, grow_within, chunk_size=chunk_size)
-        labels = number_by_size(labels, least)
-    if config.is_refined:
-        labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
+        mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)
+        if mixed is not None:
+            cores = number_by_size(grow(mixed.part, config, chunk_size), config.min_size)
+            labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
+            labels = number_by_size(labels, least)
+    if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
+        labels = number_by_size(refine_regions(cloud, labels, config, fits), config.min_size)
     return labels
 
 
@@ -238,14 +234,6 @@ def _by_column(vectors: Tensor) -> Tensor:
     return vectors.T.contiguous().T
 
 
-def _within_share(
-    cloud: GrowingCloud, config: GrowingConfig, share: float
-) -> tuple[GrowingCloud, GrowingConfig]:
-    """Return a cloud and settings whose limits of angle and distance are a share of those given."""
-    reach = None if cloud.reach is None else share * cloud.reach
-    return cloud._replace(reach=reach), replace(config, max_angle_deg=share * config.max_angle_deg)
-
-
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, those of equal size by their first point.
 
@@ -269,23 +257,24 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     return torch.from_numpy(ranks[found]).to(regions.device)
 
 
-def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
-    """Return the root of each point's region, by whichever way the settings allow.
+def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
+    """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
 
     The root of a region is the point it began with. Of a point that is not valid it is -1.
     """
     order, limit = growing_order(cloud.curvature, cloud.valid, config)
     valid = cloud.valid.cpu().numpy()
-    if not config.is_order_free:
+    if not is_order_free(config):
         edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
         indices = cloud.neighbors.indices.cpu().numpy()
-        return grow_first_in_first_out(edges, order, valid, claims, indices)
+        roots = grow_first_in_first_out(edges, order, valid, claims, indices)
+        return torch.from_numpy(roots).to(cloud.points.device)
     chain = chain_of(seeds_in_order(order, cloud.curvature, limit), len(valid))
     edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, more=chain)
     roots = first_to_reach(edges, len(valid))
     if may_grow_without_seeds(cloud.neighbors.indices.shape[1], config):
         roots = grow_rest(roots, others, order)
-    return roots
+    return torch.from_numpy(roots).to(cloud.points.device)
 
 
 def growing_order(

@@ -26,6 +26,8 @@ from torchrg.regions.edges import (
     GrowingCloud,
     find_coded_edges,
     find_edges,
+    is_order_free,
+    promotes_late,
 )
 from torchrg.regions.growth import (
     checked_cloud,
@@ -97,7 +99,7 @@ def sort_points(files: TileFiles, config: PipelineConfig, tile_size: int) -> Non
     rows = finite_rows(points)
     points = points[rows]
     k = max(min(config.normals.k, len(rows)), 1)
-    edge_bytes = 0 if config.growing.is_order_free else 5 * k
+    edge_bytes = 0 if is_order_free(config.growing) else 5 * k
     files.check_space(len(rows) * (_ROW_BYTES + 4 * k + edge_bytes))
     files.save("rows", rows)
     files.save("cloud", points)
@@ -187,13 +189,13 @@ def _estimate(files: TileFiles, tile: slice, number: int, config: PipelineConfig
 
 def _begin_edges(files: TileFiles, config: PipelineConfig) -> None:
     num_points, bounds = (files.known("order")[name] for name in ("num_points", "bounds"))
-    lists = ("edges", "sources", "targets") if config.growing.is_order_free else ("edges",)
+    lists = ("edges", "sources", "targets") if is_order_free(config.growing) else ("edges",)
     tiles = range(len(bounds) - 1)
     files.reserve(*(files.path(f"{name}_{number}").name for name in lists for number in tiles))
     files.create("counts", np.int32, (num_points,))
     files.create("components", np.int32, (num_points,))
     files.create("reach", np.float32, (num_points,))
-    if config.growing.promotes_late:
+    if promotes_late(config.growing):
         files.create("claims", np.bool_, (num_points, files.known("order")["k"]))
     _, limit = _growing_order(files, config)
     files.note("limit", value=float(limit))
@@ -222,7 +224,7 @@ def _connect(files: TileFiles, tile: slice, number: int, config: PipelineConfig)
     if cloud.reach is not None:
         files.write("reach", tile.start, cloud.reach[part.own])
     limit = torch.tensor(files.known("limit")["value"], dtype=cloud.curvature.dtype)
-    if not config.growing.is_order_free:
+    if not is_order_free(config.growing):
         coded, claims = find_coded_edges(cloud, config.growing, limit, chunk_size=config.chunk_size)
         if claims is not None:
             files.write("claims", tile.start, claims[part.own])
@@ -258,7 +260,7 @@ TILE_STAGES = {
 
 def grow_regions(files: TileFiles, config: PipelineConfig) -> None:
     """Grow the regions of the whole cloud along the edges of its tiles."""
-    grow = _grow_in_any_order if config.growing.is_order_free else _grow
+    grow = _grow_in_any_order if is_order_free(config.growing) else _grow
     files.save("heads", grow(files, config))
     files.remove(files.path("edges").name)
     files.note("growth")
@@ -288,7 +290,7 @@ def _grow(files: TileFiles, config: PipelineConfig) -> NDArray[np.int32]:
     starts = _join_edges(files)
     with released(files.path("edges")) as targets:
         edges = EdgeLists(starts, targets.numpy())
-        if not config.growing.promotes_late:
+        if not promotes_late(config.growing):
             return grow_first_in_first_out(edges, order, valid)
         with (
             released(files.path("claims")) as claims,
@@ -337,7 +339,7 @@ def tabulate_planes(files: TileFiles, config: PipelineConfig) -> None:
             files.load("normals"),
             files.load("labels"),
             neighbors=Neighbors(indices),
-            up=config.planes.up_direction,
+            up=config.planes.up,
             outline=config.planes.outline,
         )
     adjacency = None if planes.adjacency is None else tuple(planes.adjacency)
