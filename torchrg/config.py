@@ -98,8 +98,8 @@ class GrowingConfig:
     min_size: int = 50
     """Smaller regions are not labelled. With ``absorb`` the points at their borders count."""
     cut_bridges: bool = False
-    """Whether regions of several faces that a few doubtful points join are split: faces 12 degrees
-    apart, floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
+    """Whether regions of several faces that a few points join are split: faces 12 degrees apart,
+    floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
     max_plane_residual: float | None = None
     """After growth, points farther from the plane of their region than this many times its
     thickness lose their label. None: they keep it."""
