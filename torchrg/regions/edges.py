@@ -7,9 +7,9 @@ one that reads more also raises :data:`EDGE_STEPS`.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +23,6 @@ from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors, Rows
-
-Found = TypeVar("Found")
 
 EDGE_STEPS = 2
 """Steps from neighbour to neighbour, from a point, to all points that decide its edges. A part of a
@@ -105,16 +103,15 @@ def find_coded_edges(
     indices = cloud.neighbors.indices
     claims = np.empty(indices.shape, dtype=bool) if promotes_late(config) else None
 
-    def find(rows: slice) -> _Edges:
+    def find(rows: slice) -> list[_Edges]:
         joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
         becomes_seed = _become_seeds(cloud, config, rows, limit, connected)
         if claims is not None:
             claims[rows] = (joins & ~becomes_seed).cpu().numpy()
             joins &= becomes_seed
-        return _pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)
+        return [_pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)]
 
-    found = _in_chunks(find, cloud, chunk_size)
-    return _pack(found, cloud.neighbors.indices.numel()), claims
+    return _pack(find, cloud, None, chunk_size)[0], claims
 
 
 def find_edges(
@@ -133,21 +130,15 @@ def find_edges(
     shared = _shared_neighbors(cloud, config)
     is_seed = cloud.curvature <= limit
 
-    def find(rows: slice) -> tuple[_Edges, _Edges]:
+    def find(rows: slice) -> list[_Edges]:
         joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
         targets, seeds = cloud.neighbors.indices[rows], is_seed[rows, None]
         coded = targets.to(torch.int32) * 2
-        return _pick(targets, joins & seeds), _pick(coded, joins & ~seeds)
+        return [_pick(targets, joins & seeds), _pick(coded, joins & ~seeds)]
 
-    rest: list[_Edges] = []
-
-    def of_seeds() -> Iterator[_Edges]:
-        for edges, others in _in_chunks(find, cloud, chunk_size):
-            rest.append(others)
-            yield edges
-
-    edges = _pack(of_seeds(), cloud.neighbors.indices.numel(), more)
-    return edges, _pack(rest, sum(len(others.targets) for others in rest))
+    edges, rest = _pack(find, cloud, more, chunk_size)
+    targets, counts = zip(*rest, strict=True)
+    return edges, EdgeLists(np.concatenate([[0], *counts]).cumsum(), np.concatenate(targets))
 
 
 def _become_seeds(
@@ -229,31 +220,36 @@ def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
     return _Edges(chosen.cpu().numpy(), np.count_nonzero(accepted.cpu().numpy(), axis=1))
 
 
-def _in_chunks(
-    find: Callable[[slice], Found], cloud: GrowingCloud, chunk_size: int
-) -> Iterator[Found]:
-    """Yield what is found in successive chunks, on as many threads as torch uses."""
-    chunks = chunks_of(len(cloud.points), chunk_size)
-    at_once = _CHUNKS_A_THREAD * allowed_threads()
-    for first in range(0, len(chunks), at_once):
-        yield from map_tasks(find, chunks[first : first + at_once], cloud.points.device)
+def _pack(
+    find: Callable[[slice], list[_Edges]],
+    cloud: GrowingCloud,
+    more: EdgeLists | None,
+    chunk_size: int,
+) -> tuple[EdgeLists, list[_Edges]]:
+    """Join the first edges of successive chunks, and those of more nodes; collect what is left.
 
-
-def _pack(found: Iterable[_Edges], most: int, more: EdgeLists | None = None) -> EdgeLists:
-    """Join the edges of successive chunks, at most so many, and those of more nodes behind them."""
-    counts, used, spare = [], 0, 0 if more is None else len(more.targets)
+    The edges are found by as many threads as torch uses.
+    """
+    chunks, at_once = chunks_of(len(cloud.points), chunk_size), _CHUNKS_A_THREAD * allowed_threads()
+    spare = 0 if more is None else len(more.targets)
     # As long as it can get: memory that is not used is not touched.
-    targets = np.empty(most + spare, dtype=np.int32)
-    for edges in found:
+    targets = np.empty(cloud.neighbors.indices.numel() + spare, dtype=np.int32)
+    counts, rest, used = [], [], 0
+
+    def append(edges: _Edges) -> None:
+        nonlocal used
         targets[used : used + len(edges.targets)] = edges.targets
         used += len(edges.targets)
         counts.append(edges.counts)
+
+    for first in range(0, len(chunks), at_once):
+        for edges, *others in map_tasks(find, chunks[first : first + at_once], cloud.points.device):
+            append(edges)
+            rest += others
     if more is not None:
-        targets[used : used + spare] = more.targets
-        counts.append(np.diff(more.starts))
+        append(_Edges(more.targets, np.diff(more.starts)))
     dtype = np.int32 if len(targets) < 2**31 else np.int64
-    starts = np.concatenate([[0], *counts]).cumsum(dtype=dtype)
-    return EdgeLists(starts, targets[: used + spare])
+    return EdgeLists(np.concatenate([[0], *counts]).cumsum(dtype=dtype), targets[:used]), rest
 
 
 def are_valid(cloud: GrowingCloud, rows: Rows) -> Tensor:

@@ -77,9 +77,9 @@ def grow_regions(
             finite never join.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
             :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
-        colors: Colours of the points, shape ``(N, C)``. Default: they play no part.
+        colors: Colours of the points, shape ``(N, C)``.
         max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
-            unit of the colours) does not join.
+            unit of the colours) does not join. Default: colours play no part.
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0, so that the two
             faces of a thin wall never join. For normals that are oriented.
         canonical: Whether the points already are in canonical order; saves a copy.
@@ -91,8 +91,7 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If the settings ask for residuals, and there are none, or
-            ``max_color_distance`` is given without colours, or negative.
+        ConfigError: If residuals or colours are needed, and there are none.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -108,13 +107,8 @@ def grow_regions(
     config = GrowingConfig() if config is None else config
     cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
-    if colors is not None:
+    if max_color_distance < math.inf:
         cloud = _with_colors(cloud, colors, max_color_distance)
-    elif max_color_distance < math.inf:
-        raise ConfigError(
-            "grow_regions: expected colors, which max_color_distance needs, got None; pass them or "
-            "leave max_color_distance out."
-        )
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
@@ -200,13 +194,16 @@ def checked_cloud(
 
 
 def _with_colors(
-    cloud: GrowingCloud, colors: Tensor | NDArray[np.generic], max_distance: float
+    cloud: GrowingCloud, colors: Tensor | NDArray[np.generic] | None, max_distance: float
 ) -> GrowingCloud:
     """Return the cloud with colours, and how much they may differ."""
+    if colors is None or max_distance < 0:
+        raise ConfigError(
+            "grow_regions: expected colors and max_color_distance >= 0, got "
+            f"{max_distance!r} and {'no' if colors is None else 'some'} colors."
+        )
     colors = as_tensor("grow_regions", "colors", colors)
     check_shapes("grow_regions", points=(cloud.points, "N 3"), colors=(colors, "N C"))
-    if not max_distance >= 0:
-        raise ConfigError(f"grow_regions: expected max_color_distance >= 0, got {max_distance!r}.")
     colors = _by_column(colors.to(cloud.points.dtype))
     return cloud._replace(colors=colors, max_color_distance=max_distance)
 
@@ -215,14 +212,12 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
     """Return the cloud, and the rows its neighbours name, in an order ``(N,)`` of old rows."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    mask = cloud.neighbors.valid
+    neighbors = cloud.neighbors.at(order)
     return cloud._replace(
         points=_by_column(cloud.points[order]),
         normals=_by_column(cloud.normals[order]),
         curvature=cloud.curvature[order],
-        neighbors=Neighbors(
-            cloud.neighbors.of(row_of, order), None if mask is None else mask[order]
-        ),
+        neighbors=neighbors._replace(indices=neighbors.of(row_of)),
         valid=cloud.valid[order],
         reach=None if cloud.reach is None else cloud.reach[order],
         colors=None if cloud.colors is None else _by_column(cloud.colors[order]),

@@ -40,9 +40,6 @@ class Beside(Protocol):
     def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
         """Return those of the rows that have a new one beside them."""
 
-    def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of regions that touch ``(E, 2)``, and the contacts of each ``(E,)``."""
-
 
 def refine_regions(
     cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, fits: RegionFits | None = None
@@ -177,8 +174,10 @@ def merge_coplanar(
     face, or curved. Otherwise curved regions have no plane. What is merged is one region from then
     on.
 
-    ``contacts`` are those of :class:`Beside`. A region's distance to its own plane counts as at
-    least the floor of the planes. A merged region has the smallest label of its parts.
+    ``contacts`` are pairs of regions that touch ``(E, 2)``, and how many contacts each has, as
+    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. A region's distance to its
+    own plane counts as at least the floor of the planes. A merged region has the smallest label of
+    its parts.
     """
     pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
