@@ -9,12 +9,13 @@ if TYPE_CHECKING:
     from torchrg.neighbors import search_knn
     from torchrg.normals import estimate_normals
     from torchrg.pipeline import make_superpoints, segment_planes
-    from torchrg.regions import grow_regions
+    from torchrg.regions import align_axes, grow_regions
     from torchrg.structures import UNLABELED, Cloud
     from torchrg.tiling import segment_tiles
 else:
     _MODULES = {
         "UNLABELED": "structures",
+        "align_axes": "regions",
         "Cloud": "structures",
         "TorchrgError": "errors",
         "estimate_normals": "normals",
@@ -55,6 +56,7 @@ __all__ = [
     "UNLABELED",
     "Cloud",
     "TorchrgError",
+    "align_axes",
     "datasets",
     "depth",
     "estimate_normals",
