@@ -97,7 +97,7 @@ def find_coded_edges(
     With late promotion these are only the edges that do make a seed. Then there is a second result:
     which neighbours a point merely claims, shape ``(N, K)``; these are most edges, and lists of
     them would take more time and memory. ``limit`` is that of the curvature, a scalar. Chunks of
-    every size give the same edges.
+    every size, and parts of a cloud with :data:`EDGE_STEPS` around, give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
     indices = cloud.neighbors.indices
@@ -125,7 +125,8 @@ def find_edges(
     """Return the edges of points of at most the curvature limit, and those of all others.
 
     The first have the edges of ``more`` nodes behind them, the second are coded as
-    :func:`find_coded_edges` does. Chunks of every size give the same edges.
+    :func:`find_coded_edges` does. Chunks of every size, and parts of a cloud with
+    :data:`EDGE_STEPS` around, give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
     is_seed = cloud.curvature <= limit

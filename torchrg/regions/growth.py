@@ -123,8 +123,7 @@ def label_regions(
 ) -> Tensor:
     """Return labels of regions that have grown, after all that the settings ask for.
 
-    ``roots`` ``(N,)`` are what :func:`grow` gives. This step looks at the whole cloud: regions have
-    no bounded reach.
+    ``roots`` ``(N,)`` are what :func:`grow` gives. This needs the whole cloud, too.
     """
     least = config.min_size
     if config.absorb:
@@ -255,7 +254,8 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
 
-    The root of a region is the point it began with. Of a point that is not valid it is -1.
+    The root of a region is the point it began with. Of a point that is not valid it is -1. This
+    needs the edges of the whole cloud: regions have no bounded reach.
     """
     order, limit = growing_order(cloud.curvature, cloud.valid, config)
     valid = cloud.valid.cpu().numpy()
