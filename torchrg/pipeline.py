@@ -91,7 +91,7 @@ def segment_planes(
         fit.normals,
         labels,
         neighbors=neighbors,
-        up=config.planes.up_direction,
+        up=config.planes.up,
         outline=config.planes.outline,
     )
     begin("done")

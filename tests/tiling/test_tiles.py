@@ -18,7 +18,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.pipeline import segment_planes
-from torchrg.regions.growth import _grow, checked_cloud
+from torchrg.regions.growth import checked_cloud, grow
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 from torchrg.tiling import STAGES, TileFiles, TileTask, segment_tiles, stages
@@ -332,10 +332,8 @@ def test_the_points_around_a_tile_decide_its_edges(preset, tmp_path):
         segment(points.numpy(), tmp_path, config, 30, on_stage=stop)
     neighbors = search_knn(points, 12)
     fit = ESTIMATORS[config.normals.method](points, neighbors, config.normals, 4000)
-    cloud = checked_cloud(
-        config.growing, points, *fit[:2], neighbors, fit.valid, None, fit.residual_rms
-    )
-    heads = _grow(cloud, config.growing, 4000)
+    cloud = checked_cloud(config.growing, points, *fit[:2], neighbors, fit.valid, fit.residual_rms)
+    heads = grow(cloud, config.growing, 4000)
     assert len(np.unique(heads)) > 20
     np.testing.assert_array_equal(TileFiles(tmp_path).load("heads"), heads)
     if cloud.reach is not None:

@@ -12,8 +12,8 @@ from torch.nn import functional
 from torchrg.linalg.moments import Segments
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
-from torchrg.regions.measures import Rectangles, covered_areas, trace_outline
-from torchrg.regions.planes import classify_planes
+from torchrg.regions.outline import trace_outline
+from torchrg.regions.table import Rectangles, classify_planes, covered_areas
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import find_outer_surfaces
 from torchrg.render.grid import build_grid, local_spacing, surface_cells

@@ -21,15 +21,23 @@ from torchrg.io.files import check_space
 from torchrg.neighbors import finite_rows, restore_rows
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.regions import summarize_planes
-from torchrg.regions.edges import EdgeLists, GrowingCloud, find_coded_edges, find_edges
+from torchrg.regions.edges import (
+    EDGE_STEPS,
+    EdgeLists,
+    GrowingCloud,
+    find_coded_edges,
+    find_edges,
+    is_order_free,
+    promotes_late,
+)
 from torchrg.regions.growth import (
     checked_cloud,
     grow_first_in_first_out,
     grow_rest,
     growing_order,
-    leaves_enough,
-    settle_regions,
-    spreading,
+    label_regions,
+    may_grow_without_seeds,
+    seeds_in_order,
 )
 from torchrg.structures import (
     UNLABELED,
@@ -44,9 +52,6 @@ from torchrg.tiling.files import TileFiles, Written, reading, released
 from torchrg.tiling.growth import Condensed, condense, join_condensed
 from torchrg.tiling.neighbors import search_tile
 from torchrg.tiling.parts import Part, cut_part
-
-_GROWTH_STEPS = 2
-"""Steps from neighbour to neighbour that decide an edge: the neighbours of both of its ends."""
 
 _ROW_BYTES = 150
 """Of a point on disk beside its neighbours and edges: coordinates, normals, results."""
@@ -95,7 +100,7 @@ def sort_points(files: TileFiles, config: PipelineConfig, tile_size: int) -> Non
     rows = finite_rows(points)
     points = points[rows]
     k = max(min(config.normals.k, len(rows)), 1)
-    edge_bytes = 0 if config.growing.is_order_free else 5 * k
+    edge_bytes = 0 if is_order_free(config.growing) else 5 * k
     check_space(files.folder, len(rows) * (_ROW_BYTES + 4 * k + edge_bytes), "the work")
     files.save("rows", rows)
     files.save("cloud", points)
@@ -185,13 +190,13 @@ def _estimate(files: TileFiles, tile: slice, number: int, config: PipelineConfig
 
 def _begin_edges(files: TileFiles, config: PipelineConfig) -> None:
     num_points, bounds = (files.known("order")[name] for name in ("num_points", "bounds"))
-    lists = ("edges", "sources", "targets") if config.growing.is_order_free else ("edges",)
+    lists = ("edges", "sources", "targets") if is_order_free(config.growing) else ("edges",)
     tiles = range(len(bounds) - 1)
     files.reserve(*(files.path(f"{name}_{number}").name for name in lists for number in tiles))
     files.create("counts", np.int32, (num_points,))
     files.create("components", np.int32, (num_points,))
     files.create("reach", np.float32, (num_points,))
-    if config.growing.promotes_late:
+    if promotes_late(config.growing):
         files.create("claims", np.bool_, (num_points, files.known("order")["k"]))
     _, limit = _growing_order(files, config)
     files.note("limit", value=float(limit))
@@ -209,18 +214,18 @@ def _growing_points(files: TileFiles) -> Tensor:
 
 
 def _connect(files: TileFiles, tile: slice, number: int, config: PipelineConfig) -> None:
-    part = cut_part(files.map("neighbors"), tile, _GROWTH_STEPS)
+    part = cut_part(files.map("neighbors"), tile, EDGE_STEPS)
     points, normals, curvature, valid, residual_rms = (
         files.map(name)[part.rows]
         for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
     )
     cloud = checked_cloud(
-        config.growing, points, normals, curvature, part.neighbors, valid, None, residual_rms
+        config.growing, points, normals, curvature, part.neighbors, valid, residual_rms
     )
     if cloud.reach is not None:
         files.write("reach", tile.start, cloud.reach[part.own])
     limit = torch.tensor(files.known("limit")["value"], dtype=cloud.curvature.dtype)
-    if not config.growing.is_order_free:
+    if not is_order_free(config.growing):
         coded, claims = find_coded_edges(cloud, config.growing, limit, chunk_size=config.chunk_size)
         if claims is not None:
             files.write("claims", tile.start, claims[part.own])
@@ -228,7 +233,7 @@ def _connect(files: TileFiles, tile: slice, number: int, config: PipelineConfig)
         files.save(f"edges_{number}", edges.targets)
         files.write("counts", tile.start, np.diff(edges.starts))
         return
-    found, others = find_edges(cloud, config.growing, limit, spare=0, chunk_size=config.chunk_size)
+    found, others = find_edges(cloud, config.growing, limit, chunk_size=config.chunk_size)
     condensed = condense(found, part)
     files.write("components", tile.start, condensed.components)
     files.save(f"sources_{number}", condensed.sources)
@@ -256,7 +261,7 @@ TILE_STAGES = {
 
 def grow_regions(files: TileFiles, config: PipelineConfig) -> None:
     """Grow the regions of the whole cloud along the edges of its tiles."""
-    grow = _grow_in_any_order if config.growing.is_order_free else _grow
+    grow = _grow_in_any_order if is_order_free(config.growing) else _grow
     files.save("heads", grow(files, config))
     files.remove(files.path("edges").name)
     files.note("growth")
@@ -273,7 +278,7 @@ def finish_regions(files: TileFiles, config: PipelineConfig) -> None:
             _growing_points(files),
             reach=None if config.growing.plane_reach is None else files.load("reach"),
         )
-        labels = settle_regions(cloud, files.load("heads"), config.growing, config.chunk_size)
+        labels = label_regions(cloud, files.load("heads"), config.growing, config.chunk_size)
     files.save("labels", labels)
     files.note("regions")
 
@@ -286,7 +291,7 @@ def _grow(files: TileFiles, config: PipelineConfig) -> NDArray[np.int32]:
     starts = _join_edges(files)
     with released(files.path("edges")) as targets:
         edges = EdgeLists(starts, targets.numpy())
-        if not config.growing.promotes_late:
+        if not promotes_late(config.growing):
             return grow_first_in_first_out(edges, order, valid)
         with (
             released(files.path("claims")) as claims,
@@ -308,8 +313,8 @@ def _grow_in_any_order(files: TileFiles, config: PipelineConfig) -> NDArray[np.i
         )
         for number in range(len(bounds) - 1)
     ]
-    heads = join_condensed(parts, spreading(order, files.load("curvature"), limit))
-    if leaves_enough(files.known("order")["k"], config.growing):
+    heads = join_condensed(parts, seeds_in_order(order, files.load("curvature"), limit))
+    if may_grow_without_seeds(files.known("order")["k"], config.growing):
         starts = _join_edges(files)
         heads = grow_rest(heads, EdgeLists(starts, files.load("edges").numpy()), order)
     return heads
@@ -335,7 +340,7 @@ def tabulate_planes(files: TileFiles, config: PipelineConfig) -> None:
             files.load("normals"),
             files.load("labels"),
             neighbors=Neighbors(indices),
-            up=config.planes.up_direction,
+            up=config.planes.up,
             outline=config.planes.outline,
         )
     adjacency = None if planes.adjacency is None else tuple(planes.adjacency)

@@ -108,7 +108,7 @@ def segment_voxels(
     normals, curvature, sharp, valid = (
         restore_points(values, voxels.inverse) for values in seg[1:5]
     )
-    rows, up, outline = finite_rows(tensor), config.planes.up_direction, config.planes.outline
+    rows, up, outline = finite_rows(tensor), config.planes.up, config.planes.outline
     ordered = (values.index_select(0, rows) for values in (tensor, normals, labels))
     planes = summarize_planes(*ordered, up=up, outline=outline)
     planes = planes._replace(adjacency=_renumbered(seg.planes.adjacency, place))
