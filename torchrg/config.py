@@ -203,6 +203,10 @@ class SuperpointsConfig:
     """Strength of regularisation of each level, ascending: a region merges with one beside it when
     that costs at most this, in points of opposite sides of a right angle. Twice the strength leaves
     about 0.6 times the superpoints."""
+    counts: tuple[int, ...] | None = None
+    """Number of superpoints of each level, descending, in place of strengths: it is met where at
+    least so many connected parts of ``min_size`` points can be had and at most so many parts of
+    the cloud do not touch. None: strengths decide."""
     min_size: int = 10
     """Smaller superpoints join the neighbour that it costs least, in distinct points."""
     planes: Literal["pieces", "whole"] = "pieces"
@@ -211,7 +215,7 @@ class SuperpointsConfig:
     max_extent: float | None = None
     """Longest side of the box around a superpoint, in the unit of the cloud; whole planes may have
     longer ones. None: no limit."""
-    color_weight: float = 1.0
+    color_weight: float = 3.0
     """What a squared difference of colours in [0, 1] counts, against one of unit normals."""
 
     def __post_init__(self) -> None:
