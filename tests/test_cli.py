@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from torchrg.cli import COMMANDS, main
-from torchrg.io import read_cloud
+from torchrg.errors import FormatError
+from torchrg.io import read_cloud, write_cloud
+from torchrg.structures import Cloud
 
 
 @pytest.fixture(scope="module")
@@ -290,6 +292,160 @@ def test_info_says_where_a_cloud_far_away_is(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "lowest      500000.125 4000000.25 1" in shown
     assert "extent      1.25 0.25 1" in shown
+
+
+@pytest.fixture
+def leica(room, tmp_path):
+    """Points, intensity, colour and no names, and what the colours are."""
+    cloud = read_cloud(room)
+    rng = np.random.default_rng(0)
+    values = rng.integers(0, 256, (len(cloud), 4))
+    path = tmp_path / "leica.txt"
+    np.savetxt(path, np.hstack([cloud.coordinates, values]), fmt="%.9g")
+    return path, values
+
+
+NAMES = ["--columns", "x,y,z,intensity,r,g,b"]
+
+
+def test_columns_are_named_by_a_rule_that_is_shown_or_by_a_flag(leica, tmp_path, capsys):
+    path, values = leica
+    taken = "its columns have no names and are taken as x y z column_4 column_5 column_6 column_7"
+    assert main(["info", str(path)]) == 0
+    assert f"note        {taken}; if they are others, name them with --columns" in (
+        capsys.readouterr().out
+    )
+    assert main(["info", str(path), *NAMES]) == 0
+    shown = capsys.readouterr().out
+    assert "note" not in shown
+    assert "color       3 uint8" in shown
+    for command in (["segment", "--preset", "classic"], ["normals", "--method", "pca"]):
+        out = tmp_path / "out.ply"
+        assert main([*command, str(path), "--out", str(out)]) == 0
+        assert taken in error_line(capsys)
+        assert "color" not in read_cloud(out).fields
+        assert main([*command, str(path), "--out", str(out), *NAMES]) == 0
+        assert capsys.readouterr().err == ""
+        found = read_cloud(out).fields
+        np.testing.assert_array_equal(found["color"], values[:, 1:])
+        np.testing.assert_array_equal(found["intensity"], values[:, 0])
+
+
+def test_names_of_columns_are_part_of_the_work_in_tiles(tmp_path, monkeypatch, capsys):
+    rng = np.random.default_rng(0)
+    flat = np.hstack([rng.random((40_000, 2)), np.zeros((40_000, 1))])
+    np.save(tmp_path / "a.npy", np.hstack([flat, rng.random((40_000, 1))]))
+    write_cloud(tmp_path / "b.ply", Cloud(flat[:100] + np.eye(3)[2], {"d": flat[:100, 0]}))
+    inputs = [str(tmp_path / "a.npy"), str(tmp_path / "b.ply"), "--merge", "--preset", "classic"]
+    out = ["--out", str(tmp_path / "r.npz"), "--limit-memory", "0.542"]
+
+    def stop(*_, **__):
+        raise FormatError("stopped.")
+
+    monkeypatch.setattr("torchrg.cli.segment.write_cloud", stop)
+    assert main(["segment", *inputs, *out, "--columns", "x,z,d,y"]) == 2
+    monkeypatch.undo()
+    capsys.readouterr()
+    # What other names left behind is not gone on with.
+    (work,) = tmp_path.glob(".r*.tiles")
+    assert main(["segment", *inputs, *out, "--columns", "x,y,z,d"]) == 2
+    assert "holds the work of another cloud, of other settings" in error_line(capsys)
+    shutil.rmtree(work)
+    assert main(["segment", *inputs, *out, "--columns", "x,y,z,d"]) == 0
+    shown = capsys.readouterr()
+    assert "in tiles of" in shown.out
+    assert "(without its own d)" in shown.out
+    assert shown.err == ""
+    with np.load(tmp_path / "r.npz") as result:
+        np.testing.assert_array_equal(result["points"][:40_000], flat)
+        assert (result["labels"][:40_000] == 0).mean() > 0.9
+        assert json.loads(str(result["provenance"]))["columns"] == "x,y,z,d"
+
+
+def test_commands_that_read_truth_or_draw_take_names_too(leica, tmp_path, capsys):
+    path, _ = leica
+    assert main(["score", str(path), str(path), "--columns", "x,y,z,label,_,_,_"]) == 0
+    assert "f1" in capsys.readouterr().out
+    assert main(["score", str(path), str(path)]) == 2
+    assert "shares neither labels nor normals" in capsys.readouterr().err
+    view = ["view", str(path), "--out", str(tmp_path / "a.png"), "--width", "99", *NAMES]
+    assert main([*view, "--color", "color"]) == 0
+    (tmp_path / "in").mkdir()
+    shutil.copy(path, tmp_path / "in")
+    convert = ["convert", "folder", str(tmp_path / "in"), str(tmp_path / "out")]
+    convert += ["--preset", "classic", "--workers", "1"]
+    assert main(convert) == 0
+    assert "leica: its columns have no names and are taken as x y z column_4" in (
+        capsys.readouterr().out
+    )
+    assert not (tmp_path / "out" / "leica" / "color.npy").exists()
+    # Other names are other results.
+    assert main([*convert, *NAMES]) == 0
+    assert "leica: left out: intensity" in capsys.readouterr().out
+    assert (tmp_path / "out" / "leica" / "color.npy").exists()
+
+
+def test_names_for_files_that_have_their_own_are_wrong_use(room, tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    shutil.copy(room, tmp_path / "in")
+    for command in (
+        ["info", str(room)],
+        ["segment", str(room), "--out", str(tmp_path / "a.ply")],
+        ["normals", str(room), "--out", str(tmp_path / "a.ply")],
+        ["convert", "folder", str(tmp_path / "in"), str(tmp_path / "out")],
+    ):
+        assert main([*command, "--columns", "x,y,z"]) == 2
+        assert "expected text or .npy for --columns, got files that name" in error_line(capsys)
+
+
+def test_what_gives_way_to_a_result_is_told(room, tmp_path, capsys):
+    out = tmp_path / "a.ply"
+    command = ["--preset", "classic", "--out"]
+    assert main(["segment", str(room), *command, str(out)]) == 0
+    names = "label as label_input, normals as normals_input"
+    assert f"its own fields are kept beside the result's: {names}" in error_line(capsys)
+    expected, found = read_cloud(room).fields, read_cloud(out).fields
+    np.testing.assert_array_equal(found["label_input"], expected["labels"])
+    np.testing.assert_array_equal(found["normals_input"], expected["normals"])
+    # Archives hold the result alone, which the line about it says.
+    assert main(["segment", str(room), *command, str(tmp_path / "a.npz")]) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert shown.out.endswith("a.npz (without its own labels, normals)\n")
+
+
+def test_codes_for_missing_points_are_no_points(room, tmp_path, capsys):
+    far = read_cloud(room).coordinates.astype(np.float64) + np.array([5e5, 5.4e6, 300])
+    np.save(tmp_path / "whole.npy", far)
+    far[5], far[[9, 11], 2] = 1e30, (-3.4028235e38, 1e200)
+    np.save(tmp_path / "codes.npy", far)
+    labels = []
+    for name in ("whole", "codes"):
+        out = tmp_path / f"{name}.npz"
+        command = ["segment", str(tmp_path / f"{name}.npy"), "--out", str(out)]
+        assert main([*command, "--preset", "classic"]) == 0
+        with np.load(out) as result:
+            labels.append(result["labels"])
+    told = "3 of 6,000 points are not finite or beyond 1e+12; they stay in place, unlabelled"
+    assert told in error_line(capsys)
+    assert labels[1][[5, 9, 11]].tolist() == [-1, -1, -1]
+    assert (labels[1] != labels[0]).sum() < 60
+    assert labels[1].max() == labels[0].max() >= 3
+    np.save(tmp_path / "huge.npy", far * 1e20)
+    assert main(["segment", str(tmp_path / "huge.npy"), "--out", str(tmp_path / "a.npz")]) == 2
+    line = error_line(capsys)
+    assert "huge.npy: expected finite points, got none in 6,000 points; those beyond 1e+12" in line
+
+
+def test_single_points_far_off_that_cost_precision_are_told(room, tmp_path, capsys):
+    far = read_cloud(room).coordinates.astype(np.float64) + np.array([5e5, 5.4e6, 300])
+    far[5] = 0
+    np.save(tmp_path / "zero.npy", far)
+    command = ["segment", str(tmp_path / "zero.npy"), "--out", str(tmp_path / "a.npz")]
+    assert main([*command, "--preset", "classic"]) == 0
+    first, second = capsys.readouterr().err.splitlines()
+    assert "zero.npy: half of its points lie within " in first
+    assert "no plane found" in second
 
 
 def test_info_says_what_a_file_holds(room, capsys):

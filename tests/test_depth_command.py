@@ -182,11 +182,13 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, sequence, fra
 
 
 def test_what_a_killed_process_was_writing_goes_and_nothing_else(tmp_path):
-    for name in (".1.0123abcd.png", ".1_planes.0123abcd.png", ".2.0123abcd.png", "1.png"):
-        (tmp_path / name).touch()
     scan = Scan("1", (tmp_path / "1.npy",), 0)
-    Frame(scan, tmp_path / "1.png", tmp_path / "1_planes.png", None).remove_leftovers()
-    assert sorted(contents(tmp_path)) == [".2.0123abcd.png", "1.png"]
+    frame = Frame(scan, tmp_path / "1.png", tmp_path / "1_planes.png", None)
+    theirs = (".1.0123abcd.png", ".1.0123456789abcdef01234567.png", "1.png", "1_planes.png")
+    for name in (*theirs, f".1.{frame.mark}01234567.png", f".1_planes.{frame.mark}01234567.png"):
+        (tmp_path / name).touch()
+    frame.remove_leftovers()
+    assert sorted(contents(tmp_path)) == sorted(theirs)
 
 
 def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):

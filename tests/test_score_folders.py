@@ -14,12 +14,13 @@ NAMES = ("scan10", "scan9", "hall/scan1")
 
 @pytest.fixture
 def folders(tmp_path):
-    """Two folders of scans with labels; two of the three have normals too."""
+    """Two folders of scans of the same points with labels; two of the three have normals too."""
     rng = np.random.default_rng(0)
+    points = [rng.normal(size=(60 + n, 3)).astype(np.float32) for n in range(len(NAMES))]
     for kind, suffix in (("ours", ".npz"), ("truth", ".ply")):
         for number, name in enumerate(NAMES):
             arrays = {
-                "points": rng.normal(size=(60 + number, 3)).astype(np.float32),
+                "points": points[number],
                 "labels": rng.integers(0, 4, 60 + number),
             }
             if name != "scan9":
@@ -133,7 +134,7 @@ def test_mistakes_are_one_line(folders, tmp_path, capsys):
     assert run_score(ours, truth) == 0
     (truth / "scan9.pcd").touch()
     cases = {
-        (ours, tmp_path / "empty"): "empty: expected scans",
+        (ours, tmp_path / "empty"): "empty: expected files that end in one of",
         (ours, truth / "scan9.npz"): "scan9.npz: expected a folder",
         (truth / "scan9.npz", ours): "scan9.npz: expected a folder",
         (ours, truth): "got scan9.npz and scan9.pcd",

@@ -1,15 +1,53 @@
 """Robust normals, curvature and plane labels for indoor point clouds."""
 
-from torchrg import datasets, depth, metrics, nn, normals, robust, scenes, transforms
-from torchrg.config import load_config
-from torchrg.errors import TorchrgError
-from torchrg.io import read_cloud, write_cloud
-from torchrg.neighbors import search_knn
-from torchrg.normals import estimate_normals
-from torchrg.pipeline import make_superpoints, segment_planes
-from torchrg.regions import grow_regions
-from torchrg.structures import UNLABELED, Cloud
-from torchrg.tiling import segment_tiles
+TYPE_CHECKING = False  # As that of typing, without loading it.
+if TYPE_CHECKING:
+    from torchrg import datasets, depth, metrics, nn, normals, robust, scenes, transforms
+    from torchrg.config import load_config
+    from torchrg.errors import TorchrgError
+    from torchrg.io import read_cloud, write_cloud
+    from torchrg.neighbors import search_knn
+    from torchrg.normals import estimate_normals
+    from torchrg.pipeline import make_superpoints, segment_planes
+    from torchrg.regions import grow_regions
+    from torchrg.structures import UNLABELED, Cloud
+    from torchrg.tiling import segment_tiles
+else:
+    _MODULES = {
+        "UNLABELED": "structures",
+        "Cloud": "structures",
+        "TorchrgError": "errors",
+        "estimate_normals": "normals",
+        "grow_regions": "regions",
+        "load_config": "config",
+        "make_superpoints": "pipeline",
+        "read_cloud": "io",
+        "search_knn": "neighbors",
+        "segment_planes": "pipeline",
+        "segment_tiles": "tiling",
+        "write_cloud": "io",
+    }
+
+    def __getattr__(name):  # noqa: ANN001, ANN202
+        """Load a name or module when it is asked for: a command starts before torch is loaded."""
+        from importlib import import_module
+
+        place = f"torchrg.{_MODULES.get(name, name)}"
+        try:
+            module = import_module(place) if not name.startswith("_") else None
+        except ModuleNotFoundError as error:
+            if error.name != place:
+                raise
+            module = None
+        if module is None:
+            raise AttributeError(f"module 'torchrg' has no attribute {name!r}")
+        globals()[name] = getattr(module, name) if name in _MODULES else module
+        return globals()[name]
+
+    def __dir__():  # noqa: ANN202
+        """Return what is there, loaded or not."""
+        return sorted({*globals(), *__all__})
+
 
 __version__ = "0.1.0"
 

@@ -14,6 +14,9 @@ from torch import Tensor
 
 UNLABELED = -1
 """Label of a point that belongs to no region."""
+FARTHEST = 1e12
+"""Largest coordinate of a point: what programs write for a missing one, 1e20, 1e30 or the largest
+float32, is beyond, and a room in any unit is not. Squares of these are far from float32's end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +32,9 @@ class Cloud:
         source: The file it came from, for messages.
         header: What the file says about the cloud as a whole, so that it can be written again:
             ``viewpoint`` of a PCD file (seven numbers, position and quaternion w x y z), ``las``
-            (the header of a LAS file), ``scans`` of an E57 file.
+            (the header of a LAS file), ``scans`` and ``coordinate_metadata`` of an E57 file.
+        notes: What reading took for granted or left out, a line each without a full stop, for
+            people.
 
     Example:
         >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
@@ -42,14 +47,19 @@ class Cloud:
     grid_shape: tuple[int, int] | None = None
     source: str = ""
     header: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.coordinates)
 
     @cached_property
     def finite(self) -> NDArray[np.bool_]:
-        """Which points have three finite coordinates, shape ``(N,)``."""
-        finite: NDArray[np.bool_] = np.isfinite(self.coordinates).all(axis=1)
+        """Which points have three finite coordinates, none beyond 1e12, shape ``(N,)``.
+
+        Those beyond are codes for a missing point.
+        """
+        with np.errstate(invalid="ignore"):
+            finite: NDArray[np.bool_] = (np.abs(self.coordinates) <= FARTHEST).all(axis=1)
         return finite
 
     @cached_property
@@ -62,14 +72,20 @@ class Cloud:
 
     @cached_property
     def points(self) -> Tensor:
-        """Coordinates about :attr:`origin`, shape ``(N, 3)``, float32; non-finite rows stay so."""
+        """Coordinates about :attr:`origin`, shape ``(N, 3)``, float32.
+
+        Rows that are not :attr:`finite` are not finite here either.
+        """
         return self.about(self.origin)
 
     def about(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates about an origin of shape ``(3,)``, float32, shape ``(N, 3)``."""
-        if self.coordinates.dtype == np.float32 and not origin.any():
-            return torch.from_numpy(np.ascontiguousarray(self.coordinates))
-        return torch.from_numpy((self.coordinates - origin).astype(np.float32))
+        coordinates = self.coordinates
+        if not self.finite.all() and (is_code := np.abs(coordinates) > FARTHEST).any():
+            coordinates = np.where(is_code, coordinates.dtype.type(np.nan), coordinates)
+        if coordinates.dtype == np.float32 and not origin.any():
+            return torch.from_numpy(np.ascontiguousarray(coordinates))
+        return torch.from_numpy((coordinates - origin).astype(np.float32))
 
 
 def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:

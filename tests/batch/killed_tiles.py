@@ -26,9 +26,10 @@ def main(path, folder, writes):
         write(files, *given)
 
     def noted_run(task):
-        run(task)
+        written = run(task)
         with Path(f"{folder}.log").open("a") as log:
             log.write(f"{task.name}\n")
+        return written
 
     TileFiles.write, TileTask.run = counted_write, noted_run
     points = np.load(path)

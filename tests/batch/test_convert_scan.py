@@ -1,11 +1,18 @@
 """Converting one scan: what goes wrong is in the report, and files are whole or not there."""
 
+import dataclasses
+import hashlib
 import json
 
+import numpy as np
 import pytest
 
 from torchrg.batch.convert import convert_scan
 from torchrg.batch.records import RECORD, reason_to_convert
+from torchrg.batch.run import list_jobs
+from torchrg.batch.sources import FolderSource
+from torchrg.config import load_config
+from torchrg.scenes import make_room
 
 
 def test_the_record_tells_what_was_made_from_what(faults, tmp_path):
@@ -62,10 +69,76 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
     convert_scan(job)
     record = json.loads((job.folder / RECORD).read_text())
-    record["outputs"]["superpoint.npy"] = {"bytes": 0, "sha256": ""}
+    nothing = {"bytes": 0, "sha256": hashlib.sha256().hexdigest()}
+    earlier = ("superpoint.npy", "edited.npy", "../../elsewhere.npy")
+    record["outputs"] |= dict.fromkeys(earlier, nothing)
     (job.folder / RECORD).write_text(json.dumps(record))
-    for name in ("superpoint.npy", ".result.0123abcd.txt", "theirs.npy"):
+    unfinished = f".result.{job.mark}01234567.txt"
+    for name in (*earlier, unfinished, "theirs.npy", ".result.0123abcd.txt"):
         (job.folder / name).touch()
+    (job.folder / "edited.npy").write_text("by the user since")
     convert_scan(job)
     names = {path.name for path in job.folder.iterdir()}
-    assert names == {"result.txt", RECORD, "theirs.npy"}
+    assert names == {"result.txt", RECORD, "theirs.npy", "edited.npy", ".result.0123abcd.txt"}
+    assert (tmp_path / "elsewhere.npy").exists()
+
+
+def save_room(tmp_path, **settings):
+    """Return a job for a small room whose results go to ``out/room``."""
+    (tmp_path / "in").mkdir()
+    np.save(tmp_path / "in" / "room.npy", make_room(num_points=500, seed=1).points)
+    source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path / "out", **settings)
+    (job,) = list_jobs(source, tmp_path / "out")
+    return job
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("coord.npy", b"points of a user"),
+        ("plane.npy", b""),
+        ("planes.json", b'{"planes": 3}'),
+        ("provenance.json", b'{"outputs": {"coord.npy": {}}}'),
+        ("provenance.json", b'["of another program"]'),
+    ],
+)
+def test_files_of_others_are_never_replaced(tmp_path, name, content):
+    job = save_room(tmp_path)
+    job.folder.mkdir(parents=True)
+    (job.folder / name).write_bytes(content)
+    report = convert_scan(job)
+    assert report.status == "failed"
+    assert report.reason.startswith(f"{job.folder / name}: ")
+    assert "move it away" in report.reason
+    assert {path.name: path.read_bytes() for path in job.folder.iterdir()} == {name: content}
+
+
+def test_results_are_replaced_by_those_of_other_settings_and_no_others(tmp_path):
+    job = save_room(tmp_path, superpoint=True)
+    assert convert_scan(job).status == "converted"
+    (job.folder / "notes.npy").write_bytes(b"of a user")
+    other = dataclasses.replace(job, source=dataclasses.replace(job.source, superpoint=False))
+    assert convert_scan(other).status == "converted"
+    assert sorted(path.name for path in job.folder.iterdir()) == [
+        "coord.npy",
+        "curvature.npy",
+        "normal.npy",
+        "notes.npy",
+        "plane.npy",
+        "planes.json",
+        "provenance.json",
+    ]
+    # Killed after the old record went and before the new one came.
+    (job.folder / "provenance.json").unlink()
+    assert convert_scan(job).status == "converted"
+    assert (job.folder / "superpoint.npy").exists()
+
+
+def test_a_folder_that_was_there_stays(tmp_path):
+    job = save_room(tmp_path)
+    (tmp_path / "in" / "room.npy").write_bytes(b"damaged")
+    assert convert_scan(job).status == "failed"
+    assert not job.folder.exists()
+    job.folder.mkdir(parents=True)
+    assert convert_scan(job).status == "failed"
+    assert job.folder.is_dir()

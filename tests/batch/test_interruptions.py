@@ -1,5 +1,6 @@
 """The whole command is stopped at any moment: no partial file, and the next run finishes."""
 
+import contextlib
 import os
 import random
 import signal
@@ -10,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+from tests.datasets.s3dis_tree import write_clean_room
 from torchrg.batch.convert import convert_scan
 from torchrg.batch.run import list_jobs
 from torchrg.batch.sources import FolderSource
@@ -53,9 +55,9 @@ def convert_here(rooms, out):
     return results_of(out)
 
 
-def start(rooms, out, workers=1):
+def start(rooms, out, workers=1, kind="folder"):
     """Start the command in a process group of its own."""
-    command = [sys.executable, "-m", "torchrg", "convert", "folder", str(rooms), str(out)]
+    command = [sys.executable, "-m", "torchrg", "convert", kind, str(rooms), str(out)]
     return subprocess.Popen(
         [*command, "--preset", "classic", "--workers", str(workers)],
         stdout=subprocess.PIPE,
@@ -92,48 +94,73 @@ def check_whole(out, undisturbed):
         assert content == undisturbed[name], name
 
 
-def check_finishes(rooms, out, undisturbed):
-    """Run the command to its end and compare."""
-    process = start(rooms, out)
+def finish(process):
+    """Let a command end, which it does well."""
     shown, told = process.communicate()
     assert process.returncode == 0, told
-    assert results_of(out) == undisturbed
-    assert not list(out.rglob(".*.np?"))
     assert "4 of 4 scans are complete" in shown
 
 
-def kill_and_go_on(rooms, out, undisturbed, moments, *, whole_group, workers=1):
-    """Kill the command when it has written so many files, again and again, then let it finish."""
-    for count in moments:
-        process = start(rooms, out, workers)
-        wait_for_files(out, process, count)
-        if whole_group:
-            os.killpg(process.pid, signal.SIGKILL)
-        else:
-            process.send_signal(signal.SIGKILL)
-        process.communicate()
-        check_whole(out, undisturbed)
-    check_finishes(rooms, out, undisturbed)
+def check_finishes(rooms, out, undisturbed, kind="folder"):
+    """Run the command to its end and compare."""
+    finish(start(rooms, out, kind=kind))
+    assert results_of(out) == undisturbed
+    assert not list(out.rglob(".*.np?"))
 
 
 def test_a_killed_command_goes_on_where_it_was(rooms, undisturbed, tmp_path):
-    # Its workers are left to themselves, as when the kernel picks the process.
-    kill_and_go_on(rooms, tmp_path, undisturbed, [9], whole_group=False)
+    process = start(rooms, tmp_path)
+    wait_for_files(tmp_path, process, 9)
+    process.kill()
+    process.communicate()
+    check_whole(tmp_path, undisturbed)
+    check_finishes(rooms, tmp_path, undisturbed)
+
+
+KILLS = 50
+"""Of each kind of data set."""
+
+
+@pytest.fixture
+def rooms_of_s3dis(tmp_path):
+    """An area of small rooms as S3DIS is released."""
+    for seed, name in enumerate(NAMES):
+        objects = {"wall_1": 900 + 300 * seed, "floor_1": 600, "chair_1": 200}
+        write_clean_room(tmp_path / "in" / "Area_1" / f"{name}_1", seed, objects)
+    return tmp_path / "in"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("whole_group", [True, False])
-def test_ten_kills_at_random_moments_change_nothing(rooms, undisturbed, tmp_path, whole_group):
-    moments = random.Random(int(whole_group)).choices(range(2, 26), k=10)
-    kill_and_go_on(rooms, tmp_path, undisturbed, moments, whole_group=whole_group, workers=2)
-    for seed in range(10):
-        out = tmp_path / f"by_time_{seed}"
-        process = start(rooms, out, workers=2)
-        time.sleep(random.Random(seed).uniform(0, 8))
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        check_whole(out, undisturbed)
-    check_finishes(rooms, out, undisturbed)
+@pytest.mark.parametrize("kind", ["folder", "s3dis"])
+def test_kills_at_random_moments_change_no_byte(rooms, rooms_of_s3dis, tmp_path, kind):
+    if kind == "s3dis":
+        pytest.importorskip("pyarrow")
+    root, chance = {"folder": rooms, "s3dis": rooms_of_s3dis}[kind], random.Random(kind)
+    begin = time.monotonic()
+    finish(start(root, tmp_path / "undisturbed", workers=2, kind=kind))
+    seconds = time.monotonic() - begin
+    undisturbed, kills, round_number = results_of(tmp_path / "undisturbed"), 0, 0
+    while kills < KILLS:
+        out = tmp_path / f"round_{round_number}"
+        round_number += 1
+        is_done = False
+        while not is_done and kills < KILLS:
+            process = start(root, out, workers=2, kind=kind)
+            if chance.random() < 0.5:
+                time.sleep(chance.uniform(0, seconds))
+            else:
+                # A file more or less than now, finished or not, and a moment within its writing.
+                count = sum(path.is_file() for path in out.rglob("*"))
+                wait_for_files(out, process, count + chance.randint(1, 8))
+                time.sleep(chance.choice([0, 0.002, 0.02, 0.1]))
+            is_done = process.poll() is not None
+            # Sometimes its workers are left to themselves, as when the kernel picks the process.
+            with contextlib.suppress(ProcessLookupError):
+                (os.killpg if chance.random() < 0.5 else os.kill)(process.pid, signal.SIGKILL)
+            process.communicate()
+            kills += not is_done
+            check_whole(out, undisturbed)
+        check_finishes(root, out, undisturbed, kind=kind)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

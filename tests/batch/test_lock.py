@@ -1,6 +1,7 @@
 """One writer in a directory, and no lock outlives its holders."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -28,6 +29,27 @@ def test_the_second_is_refused_and_told_who_is_first(tmp_path):
         DirectoryLock(tmp_path, patience=0)
     with DirectoryLock(tmp_path, patience=0):
         pass
+
+
+def test_a_mark_stays_and_a_file_of_others_does_too(tmp_path):
+    with DirectoryLock(tmp_path) as lock:
+        mark = lock.mark
+    with DirectoryLock(tmp_path) as lock:
+        assert lock.mark == mark
+    assert re.fullmatch("[0-9a-f]{16}", mark)
+    (tmp_path / ".torchrg.lock").write_text("process 7 on a host")  # Of a version without marks.
+    with DirectoryLock(tmp_path) as lock:
+        assert lock.mark != mark
+    (tmp_path / "theirs").write_text("theirs")
+    for name in ("theirs", "nothing"):
+        (tmp_path / ".torchrg.lock").unlink()
+        (tmp_path / ".torchrg.lock").symlink_to(tmp_path / name)
+        with pytest.raises(FormatError, match=r"\.torchrg\.lock: cannot be written"):
+            DirectoryLock(tmp_path)
+    (tmp_path / "theirs").replace(tmp_path / ".torchrg.lock")
+    with pytest.raises(FormatError, match=r"\.torchrg\.lock: is in the way, it is no lock"):
+        DirectoryLock(tmp_path)
+    assert (tmp_path / ".torchrg.lock").read_text() == "theirs"
 
 
 def test_a_holder_that_is_killed_leaves_no_lock(tmp_path):

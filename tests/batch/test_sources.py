@@ -37,6 +37,8 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
     assert S3DISSource(tmp_path, CLASSIC, (5,), "spt", superpoint=True).describe() == options
     options = {"kind": "folder", "superpoint": False}
     assert FolderSource(tmp_path, CLASSIC, tmp_path).describe() == options
+    named = FolderSource(tmp_path, CLASSIC, tmp_path, columns=("x", "y", "z"))
+    assert named.describe() == options | {"columns": ["x", "y", "z"]}
 
 
 def grid(step=0.05, side=20, height=0.0):

@@ -14,7 +14,12 @@ import pytest
 import torch
 
 from torchrg.batch.run import DirectoryLock
-from torchrg.batch.tiles import choose_tile_size, choose_workers, segmented_in_tiles
+from torchrg.batch.tiles import (
+    choose_tile_size,
+    choose_workers,
+    folder_of_work,
+    segmented_in_tiles,
+)
 from torchrg.cli import main
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
@@ -59,7 +64,7 @@ def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys):
     [
         (1.0, "x.npz", 0, "no plane found: all points are equal"),
         (np.nan, "x.npz", 2, "expected finite points, got none in 40,000 points"),
-        (None, "x.npz", 0, "1 of 40,000 points are not finite; they stay in place, unlabelled"),
+        (None, "x.npz", 0, "1 of 40,000 points are not finite or beyond 1e+12; they stay in "),
         (None, "x.las", 2, "got 1 points that are not (first: 4)"),
     ],
 )
@@ -108,13 +113,50 @@ def test_what_cannot_be_done_is_one_line(rooms, tmp_path, capsys, flags, message
 
 
 @pytest.mark.slow
-def test_a_working_directory_is_of_one_command(rooms, tmp_path, capsys):
-    work = tmp_path / "work"
-    work.mkdir()
+def test_a_folder_of_work_is_of_one_command(rooms, tmp_path, capsys):
     files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--out", tmp_path / "x.npz")
+    work = folder_of_work(tmp_path / "x.npz", tmp_path / "work")
+    work.mkdir(parents=True)
     with DirectoryLock(work):
-        assert run(*files, "--workdir", work, "--limit-memory", LIMIT) == 2
+        assert run(*files, "--workdir", tmp_path / "work", "--limit-memory", LIMIT) == 2
     assert "another torchrg" in capsys.readouterr().err
+
+
+def test_a_directory_for_work_may_hold_what_it_likes(tmp_path, capsys):
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    np.save(shared / "scan.npy", make_room(num_points=ROOM, seed=1).points)
+    names = ("model.pt", "sensor.raw", "points.npy", "normals.npy", ".x.01234567.y", "tiles.json")
+    for name in names:
+        (shared / name).write_text(f"the user's {name}")
+    before = {path: path.read_bytes() for path in shared.iterdir()}
+    work = ("--preset", "classic", "--limit-memory", LIMIT, "--workdir", shared)
+    assert run(shared / "scan.npy", "--out", shared / "result.npy", *work) == 0
+    assert f"in {shared}{os.sep}result.npy." in capsys.readouterr().out
+    assert np.load(shared / "result.npy").shape[0] == ROOM
+    (shared / "result.npy").unlink()
+    assert {path: path.read_bytes() for path in shared.iterdir()} == before
+
+
+@pytest.mark.parametrize("flags", [(), ("--workdir", "work")])
+def test_what_is_in_the_way_of_the_work_is_named_and_stays(tmp_path, capsys, monkeypatch, flags):
+    monkeypatch.chdir(tmp_path)
+    np.save("scan.npy", make_room(num_points=ROOM, seed=1).points)
+    folder = folder_of_work(Path("x.npz"), Path("work") if flags else None)
+    folder.mkdir(parents=True)
+    scan = Path("scan.npy").rename(folder / "scan.npy")
+    said = {
+        scan: f"{scan}: expected a file outside of {folder}",
+        Path("scan.npy"): f"{folder}: expected an empty directory or the work of an earlier call",
+    }
+    for source, message in said.items():
+        if source != scan:
+            source.write_bytes(scan.read_bytes())
+        assert run(source, "--out", "x.npz", "--limit-memory", LIMIT, *flags) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        assert [path.name for path in folder.iterdir()] == ["scan.npy"]
 
 
 def test_tiles_are_as_large_as_memory_allows():
@@ -178,6 +220,16 @@ def test_killed_in_every_stage_it_goes_on_and_does_no_tile_twice(tmp_path):
         found, expected = (np.load(tmp_path / f"{run}.npz")[name] for run in ("work", "other"))
         np.testing.assert_array_equal(found, expected)
     assert set(Counter((tmp_path / "work.log").read_text().splitlines()).values()) == {1}
+
+
+@pytest.mark.slow
+def test_a_hundred_kills_at_random_moments_change_nothing(tmp_path):
+    np.save(tmp_path / "room.npy", make_room(num_points=3000, noise=0.003, seed=2).points)
+    (tmp_path / "out").mkdir()
+    script = Path(__file__).with_name("killed_at_random.py")
+    done = python(script, tmp_path / "room.npy", tmp_path / "out", 100, 1)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 10
 
 
 @pytest.mark.slow

@@ -1,10 +1,13 @@
 """A folder of clouds lists every readable file, in natural order, by a name of its own."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
 
 from torchrg.datasets import FolderOfClouds
+from torchrg.datasets.folder import natural_key
 from torchrg.errors import FormatError
 from torchrg.io import write_cloud
 from torchrg.structures import Cloud
@@ -37,9 +40,80 @@ def test_files_are_found_in_natural_order(root):
         assert data[i]["name"] == names_of(data)[i]
 
 
-def test_equal_names_keep_their_suffix(root):
-    write_cloud(root / "scan_10.npy", Cloud(COORDINATES))
-    assert names_of(FolderOfClouds(root))[-2:] == ["scan_10.npy", "scan_10.ply"]
+@pytest.mark.parametrize("other", ["scan_10.npy", "scan_10.Ply", "scan_10/coord.npy"])
+def test_two_of_one_name_are_refused_whatever_their_suffixes(root, other):
+    assert names_of(FolderOfClouds(root))[-1] == "scan_10"
+    (root / other).parent.mkdir(exist_ok=True)
+    np.save(root / "array.npy", COORDINATES)
+    (root / "array.npy").rename(root / other)
+    names = sorted(["scan_10.ply", other.removesuffix("/coord.npy")], key=natural_key)
+    with pytest.raises(FormatError, match=f"one file for each scan, got {' and '.join(names)};"):
+        FolderOfClouds(root)
+
+
+def test_a_name_does_not_depend_on_what_else_there_is(root):
+    write_cloud(root / "b" / "scan.ply", Cloud(COORDINATES))
+    (root / "b" / "scan.ply").rename(root / "b" / "scan.pcd.ply")
+    before = {scene.path: scene.name for scene in FolderOfClouds(root).scenes}
+    assert before[root / "b" / "scan.pcd.ply"] == "b/scan.pcd"
+    write_cloud(root / "b" / "scan.pcd", Cloud(COORDINATES))
+    after = {scene.path: scene.name for scene in FolderOfClouds(root).scenes}
+    assert after == {**before, root / "b" / "scan.pcd": "b/scan"}
+    write_cloud(root / "b" / "scan.npz", Cloud(COORDINATES))
+    with pytest.raises(FormatError, match=r"got b/scan.npz and b/scan.pcd; .*by suffixes"):
+        FolderOfClouds(root)
+    assert "b/scan" in names_of(FolderOfClouds(root, suffixes=[".ply", ".pcd", ".xyz"]))
+
+
+def warned(root):
+    """Return the names of the clouds of a folder, and the one warning about links, or nothing."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        names = names_of(FolderOfClouds(root))
+    assert len(caught) <= 1
+    return names, str(caught[0].message) if caught else ""
+
+
+def test_links_in_a_loop_are_passed_over(root):
+    expected = names_of(FolderOfClouds(root))
+    (root / "b" / "loop").symlink_to("..")
+    (root / "b" / "deep" / "again").symlink_to(root / "b")
+    (root / "self").symlink_to(".")
+    (root / "above").symlink_to("../..")
+    names, warning = warned(root)
+    assert names == expected
+    assert warning.startswith(f"{root}: passed over above and 3 more: a link leads there")
+
+
+def test_links_to_other_places_are_followed_and_each_file_counts_once(root, tmp_path):
+    other = tmp_path / "other"
+    (other / "sub").mkdir(parents=True)
+    for name in ("x.ply", "sub/y.ply"):
+        write_cloud(other / name, Cloud(COORDINATES))
+    (other / "back").symlink_to(root)
+    expected = names_of(FolderOfClouds(root))
+    (root / "c").symlink_to(other)
+    (root / "file.ply").symlink_to(other / "x.ply")
+    (root / "gone.ply").symlink_to(other / "nothing.ply")
+    names, warning = warned(root)
+    # The link to the folder comes first; what it leads back to has a name without links.
+    assert names == sorted([*expected, "c/sub/y", "c/x", "gone"], key=natural_key)
+    assert "passed over file.ply and 1 more: a link" in warning
+    # A link comes after what is there itself, whatever their order.
+    (root / "a").symlink_to("b")
+    assert warned(root)[0] == names
+
+
+def test_a_folder_of_links_is_a_data_set(root, tmp_path):
+    farm = tmp_path / "farm"
+    farm.mkdir()
+    for number, path in enumerate(sorted(root.rglob("*.ply"))):
+        (farm / f"{number}.ply").symlink_to(path)
+    assert warned(farm) == (["0", "1", "2"], "")
+    (farm / "scans").symlink_to(root)
+    names, warning = warned(farm)
+    assert names == ["0", "1", "2", "scans/b/a", "scans/b/deep/x", "scans/scan_9"]
+    assert warning.startswith(f"{farm}: passed over scans/scan_10.ply: ")
 
 
 def test_suffixes_can_be_chosen(root):

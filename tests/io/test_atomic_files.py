@@ -1,6 +1,9 @@
 """Files appear whole or not at all."""
 
+import gc
 import os
+import resource
+import signal
 import stat
 
 import numpy as np
@@ -56,6 +59,28 @@ def test_failing_disk_is_a_line_that_names_the_file(tmp_path, monkeypatch):
     with pytest.raises(FormatError, match=r"a\.npz: cannot be written: No space left on device\."):
         write_cloud(tmp_path / "a.npz", Cloud(np.zeros((2, 3))))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")
+@pytest.mark.parametrize("limit", [0, 100, 4096, 100_000])
+@pytest.mark.parametrize("suffix", list(FORMATS))
+def test_a_disk_that_is_full_is_the_one_thing_told(tmp_path, capfd, suffix, limit):
+    pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
+    cloud = Cloud(np.random.default_rng(0).random((20_000, 3)))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+    message = r"a\.\w+: cannot be written: (File too large|No space left on device)\."
+    try:
+        with pytest.raises(FormatError, match=message):
+            write_cloud(tmp_path / f"a{suffix}", cloud)
+        # What is left behind is not heard of either.
+        gc.collect()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")

@@ -1,15 +1,18 @@
 """E57: scans with poses, extensions, invalid points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud, write_cloud
+from torchrg.io import read_cloud, stream_cloud, write_cloud
 from torchrg.io.e57 import Scan, to_cartesian
 from torchrg.structures import Cloud
 
 pye57 = pytest.importorskip("pye57")
 
+AXES = ("cartesianX", "cartesianY", "cartesianZ")
 QUARTER = np.array([0.5**0.5, 0.0, 0.0, 0.5**0.5])
 
 
@@ -68,6 +71,50 @@ def test_scans_are_written_with_their_poses(tmp_path, scans, make_segmentation):
     np.testing.assert_array_equal(again.fields["labels"], seg.labels)
     np.testing.assert_allclose(again.fields["normals"], seg.normals, atol=1e-6)
     assert again.fields["scan"].tolist() == [0] * 20 + [1] * 20
+
+
+def test_scans_without_colour_are_written_without(tmp_path, scans, make_segmentation):
+    path, _ = scans
+    cloud = read_cloud(path)
+    assert cloud.notes == ("1 of 2 scans lack red, green, blue, zero there",)
+    assert cloud.fields["color"][20:].tolist() == [[0, 0, 0]] * 20
+    write_cloud(tmp_path / "whole.e57", cloud, make_segmentation(40))
+    stream = stream_cloud(path, chunk_size=7)
+    write_cloud(tmp_path / "chunks.e57", stream, make_segmentation(40))
+    for name in ("whole.e57", "chunks.e57"):
+        with pye57.E57(str(tmp_path / name)) as file:
+            headers = [file.get_header(number) for number in range(2)]
+            assert "colorRed" in headers[0].point_fields
+            assert "colorRed" not in headers[1].point_fields
+            assert "colorLimits" not in headers[1].scan_fields
+            assert "torchrg:label" in headers[1].point_fields
+        again = read_cloud(tmp_path / name)
+        np.testing.assert_array_equal(again.fields["color"], cloud.fields["color"])
+    # What somebody gave colours has them.
+    painted = {**cloud.fields, "color": cloud.fields["color"] + np.uint8(1)}
+    write_cloud(tmp_path / "b.e57", replace(cloud, fields=painted))
+    found = read_cloud(tmp_path / "b.e57")
+    assert found.notes == ()
+    np.testing.assert_array_equal(found.fields["color"], painted["color"])
+
+
+def test_the_coordinate_system_is_kept_and_pictures_are_told(tmp_path):
+    system = 'PROJCS["hand made"]'
+    cloud = Cloud(np.eye(3), header={"coordinate_metadata": system})
+    write_cloud(tmp_path / "a.e57", cloud)
+    assert read_cloud(tmp_path / "a.e57").header["coordinate_metadata"] == system
+    write_cloud(tmp_path / "b.e57", stream_cloud(tmp_path / "a.e57"))
+    with pye57.E57(str(tmp_path / "b.e57")) as file:
+        assert file.root["coordinateMetadata"].value() == system
+    with pye57.E57(str(tmp_path / "c.e57"), "w") as file:
+        file.write_scan_raw(dict.fromkeys(AXES, np.ones(5)))
+        image, pictures = file.image_file, file.root["images2D"]
+        picture = pye57.libe57.StructureNode(image)
+        picture.set("guid", pye57.libe57.StringNode(image, "{1}"))
+        pictures.append(picture)
+    found = read_cloud(tmp_path / "c.e57")
+    assert found.notes == ("pictures left out: 1",)
+    assert "coordinate_metadata" not in found.header
 
 
 def test_normals_turn_with_the_points(tmp_path):
@@ -144,6 +191,40 @@ def test_names_are_made_fit_for_xml(tmp_path, make_cloud):
     cloud = Cloud(np.eye(3), {"a b/c": np.arange(3.0)})
     write_cloud(tmp_path / "a.e57", cloud)
     assert read_cloud(tmp_path / "a.e57").fields["a_b_c"].tolist() == [0, 1, 2]
+    write_cloud(tmp_path / "a.e57", Cloud(np.eye(3), {"1st": np.arange(3.0)}))
+    assert read_cloud(tmp_path / "a.e57").fields["_1st"].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("names", [("a b", "a/b"), ("高さ", "長さ")])
+def test_names_that_become_one_are_refused(tmp_path, names):
+    message = "expected fields of different names in letters and digits, got '[a_]_[b_]?' twice"
+    with pytest.raises(FormatError, match=message):
+        write_cloud(tmp_path / "a.e57", Cloud(np.eye(3), dict.fromkeys(names, np.ones(3))))
+
+
+def test_fields_of_two_extensions_are_both_read(tmp_path):
+    values = {"a:rank": np.arange(5.0), "b:rank": np.ones(5)}
+    with pye57.E57(str(tmp_path / "a.e57"), "w") as file:
+        libe57, image = pye57.libe57, file.image_file
+        for prefix in "ab":
+            image.extensionsAdd(prefix, f"urn:{prefix}")
+        columns = {**dict.fromkeys(AXES, np.zeros(5)), **values}
+        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+        for name, column in columns.items():
+            prototype.set(name, libe57.FloatNode(image))
+            buffers.append(libe57.SourceDestBuffer(image, name, column, 5, True, True))
+        scan = libe57.StructureNode(image)
+        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+        scan.set("guid", libe57.StringNode(image, "{1}"))
+        scan.set("points", points)
+        file.data3d.append(scan)
+        writer = points.writer(buffers)
+        writer.write(5)
+        writer.close()
+    found = read_cloud(tmp_path / "a.e57").fields
+    assert {name: column.tolist() for name, column in found.items()} == {
+        name: column.tolist() for name, column in values.items()
+    }
 
 
 def test_integers_beyond_the_format_are_refused(tmp_path):

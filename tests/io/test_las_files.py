@@ -9,7 +9,7 @@ import pytest
 
 import torchrg._optional
 from torchrg.errors import FormatError, MissingDependencyError
-from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.io import check_output, read_cloud, stream_cloud, write_cloud
 from torchrg.structures import Cloud
 
 laspy = pytest.importorskip("laspy")
@@ -61,11 +61,7 @@ def test_everything_that_came_in_goes_out(
     write_cloud(tmp_path / f"out{suffix}", cloud, seg)
     before, after = laspy.read(source), laspy.read(tmp_path / f"out{suffix}")
     for name in before.point_format.dimension_names:
-        if name == "pair":
-            written = np.stack([after["pair_0"], after["pair_1"]], axis=1)
-        else:
-            written = after[name]
-        np.testing.assert_array_equal(written, before[name], err_msg=name)
+        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
     assert after.header.version == before.header.version
     assert after.header.point_format.id == point_format
     assert after.header.scales.tolist() == [0.001, 0.001, 0.01]
@@ -114,6 +110,98 @@ def test_values_that_a_standard_dimension_cannot_hold_get_their_own(tmp_path):
         np.testing.assert_array_equal(found[name], values)
 
 
+@pytest.fixture
+def described(tmp_path):
+    """A file whose extra dimensions say all that LAS can say of them."""
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = [0.001] * 3
+    params = [
+        ("Pulse width", "f4", "of the echo", {}),
+        ("Range", "u2", "in metres", {"offsets": [5.0], "scales": [0.01]}),
+        ("vector", "3i2", "", {}),
+        ("Beam", "2i4", "angles", {"offsets": [0.0, 1.0], "scales": [0.5, 0.25]}),
+        ("label", "u1", "ground truth", {}),
+        ("NormalX", "f4", "of the scanner", {}),
+        ("NormalY", "f4", "", {}),
+        ("NormalZ", "f4", "", {}),
+        ("Deviation", "i4", "fit", {"no_data": [-9999]}),
+        ("intensity_value", "f8", "calibrated", {}),
+    ]
+    for name, kind, description, more in params:
+        header.add_extra_dim(laspy.ExtraBytesParams(name, kind, description, **more))
+    data, rng = laspy.LasData(header), np.random.default_rng(0)
+    data.x, data.y, data.z = rng.random((3, 50))
+    data["Pulse width"] = rng.random(50)
+    data["Pulse width"][3] = np.nan
+    data.Range, data.label = 5 + rng.integers(0, 900, 50) / 100, rng.integers(200, 256, 50)
+    data.vector, data.Beam = rng.integers(-9, 9, (50, 3)), rng.integers(-9, 9, (50, 2)) / 4
+    data.NormalX, data.Deviation = np.ones(50), rng.integers(-9999, 5, 50)
+    data["intensity_value"] = rng.random(50)
+    data.write(tmp_path / "described.las")
+    return tmp_path / "described.las"
+
+
+def descriptions(path):
+    """Return what a file says of each extra dimension, and its numbers as they are stored."""
+    data = laspy.read(path)
+    return {
+        dim.name: (dim.type_str(), dim.description, *map(str, dim[6:]), data.points.array[dim.name])
+        for dim in data.point_format.extra_dimensions
+    }
+
+
+@pytest.mark.parametrize("kind", ["las", "laz"])
+def test_extra_dimensions_stay_as_they_are_described(tmp_path, described, kind):
+    cloud = read_cloud(described)
+    assert cloud.fields["Range"].dtype == np.float64
+    assert cloud.fields["vector"].shape == (50, 3)
+    write_cloud(tmp_path / f"whole.{kind}", cloud)
+    write_cloud(tmp_path / f"chunks.{kind}", stream_cloud(described, chunk_size=7))
+    whole, chunks = ((tmp_path / f"{name}.{kind}").read_bytes() for name in ("whole", "chunks"))
+    assert whole == chunks
+    before, after = descriptions(described), descriptions(tmp_path / f"whole.{kind}")
+    assert before.keys() == after.keys()
+    for name, (*words, numbers) in before.items():
+        assert list(after[name][:-1]) == words, name
+        np.testing.assert_array_equal(after[name][-1], numbers, err_msg=name)
+
+
+def test_extra_dimensions_that_give_way_to_a_result_take_their_description_along(
+    tmp_path, described, make_segmentation
+):
+    seg = make_segmentation(50)
+    write_cloud(tmp_path / "a.las", read_cloud(described), seg)
+    write_cloud(tmp_path / "b.las", read_cloud(tmp_path / "a.las"), seg)
+    write_cloud(tmp_path / "c.las", read_cloud(tmp_path / "b.las"), seg)
+    before = descriptions(described)
+    for name in ("a.las", "b.las", "c.las"):
+        after = descriptions(tmp_path / name)
+        assert after["label_input"][:2] == ("u1", "ground truth")
+        assert after["label"][:2] == ("i4", "")
+        assert after["normals_input_0"][:2] == ("f4", "of the scanner")
+        assert after["NormalX"][1] == ""
+        np.testing.assert_array_equal(after["label_input"][-1], before["label"][-1])
+        np.testing.assert_array_equal(after["label"][-1], seg.labels)
+        np.testing.assert_array_equal(after["NormalX"][-1], seg.normals[:, 0])
+        more = after.keys() - before.keys() - {"Curvature", "curvature_input", "label_input"}
+        assert more == {f"normals_input_{i}" for i in range(3)}
+    assert (tmp_path / "b.las").read_bytes() == (tmp_path / "c.las").read_bytes()
+
+
+def test_values_that_their_dimension_does_not_hold_have_one_of_their_own(tmp_path, described):
+    cloud = read_cloud(described)
+    fields = dict(cloud.fields)
+    fields["Range"] = fields["Range"] + 0.001
+    fields["Deviation"] = fields["Deviation"] + 0.5
+    fields["vector"] = fields["vector"].astype(np.int64) + 40_000
+    write_cloud(tmp_path / "a.las", replace(cloud, fields=fields))
+    found = read_cloud(tmp_path / "a.las").fields
+    for name, values in fields.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    write_cloud(tmp_path / "b.las", replace(cloud, fields={"Range": cloud.fields["Range"]}))
+    assert list(descriptions(tmp_path / "b.las")) == ["Range"]
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3, 1e9])
 def test_grid_follows_the_size_of_the_cloud(tmp_path, scale):
     coordinates = np.random.default_rng(0).random((100, 3)) * scale
@@ -134,6 +222,9 @@ def test_points_that_are_not_finite_are_refused_before_the_work(tmp_path):
         check_output(tmp_path / "a.las", cloud)
     with pytest.raises(FormatError, match=message):
         write_cloud(tmp_path / "a.las", cloud)
+    # A code for no data would take the grid of all others.
+    with pytest.raises(FormatError, match="got 1 points that are not"):
+        write_cloud(tmp_path / "a.las", Cloud(np.array([[0.0, 0, 0], [1e30, 0, 0]])))
 
 
 def test_points_off_the_grid_are_refused(tmp_path, scanned):

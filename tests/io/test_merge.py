@@ -150,6 +150,136 @@ def test_coordinate_systems_that_differ_are_refused(tmp_path):
         merge_streams([first, none, other])
 
 
+def timed(path, kind, point_format=6, *, used=True, **header):
+    """A LAS file with GPS times that count in one of two ways."""
+    laspy = pytest.importorskip("laspy")
+    data = laspy.create(point_format=point_format, file_version="1.4")
+    data.header.global_encoding.gps_time_type = getattr(laspy.header.GpsTimeType, kind)
+    for name, value in header.items():
+        setattr(data.header, name, value)
+    data.x = data.y = data.z = np.arange(9) / 8
+    if used:
+        data.gps_time = np.arange(9.0) + 5
+    data.write(path)
+    return stream_cloud(path, chunk_size=4)
+
+
+def test_gps_times_that_count_differently_are_refused(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    week, standard = (timed(tmp_path / f"{k}.las", k) for k in ("WEEK_TIME", "STANDARD"))
+    unused = timed(tmp_path / "unused.las", "WEEK_TIME", used=False)
+    other = timed(tmp_path / "other.las", "WEEK_TIME", 7)
+    message = (
+        r"STANDARD\.las: expected the kind of GPS times of .*/WEEK_TIME\.las, got another; con"
+    )
+    for streams in ([week, standard], [week, unused, standard], [other, standard]):
+        with pytest.raises(FormatError, match=message.replace("WEEK_TIME", "(WEEK_TIME|other)")):
+            merge_streams(streams)
+    stream, notes = merge_streams([unused, standard])
+    assert notes == []
+    write_cloud(tmp_path / "all.las", stream)
+    after = laspy.read(tmp_path / "all.las")
+    assert after.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    assert after.gps_time.tolist() == [0] * 9 + list(range(5, 14))
+    # The header of the file that was read is its own.
+    assert not unused.header["las"].global_encoding.gps_time_type
+    _, notes = merge_streams([week, other])
+    assert notes[-2].endswith("is not kept: point formats differ")
+    assert notes[-1] == "what GPS times count from is not kept with it"
+
+
+def test_headers_of_las_files_that_differ_are_told(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    record = laspy.VLR("ACME", 4711, "", b"mine")
+    first = timed(tmp_path / "a.las", "STANDARD", file_source_id=7, system_identifier="one")
+    other = timed(
+        tmp_path / "b.las",
+        "STANDARD",
+        file_source_id=8,
+        system_identifier="two",
+        vlrs=laspy.vlrs.vlrlist.VLRList([record]),
+    )
+    assert merge_streams([first, other]).notes == [
+        f"system identifier, file source id are those of {tmp_path}/a.las for all points",
+        f"records are those of {tmp_path}/a.las; left out of others: ACME 4711",
+    ]
+
+
+@pytest.mark.parametrize("more", [{"scales": [0.5], "offsets": [0.0]}, {"description": "other"}])
+def test_extra_dimensions_that_are_described_differently_are_plain_numbers(tmp_path, more):
+    laspy = pytest.importorskip("laspy")
+    for name, options in (("a", {"scales": [0.1], "offsets": [1.0]}), ("b", more)):
+        header = laspy.LasHeader(version="1.4", point_format=6)
+        header.add_extra_dim(laspy.ExtraBytesParams("Range", "u2", **options))
+        data = laspy.LasData(header)
+        data.x = data.y = data.z = np.arange(9)
+        data.Range = np.arange(9) + 1
+        data.write(tmp_path / f"{name}.las")
+    paths = [tmp_path / "a.las", tmp_path / "b.las"]
+    stream, notes = merge_streams([stream_cloud(path) for path in paths])
+    assert notes == ["scale and description of Range are left out: files differ"]
+    write_cloud(tmp_path / "all.las", stream)
+    after = laspy.read(tmp_path / "all.las")
+    assert not after.point_format.dimension_by_name("Range").is_scaled
+    np.testing.assert_allclose(after.Range, np.tile(np.arange(9) + 1, 2), rtol=1e-15)
+
+
+def test_headers_that_are_not_kept_are_told(tmp_path, make_cloud):
+    pytest.importorskip("pye57")
+    first = las_tile(tmp_path / "a.las", 0.0)
+    away = (1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0)
+    write_cloud(tmp_path / "a.ply", make_cloud(9))
+    write_cloud(tmp_path / "a.pcd", make_cloud(9))
+    write_cloud(tmp_path / "b.pcd", make_cloud(9, header={"viewpoint": away}))
+    write_cloud(tmp_path / "a.e57", make_cloud(9, header={"coordinate_metadata": "WKT"}))
+    ply, pcd, seen, e57 = (
+        stream_cloud(tmp_path / name) for name in ("a.ply", "a.pcd", "b.pcd", "a.e57")
+    )
+
+    def told(*streams):
+        kept = [note for note in merge_streams(streams).notes if not note.startswith("field")]
+        return [note.replace(f"{tmp_path}/", "") for note in kept]
+
+    assert told(ply, pcd) == told(pcd, pcd)[1:] == []
+    assert merge_streams([seen, seen]).stream.header["viewpoint"] == away
+    differs = "the viewpoint of {} is not kept: it differs between files"
+    assert told(ply, seen) == [differs.format("b.pcd")]
+    assert told(seen, pcd) == [differs.format("b.pcd")]
+    one = "is not kept: not all files have one"
+    assert told(ply, first) == [f"the header of a.las {one}"]
+    assert told(ply, e57) == [
+        "only 1 of 2 files name a coordinate system",
+        f"the list of scans, with poses, of a.e57 {one}",
+        f"the coordinate system of a.e57 {one}",
+    ]
+
+
+def test_coordinate_systems_of_e57_files_are_compared(tmp_path, make_cloud):
+    pytest.importorskip("pye57")
+    for name, system in (("a", "one"), ("b", "one"), ("c", "two")):
+        cloud = make_cloud(9, header={"coordinate_metadata": system})
+        write_cloud(tmp_path / f"{name}.e57", cloud)
+    first, same, other = (stream_cloud(tmp_path / f"{name}.e57") for name in "abc")
+    stream, notes = merge_streams([first, same])
+    assert notes == []
+    write_cloud(tmp_path / "all.e57", stream)
+    assert read_cloud(tmp_path / "all.e57").header["coordinate_metadata"] == "one"
+    with pytest.raises(FormatError, match=r"c\.e57: expected the coordinate reference system of"):
+        merge_streams([first, other])
+
+
+def test_what_reading_the_files_said_is_told(tmp_path):
+    for name in "ab":
+        np.savetxt(tmp_path / f"{name}.txt", np.arange(20.0).reshape(5, 4))
+    streams = [stream_cloud(tmp_path / f"{name}.txt") for name in "ab"]
+    stream, notes = merge_streams(streams)
+    taken = "its columns have no names and are taken as x y z intensity"
+    assert [note.partition(";")[0] for note in notes] == [
+        f"{tmp_path}/{name}.txt: {taken}" for name in "ab"
+    ]
+    assert stream.read().notes == ()
+
+
 def test_scans_of_several_e57_files_are_numbered_on(tmp_path, make_cloud):
     pytest.importorskip("pye57")
     from torchrg.io.e57 import Scan

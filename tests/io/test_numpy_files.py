@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud, write_cloud
+from torchrg.io import read_cloud, stream_cloud, write_cloud
 from torchrg.structures import Cloud
 
 POINTS = np.arange(12, dtype=np.float64).reshape(4, 3)
@@ -54,9 +54,14 @@ def test_fortran_order_and_foreign_bytes_are_read(tmp_path):
         (np.zeros((4, 3)), {"color"}),
         (np.full((4, 3), 1e200), {"column_4", "column_5", "column_6"}),
         (np.full((4, 3), 0.3), {"column_4", "column_5", "column_6"}),
-        (np.tile([255.0, 0, 7, 3], (4, 1)), {"color", "labels"}),
         (np.tile([255.0, 0, 7, 0.5], (4, 1)), {"color", "column_7"}),
-        (np.tile([256.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
+        (np.tile([256.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
+        (np.tile([-1640.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
+        (np.tile([0.5, 0.6, 0, -0.8], (4, 1)), {"column_4", "normals"}),
+        (np.tile([0.6, 0, -0.8, 3], (4, 1)), {"normals", "column_7"}),
+        # Intensity and colour, or colour and label: values do not tell.
+        (np.tile([255.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
+        (np.tile([0.5, 0, 7, 0.5], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
     ],
 )
 def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
@@ -67,6 +72,48 @@ def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
     assert cloud.fields.keys() == names
     np.savetxt(tmp_path / "a.txt", table)
     assert read_cloud(tmp_path / "a.txt").fields.keys() == names
+
+
+def test_arrays_that_are_no_points_are_refused(tmp_path):
+    pose = np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
+    wrong = {
+        "a.npy": (pose, "expected points, got a matrix of 4 x 4, a pose"),
+        "b.npy": (POINTS.T.repeat(9, axis=1), "got 3 rows of 36 numbers; transpose them"),
+        "c.npy": (np.full((9, 6), "x"), "expected real numbers as coordinates, got <U1"),
+    }
+    for name, (values, message) in wrong.items():
+        np.save(tmp_path / name, values)
+        for read in (read_cloud, stream_cloud):
+            with pytest.raises(FormatError, match=rf"{name}: .*{message}"):
+                read(tmp_path / name)
+    np.savez(tmp_path / "a.npz", points=POINTS.T)
+    with pytest.raises(FormatError, match=r"a\.npz: .* \(N, 3\), got \(3, 4\); transpose them\."):
+        read_cloud(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("names", ["xyz", "nx ny nz", "r g b"])
+@pytest.mark.parametrize("code", ["M8[s]", "S3", "U3", "c16"])
+def test_columns_of_several_kinds_are_one_line(tmp_path, names, code):
+    # A damaged header makes one number of three a date, or text.
+    types = dict.fromkeys("xyz", "f8") | dict.fromkeys(
+        names.split() if " " in names else "xyz", "f8"
+    )
+    types[list(types)[-1]] = code
+    np.save(tmp_path / "a.npy", np.zeros(4, list(types.items())))
+    with pytest.raises(FormatError, match=r"a\.npy: expected ") as caught:
+        read_cloud(tmp_path / "a.npy")
+    assert len(str(caught.value).replace(str(tmp_path), "")) < 160
+
+
+def test_arrays_that_are_left_out_are_told(tmp_path):
+    more = {"scale": np.ones(2), "name": np.array("hall"), "plane_id": np.arange(4)}
+    ours = {"plane_area": np.ones(4), "outline_points": np.ones((4, 3)), "provenance": np.array("")}
+    np.savez(tmp_path / "a.npz", points=POINTS, **more, **ours)
+    for cloud in (read_cloud(tmp_path / "a.npz"), stream_cloud(tmp_path / "a.npz").read()):
+        assert cloud.notes == ("scale, name left out: not of 4 rows",)
+        assert list(cloud.fields) == ["plane_id"]
+    with pytest.raises(FormatError, match="expected fields beside points, got 'plane_area'; ren"):
+        write_cloud(tmp_path / "b.npz", Cloud(POINTS, {"plane_area": np.ones(4)}))
 
 
 def test_structured_arrays_are_read_by_name(tmp_path):

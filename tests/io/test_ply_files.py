@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud
+from torchrg.io import read_cloud, stream_cloud, write_cloud
+from torchrg.structures import Cloud
 
 POINTS = [(1.5, -2.0, 3.0), (4.0, 5.25, -6.0), (float("nan"), 0.0, 1e30)]
 HEADER = """ply
@@ -99,6 +100,21 @@ def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
     cloud = read_cloud(save(tmp_path / "a.ply", header, body))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
     assert set(cloud.fields) == {"color", "labels"}
+    told = "1 of camera, 2 of strip, 2 of face"
+    assert cloud.notes == (f"elements left out, as only vertices are read: {told}",)
+    assert next(iter(stream_cloud(tmp_path / "a.ply"))).notes == cloud.notes
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_names_are_read_in_the_letters_they_were_written_in(tmp_path, kind):
+    fields = {"höhe_à": np.arange(3.0), "高さ": np.ones(3)}
+    write_cloud(tmp_path / f"a.{kind}", Cloud(np.eye(3), fields))
+    assert list(read_cloud(tmp_path / f"a.{kind}").fields) == list(fields)
+    data = (tmp_path / f"a.{kind}").read_bytes()
+    (tmp_path / f"b.{kind}").write_bytes(
+        data.replace("höhe_à".encode(), "höhe_à".encode("latin-1")).replace("高さ".encode(), b"h")
+    )
+    assert list(read_cloud(tmp_path / f"b.{kind}").fields) == ["höhe_à", "h"]
 
 
 def test_lists_of_one_length_in_vertices_become_columns(tmp_path):

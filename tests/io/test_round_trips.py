@@ -10,8 +10,9 @@ import torch
 
 import torchrg.io
 from torchrg.errors import FormatError
-from torchrg.io import FORMATS, check_output, read_cloud, write_cloud
-from torchrg.structures import Cloud, PlaneAdjacency, Planes
+from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
+from torchrg.io.fields import notes_on_results
+from torchrg.structures import Cloud, PlaneAdjacency, Planes, Superpoints
 
 EXACT = [".npz", ".npy", ".ply", ".pcd", ".e57"]
 TEXT = [".xyz", ".txt"]
@@ -111,6 +112,50 @@ def test_segmentation_is_written_beside_the_own_fields(
     if suffix != ".npz":
         np.testing.assert_array_equal(fields["color"], cloud.fields["color"])
         np.testing.assert_array_equal(fields["intensity"].astype("f4"), cloud.fields["intensity"])
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != ".npz"])
+def test_own_fields_that_a_result_has_too_are_kept_aside(
+    tmp_path, make_cloud, make_segmentation, kind
+):
+    needs(kind)
+    cloud, seg = make_cloud(), make_segmentation(60)
+    results = {"labels": seg.labels, "normals": seg.normals, "curvature": seg.curvature}
+    write_cloud(tmp_path / f"a{kind}", cloud, seg)
+    # A result that is segmented again keeps what its input had.
+    again = read_cloud(tmp_path / f"a{kind}")
+    write_cloud(tmp_path / f"b{kind}", again, seg)
+    write_cloud(tmp_path / f"c{kind}", read_cloud(tmp_path / f"b{kind}"), seg)
+    for name in ("a", "b", "c"):
+        fields = read_cloud(tmp_path / f"{name}{kind}").fields
+        aside = {"label_input", "normals_input", "curvature_input"}
+        assert fields.keys() == cloud.fields.keys() | aside
+        for field, values in results.items():
+            np.testing.assert_array_equal(fields[field].astype("f4"), values)
+            own = "label_input" if field == "labels" else f"{field}_input"
+            np.testing.assert_array_equal(fields[own].astype("f4"), cloud.fields[field])
+    if kind != ".e57":
+        assert (tmp_path / f"b{kind}").read_bytes() == (tmp_path / f"c{kind}").read_bytes()
+    told = notes_on_results(cloud.fields, RESULT_FIELDS)
+    names = "label as label_input, normals as normals_input, curvature as curvature_input"
+    assert told == [f"its own fields are kept beside the result's: {names}"]
+    assert notes_on_results(again.fields, RESULT_FIELDS) == [
+        "its own label, normals, curvature left out for the result's; label_input, normals_input, "
+        "curvature_input stay"
+    ]
+    assert notes_on_results({"color"}, RESULT_FIELDS) == []
+
+
+def test_own_superpoints_are_kept_aside_too(tmp_path, make_cloud):
+    cloud = make_cloud(60)
+    parts = Superpoints(torch.arange(60) // 2, torch.full((30,), -1), (torch.arange(60) // 4,))
+    own = {"superpoints": np.arange(60, dtype=np.int32)}
+    for kind in (".npz", ".ply"):
+        write_cloud(tmp_path / f"a{kind}", replace(cloud, fields=own), superpoints=parts)
+        fields = read_cloud(tmp_path / f"a{kind}").fields
+        assert fields.keys() == {"superpoints", "superpoints_1", "superpoints_input"}
+        np.testing.assert_array_equal(fields["superpoints"], parts.labels)
+        np.testing.assert_array_equal(fields["superpoints_input"], own["superpoints"])
 
 
 def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, make_segmentation):
@@ -255,6 +300,7 @@ def test_truth_values_and_wide_integers_are_kept_by_value(tmp_path, make_cloud):
         ("none", np.zeros((2, 0)), r"expected field none of shape \(N,\) or \(N, C\)"),
         ("x", np.zeros(2), "expected fields of different names, got 'x' twice"),
         ("color", np.zeros((2, 3)), "expected field color of uint8 or uint16, got float64"),
+        ("_", np.zeros(2), "expected names of fields, got '_'; rename it"),
     ],
 )
 def test_fields_that_a_file_cannot_hold_are_refused(tmp_path, kind, name, values, message):

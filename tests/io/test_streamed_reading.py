@@ -58,11 +58,14 @@ def test_chunks_join_to_the_cloud(tmp_path, make_cloud, kind, number):
 @pytest.mark.parametrize(
     ("row", "fields"),
     [
-        ([0.0, 0.6, 0.8, 1.0], ["normals", "labels"]),
+        ([0.0, 0.6, 0.8, 1.0], ["normals", "column_7"]),
         ([0.0, 0.6, 0.8, 1.5], ["normals", "column_7"]),
-        ([0.0, 2.0, 3.0, 1.0], ["color", "labels"]),
+        ([0.5, 0.0, 0.6, 0.8], ["normals", "column_4"]),
+        ([256.0, 2.0, 3.0, 1.0], ["color", "intensity"]),
+        ([0.0, 2.0, 3.0, 256.0], ["color", "column_7"]),
+        ([0.0, 2.0, 3.0, 1.0], ["column_4", "column_5", "column_6", "column_7"]),
         ([0.0, 0.5, 0.5, 1.0], ["column_4", "column_5", "column_6", "column_7"]),
-        ([np.nan, 0.0, 1.0, 1.0], ["normals", "labels"]),
+        ([np.nan, 0.0, 1.0, 0.5], ["normals", "column_7"]),
     ],
 )
 def test_one_row_decides_the_names_of_all(tmp_path, kind, at, row, fields):
@@ -258,7 +261,7 @@ def test_ply_with_lists_before_and_in_the_vertices(tmp_path):
 
 
 def test_text_between_blank_lines_and_comments(tmp_path):
-    lines = ["// x y z label", "9", "0 0 0 1", "", "# a", "# b", "1 0 0 2", "", "1 2 3 4 # end", ""]
+    lines = ["// x y z label", "3", "0 0 0 1", "", "# a", "# b", "1 0 0 2", "", "1 2 3 4 # end", ""]
     (tmp_path / "a.txt").write_text("\n".join(lines))
     whole = assert_streams_as_read(tmp_path / "a.txt", [1, 2, 1000])
     assert whole.fields["labels"].tolist() == [1, 2, 4]

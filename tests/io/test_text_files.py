@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud, write_cloud
+from torchrg.io import CloudStream, read_cloud, stream_cloud, write_cloud
 from torchrg.io.text import LINES_AT_ONCE
 from torchrg.structures import Cloud
 
@@ -39,6 +39,117 @@ def test_every_way_to_write_two_points_is_read(tmp_path, suffix, text):
     assert cloud.coordinates.tolist() == POINTS
     assert cloud.coordinates.dtype == np.float64
     assert cloud.fields == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["0,0;1,5;-2,0\n3;4;1e3\n", "0,0 1,5 -2,0\n3 4 1e3\n", "0,0\t1,5\t-2,0\n3\t4\t1e3\n"],
+)
+def test_decimals_may_begin_with_commas_and_that_is_told(tmp_path, text):
+    path = save(tmp_path / "a.txt", text)
+    for cloud in (read_cloud(path), next(iter(stream_cloud(path)))):
+        assert cloud.coordinates.tolist() == POINTS
+        assert cloud.notes == ("its commas are taken as decimal points",)
+
+
+@pytest.mark.parametrize(
+    ("text", "fields"),
+    [
+        # CloudCompare: names of fields keep their blanks where these are not between columns.
+        ("//X,Y,Z,Scalar field\n0,1.5,-2,7\n3,4,1e3,8\n", {"Scalar field": [7, 8]}),
+        ('"X";"Y";"Z";"Range, in m"\n0;1.5;-2;7\n3;4;1e3;8\n', {"Range, in m": [7, 8]}),
+        ("X\tY\tZ\tScalar field\n0\t1.5\t-2\t7\n3\t4\t1e3\t8\n", {"Scalar field": [7, 8]}),
+        ('x y z "a b"\n0 1.5 -2 7\n3 4 1e3 8\n', {"a b": [7, 8]}),
+        ("X;Y;Z;d\n0,0;1,5;-2,0;7,5\n3;4;1e3;8\n", {"d": [7.5, 8]}),
+        (
+            "//X Y Z Rf Gf Bf\n0 1.5 -2 0 0 1\n3 4 1e3 1 0.2 0\n",
+            {"color": [[0, 0, 255], [255, 51, 0]]},
+        ),
+    ],
+)
+def test_names_of_other_programs_are_told_apart(tmp_path, text, fields):
+    cloud = read_cloud(save(tmp_path / "a.txt", text))
+    assert cloud.coordinates.tolist() == POINTS
+    assert {name: values.tolist() for name, values in cloud.fields.items()} == fields
+
+
+LEICA = "0 1.5 -2 {} 255 128 7\n3 4 1e3 {} 0 1 2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "taken"),
+    [
+        ("0 1.5 -2\n3 4 1e3\n", ""),
+        ("x y z i\n0 1.5 -2 7\n3 4 1e3 8\n", ""),
+        ("0 1.5 -2 7\n3 4 1e3 8\n", "x y z intensity"),
+        ("0 1.5 -2 7 9\n3 4 1e3 8 9\n", "x y z column_4 column_5"),
+        ("0 1.5 -2 7 9 255\n3 4 1e3 8 9 0\n", "x y z red green blue"),
+        ("0 1.5 -2 0 -1 0\n3 4 1e3 1 0 0\n", "x y z nx ny nz"),
+        # Intensities as Cyclone writes them, and as programs that scale them do.
+        (LEICA.format(-1640, 900), "x y z intensity red green blue"),
+        (LEICA.format(0.5, 0.25), "x y z intensity red green blue"),
+        (LEICA.format(200, 100), "x y z column_4 column_5 column_6 column_7"),
+    ],
+)
+def test_names_that_are_taken_for_granted_are_told(tmp_path, text, taken):
+    path = save(tmp_path / "a.txt", text)
+    stream = stream_cloud(path, chunk_size=1)
+    clouds = [read_cloud(path), *stream, stream.read(), *CloudStream.of(read_cloud(path))]
+    assert len(clouds) == 5
+    for cloud in clouds:
+        told = f"its columns have no names and are taken as {taken}; if they are others, name them"
+        assert [note.removesuffix(" with --columns") for note in cloud.notes] == [told] * bool(
+            taken
+        )
+
+
+@pytest.mark.parametrize("kind", [".txt", ".npy"])
+def test_names_that_are_given_decide(tmp_path, kind):
+    table = np.array([[9.0, 0, 1.5, -2, 200, 255, 128, 7], [9, 3, 4, 1e3, 100, 0, 1, 2]])
+    path = tmp_path / f"a{kind}"
+    np.savetxt(path, table) if kind == ".txt" else np.save(path, table)
+    names = ["_", "x", "y", "z", "intensity", "r", "g", "b"]
+    for cloud in (read_cloud(path, columns=names), stream_cloud(path, columns=names).read()):
+        assert cloud.coordinates.tolist() == POINTS
+        assert {name: values.tolist() for name, values in cloud.fields.items()} == {
+            "color": [[255, 128, 7], [0, 1, 2]],
+            "intensity": [200, 100],
+        }
+        assert cloud.notes == ()
+
+
+def test_names_that_are_given_take_the_place_of_the_first_line(tmp_path):
+    text = "a b c\n0 1.5 -2\n3 4 1e3\n"
+    cloud = read_cloud(save(tmp_path / "a.txt", text), columns=("z", "y", "x"))
+    assert cloud.coordinates[0].tolist() == [-2, 1.5, 0]
+    text = "//X Y Z Scalar field\n0 1.5 -2 7\n"
+    cloud = read_cloud(save(tmp_path / "a.txt", text), columns=("x", "y", "z", "label"))
+    assert cloud.fields["labels"].tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ("xy", "expected names of columns that differ, x, y and z among them, got x,y; _ leaves"),
+        ("xyzz", "expected names of columns that differ, x, y and z among them, got x,y,z,z"),
+        ("xyz", r"expected names for 4 columns, got 3 \(x,y,z\); _ leaves a column out"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(tmp_path, names, message):
+    np.save(tmp_path / "a.npy", np.ones((9, 4)))
+    np.savetxt(tmp_path / "a.txt", np.ones((9, 4)))
+    for kind in ("npy", "txt"):
+        with pytest.raises(FormatError, match=rf"a\.{kind}: {message}"):
+            read_cloud(tmp_path / f"a.{kind}", columns=list(names))
+
+
+def test_names_for_files_that_have_their_own_are_refused(tmp_path):
+    write_cloud(tmp_path / "a.ply", Cloud(np.eye(3)))
+    write_cloud(tmp_path / "a.npy", Cloud(np.eye(3), {"a": np.ones(3)}))
+    with pytest.raises(FormatError, match=r"a\.ply: expected text or \.npy for names of columns"):
+        read_cloud(tmp_path / "a.ply", columns=["x", "y", "z"])
+    with pytest.raises(FormatError, match=r"a\.npy: expected no names .* some: x, y, z, a; leave"):
+        stream_cloud(tmp_path / "a.npy", columns=["x", "y", "z", "b"])
 
 
 def test_names_in_the_first_line_name_the_columns(tmp_path):
@@ -87,7 +198,23 @@ def test_written_text_says_what_its_columns_are(tmp_path):
         ("0 1 two\n3 4 5\n", "line 1: expected 3 numbers, got '0 1 two'"),
         ("# x y z\n0 1 2 3\n", "line 2: expected 3 numbers, got '0 1 2 3'"),
         ("0 1\n", "line 1: expected at least 3 numbers, got '0 1'"),
-        ("1,5 2,5 3,5\n", "line 1: expected 4 numbers, got '1,5 2,5 3,5'"),
+        ("0 0 0\n1,5 2,5 3,5\n", "line 2: expected 3 numbers, got '1,5 2,5 3,5'; write all dec"),
+        ("0;0;0\n1,5;2,5;3,5\n", "line 2: expected 3 numbers, got '1,5;2,5;3,5'; write all dec"),
+        (
+            "//X Y Z R G B Scalar field\n2\n0 1 2 3 4 5 6\n",
+            "line 3: expected 8 numbers, got '0 1 2 3 4 5 6', under names that may hold blanks: "
+            "'X Y Z R G B Scalar field'; name the 7 columns with --columns, or put _ in place",
+        ),
+        ("9\n0 1 2\n3 4 5\n", "expected 9 points, as the line before them says, got 2; the file"),
+        ("2\n1\n0 0 0\n", "line 2: expected a point after the count of points, got a second count"),
+        (
+            "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n",
+            "expected points, got a matrix of 4 x 4, a pose; name the file of the cloud",
+        ),
+        (
+            f"{'1 ' * 900}\n{'2 ' * 900}\n# z\n{'3 ' * 900}\n",
+            "expected a row for each point, got 3 rows of 900 numbers; transpose them",
+        ),
         ("0,1,2\n3 4 5\n", "line 2: expected 3 numbers, got '3 4 5'"),
         ("a b c\n0 1 2\n", "line 1: expected numbers or names of columns with x, y and z, got 'a"),
         ("x y z x\n0 1 2 3\n", "line 1: expected numbers or names of columns"),

@@ -3,6 +3,10 @@
 import dataclasses
 import errno
 import itertools
+import os
+import re
+from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -118,7 +122,7 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
     whole = segment_planes(Cloud(points).points, config)
     done = []
     run = TileTask.run
-    monkeypatch.setattr(TileTask, "run", lambda task: (run(task), done.append(task.name)))
+    monkeypatch.setattr(TileTask, "run", lambda task: (done.append(task.name), run(task))[1])
     for name in ("read_points", "sort_points", "grow_regions", "finish_regions"):
         step = getattr(stages, name)
         counted = lambda *given, step=step: (step(*given), done.append(step.__name__))  # noqa: E731
@@ -142,6 +146,128 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
     assert not tmp_path.exists()
 
 
+def begun(points, folder, config, stage):
+    """Segment until a stage begins."""
+
+    def stop(begun, number, of):
+        if begun == stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        segment(points, folder, config, 300, on_stage=stop)
+
+
+def zero_rows(path):
+    content = path.read_bytes()
+    path.write_bytes(content[:128].ljust(len(content), b"\0"))
+
+
+def cut_off(path):
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def damage_header(path):
+    content = path.read_bytes()
+    path.write_bytes(bytes(128) + content[128:])
+
+
+@pytest.mark.parametrize("damage", [zero_rows, cut_off, damage_header, Path.unlink])
+def test_what_the_disk_has_lost_is_made_again(damage, tmp_path):
+    points, config = wall(700), settings("classic")
+    whole = segment_planes(Cloud(points).points, config)
+    for name in ("points", "rows", "boxes_low", "neighbors", "normals", "edges_1"):
+        begun(points, tmp_path / name, config, "growth")
+        damage(TileFiles(tmp_path / name).path(name))
+        assert_same(segment(points, tmp_path / name, config, 500), whole)
+    segment(points, tmp_path / "all", config, 300)
+    for path in (tmp_path / "all").glob("[!t]*"):
+        damage(path)
+    assert_same(segment(points, tmp_path / "all", config, 300), whole)
+
+
+def test_points_that_are_lost_are_not_taken_from_another_cloud(tmp_path):
+    config = settings("classic")
+    segment(wall(400), tmp_path, config, 300)
+    zero_rows(tmp_path / "points.npy")
+    with pytest.raises(FormatError, match=r"points\.npy: is damaged, and the points .* are others"):
+        segment_tiles([], tmp_path, config)
+    segment(wall(400), tmp_path, config, 300)
+    segment_tiles([], tmp_path, config)
+
+
+def test_a_record_that_is_damaged_is_one_line_or_made_again(tmp_path):
+    points, config = wall(600), settings("classic")
+    whole = segment_planes(Cloud(points).points, config)
+    rng, ends = np.random.default_rng(1), Counter()
+    segment(points, tmp_path, config, 300)
+    record = (tmp_path / "tiles.json").read_bytes()
+    for place in rng.integers(0, len(record), 40):
+        for damaged in (
+            record[:place] + bytes([record[place] ^ 1]) + record[place + 1 :],
+            record[:place],
+            record[:place] + bytes(len(record) - place),
+        ):
+            (tmp_path / "tiles.json").write_bytes(damaged)
+            try:
+                assert_same(segment(points, tmp_path, config, 300), whole)
+            except FormatError as error:
+                ends[re.sub(r".*: (is in the way|line).*", r"\1", str(error), flags=re.DOTALL)] += 1
+    assert set(ends) == {"is in the way", "line"}
+
+
+def test_an_array_that_is_lost_during_the_work_is_one_line(tmp_path):
+    points, config = wall(600), settings("classic")
+    for stage, at, name in (
+        ("normals", 0, "neighbors"),
+        ("normals", 1, "normals"),
+        ("edges", 0, "cloud"),
+        ("regions", 0, "heads"),
+    ):
+
+        def lose(begun, number, of, *, stage=stage, at=at, name=name):
+            if (begun, number) == (stage, at):
+                os.truncate(tmp_path / stage / f"{name}.npy", 100)
+
+        message = rf"{name}\.npy: is damaged: .*; run the same again, or remove .*{stage} and begin"
+        with pytest.raises(FormatError, match=message):
+            segment(points, tmp_path / stage, config, 300, on_stage=lose)
+        TileFiles(tmp_path / stage).remove_all()
+
+
+def test_what_others_have_put_among_the_arrays_stays(tmp_path):
+    points, config = wall(600), settings("classic")
+    begun(points, tmp_path, config, "growth")
+    (tmp_path / "theirs.npy").write_text("theirs")
+    (tmp_path / "labels.npy").symlink_to(tmp_path / "theirs.npy")
+    with pytest.raises(FormatError, match=r"labels\.npy: is in the way, this work has not made it"):
+        segment(points, tmp_path, config, 300)
+    (tmp_path / "labels.npy").unlink()
+    segment(points, tmp_path, config, 300)
+    (tmp_path / "normals.npy").unlink()
+    (tmp_path / "normals.npy").symlink_to(tmp_path / "theirs.npy")
+    TileFiles(tmp_path).remove_all()
+    assert {path.name for path in tmp_path.iterdir()} == {"theirs.npy", "normals.npy"}
+    assert (tmp_path / "theirs.npy").read_text() == "theirs"
+
+
+def test_a_folder_that_holds_something_else_is_refused(tmp_path):
+    points, config = wall(300), settings("classic")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "folder")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FormatError, match=r"link: expected a directory, got a symbolic link"):
+        segment(points, tmp_path / "link", config, 100)
+    with pytest.raises(FormatError, match="file: cannot be made: File exists"):
+        segment(points, tmp_path / "file", config, 100)
+    (tmp_path / "folder" / "notes.txt").write_text("theirs")
+    with pytest.raises(FormatError, match=r"expected an empty directory .* with notes\.txt"):
+        segment(points, tmp_path / "folder", config, 100)
+    (tmp_path / "folder" / "tiles.json").write_text("theirs")
+    with pytest.raises(FormatError, match=r"tiles\.json: is in the way, it is no record"):
+        segment(points, tmp_path / "folder", config, 100)
+    assert len(list((tmp_path / "folder").iterdir())) == 2
+
+
 def test_work_of_other_settings_or_files_is_refused(tmp_path):
     points = wall(300)
     segment(points, tmp_path, settings("classic"), 100, identity={"file": "a"})
@@ -151,10 +277,11 @@ def test_work_of_other_settings_or_files_is_refused(tmp_path):
 
 
 def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
-    files = TileFiles(tmp_path, {})
+    files = TileFiles(tmp_path / "a", {})
+    files.reserve("a.npy")
     with (
         pytest.raises(FormatError, match=r"a\.npy: cannot be written: No space left.*goes on"),
-        files.writing(files.path("a")),
+        files.opened("a.npy"),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))

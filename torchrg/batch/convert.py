@@ -11,10 +11,17 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.batch.records import RECORD, describe_job, read_record, write_record
+from torchrg.batch.records import (
+    RECORD,
+    check_record,
+    describe_job,
+    is_unchanged,
+    read_record,
+    write_record,
+)
 from torchrg.batch.scans import Converted, Job
 from torchrg.errors import TorchrgError
-from torchrg.io.files import remove_leftovers
+from torchrg.io.files import check_place, marked_parts, sync_folder
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -65,18 +72,27 @@ def convert_scan(job: Job) -> ScanReport:
         begin("hash")
         description = describe_job(job)
         job.folder.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(job.folder)
+        for folder in (job.folder, *job.folder.parents):
+            sync_folder(folder.parent)
+            if folder == job.out:
+                break
+        check_place(job.folder / RECORD)
+        check_record(job)
+        job.remove_leftovers()
         earlier = read_record(job) or {"outputs": {}}
         (job.folder / RECORD).unlink(missing_ok=True)
-        converted = job.source.convert(job.scan, job.folder, begin)
-        begin("record")
-        for name in earlier["outputs"].keys() - set(converted.files):
-            (job.folder / name).unlink(missing_ok=True)
-        write_record(job, description, converted)
+        with marked_parts(job.mark):
+            converted = job.source.convert(job.scan, job.folder, begin)
+            begin("record")
+            for name in earlier["outputs"].keys() - set(converted.files):
+                if is_unchanged(job, name, earlier["outputs"][name]):
+                    (job.folder / name).unlink()
+            write_record(job, description, converted)
         return converted
 
+    is_new = not job.folder.exists()
     report = report_on(job.scan.name, convert)
-    if report.status == "failed":
+    if report.status == "failed" and is_new:
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
     return report

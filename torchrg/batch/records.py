@@ -12,6 +12,7 @@ import torch
 
 from torchrg.batch.scans import Converted, Job
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
+from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 
 RECORD = "provenance.json"
@@ -88,11 +89,39 @@ def write_record(job: Job, description: dict[str, Any], converted: Converted) ->
 
 def read_record(job: Job) -> dict[str, Any] | None:
     """Return the record of a scan, or None if there is none that can be read."""
+    record = _read_json(job)
+    return record if _is_record(record) else None
+
+
+def check_record(job: Job) -> None:
+    """Raise FormatError if another program has a file in the place of the record."""
+    other = _read_json(job)
+    if other is not None and not _is_record(other):
+        raise FormatError(
+            f"{job.folder / RECORD}: was not written by torchrg; move it away, or choose another "
+            "directory."
+        )
+
+
+def _read_json(job: Job) -> Any:  # noqa: ANN401
+    """Return what is in the place of the record, None if it is not there or damaged."""
     try:
-        record = json.loads((job.folder / RECORD).read_bytes())
+        return json.loads((job.folder / RECORD).read_bytes())
     except (OSError, ValueError):
         return None
-    return record if isinstance(record, dict) and isinstance(record.get("outputs"), dict) else None
+
+
+def _is_record(found: Any) -> bool:  # noqa: ANN401
+    """Return whether an object of JSON is a record."""
+    parts = ("versions", "outputs")
+    return isinstance(found, dict) and all(isinstance(found.get(part), dict) for part in parts)
+
+
+def is_unchanged(job: Job, name: str, noted: Any) -> bool:  # noqa: ANN401
+    """Return whether a file beside a record is still the one that the record notes."""
+    path = job.folder / name
+    is_result = path.parent == job.folder and path.is_file() and not path.is_symlink()
+    return is_result and bool(_fingerprint(path) == noted)
 
 
 def reason_to_convert(job: Job) -> str:

@@ -4,9 +4,10 @@ import contextlib
 import json
 import os
 import platform
+import re
 import shutil
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from multiprocessing import reduction
@@ -16,14 +17,18 @@ from typing import Any, NamedTuple
 from torchrg.batch.convert import ScanReport
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.report import BatchReport, format_table, kept_report
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Scan, Source
+from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
+from torchrg.io.files import make_mark, sync_folder
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
 LOCK = ".torchrg.lock"
 """Name of the file that is locked. It stays when the lock goes."""
+_HELD = re.compile(r"(?:([0-9a-f]{16}) )?(process \d+ on .*)?", re.DOTALL)
+"""What is in it: a mark, which older versions did not write, and who holds it or did last."""
 _PATIENCE_SECONDS = 5.0
 """How long a lock that is held is waited for: workers of a command that was killed end by then."""
 Reports = Generator[ScanReport | None, None, None]
@@ -59,20 +64,56 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
 
     Raises:
         ConfigError: If no name matches the pattern, or results would go in among the scans.
-        FormatError: If the source has no scans.
+        FormatError: If the source has no scans, or the results of one have no place of their own.
     """
-    if source.root in out.parents or (source.root == out and not source.in_place):
+    is_among = source.root in out.parents or (source.root == out and not source.in_place)
+    scans = [] if is_among else source.list_scans()
+    if is_among or _is_among_scans(source, scans, out):
         raise ConfigError(
             f"{out}: expected a directory outside {source.root}, so that no result is read as a "
             "scan; choose another."
         )
-    scans = source.list_scans()
+    _check_names(source.root, scans)
     chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
     if not chosen:
         names = ", ".join(scan.name for scan in scans[:5])
         more = f" and {len(scans) - 5:,} more" if len(scans) > 5 else ""
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
     return [Job(source, scan, out) for scan in chosen]
+
+
+def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
+    """Whether results would be read as scans the next time, also through links."""
+    if source.root == out:
+        return False
+    inputs = (Path(os.path.realpath(file)) for scan in scans for file in scan.inputs)
+    return any((out / scan.name).is_relative_to(source.root) for scan in scans) or (
+        not source.root.is_relative_to(out) and any(file.is_relative_to(out) for file in inputs)
+    )
+
+
+def _check_names(root: Path, scans: Sequence[Scan]) -> None:
+    """Refuse scans whose results would share a folder, or take the place of the batch's own files.
+
+    See :func:`torchrg.datasets.folder.folded_name`.
+    """
+    batch_files = {folded_name(name): name for name in (REPORT, LOCK)}
+    taken: dict[str, str] = {}
+    for name in (scan.name for scan in scans):
+        key = folded_name(name)
+        if name.startswith("/") or ".." in name.split("/"):
+            raise FormatError(f"{root}: expected names of scans below a folder, got {name!r}.")
+        if key in taken:
+            raise FormatError(
+                f"{root}: expected a folder for each scan, got one for {taken[key]} and {name}, "
+                "which many file systems take for the same; rename one."
+            )
+        taken[key] = name
+        if (first := key.partition("/")[0]) in batch_files:
+            raise FormatError(
+                f"{root}: expected no scan called {name}, as OUT/{batch_files[first]} is a file "
+                "of the command; rename it."
+            )
 
 
 def make_plan(
@@ -182,8 +223,12 @@ class DirectoryLock:
         folder: The directory; it exists.
         patience: Seconds to wait for another holder.
 
+    Attributes:
+        mark: Of the names that holders of this lock write under before files have their own, the
+            same for all of them; see :func:`torchrg.io.files.marked_parts`.
+
     Raises:
-        FormatError: If another process holds the lock.
+        FormatError: If another process holds the lock, or the file of the lock is another one.
 
     Example:
         >>> import tempfile
@@ -194,25 +239,53 @@ class DirectoryLock:
     """
 
     def __init__(self, folder: Path, *, patience: float = _PATIENCE_SECONDS) -> None:
-        import fcntl
-
-        self.descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        path = folder / LOCK
+        try:
+            self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        except OSError as error:
+            raise FormatError(f"{path}: cannot be written: {error.strerror}.") from error
         end = time.monotonic() + patience
-        while True:
-            try:
-                fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
+        try:
+            self._read(path)
+            while not self._take():
                 if time.monotonic() >= end:
-                    holder = os.pread(self.descriptor, 200, 0).decode(errors="replace").strip()
-                    os.close(self.descriptor)
+                    _, holder = self._read(path)
                     raise FormatError(
                         f"{folder}: another torchrg command ({holder or 'unknown'}) writes here; "
                         "wait for it, stop it, or choose another directory."
-                    ) from None
+                    )
                 time.sleep(0.05)
-        os.ftruncate(self.descriptor, 0)
-        os.pwrite(self.descriptor, f"process {os.getpid()} on {platform.node()}".encode(), 0)
+        except FormatError:
+            os.close(self.descriptor)
+            raise
+        mark, _ = self._read(path)
+        self.mark = mark or make_mark()
+        text = f"{self.mark} process {os.getpid()} on {platform.node()}".encode()
+        os.pwrite(self.descriptor, text, 0)
+        os.ftruncate(self.descriptor, len(text))
+        os.fsync(self.descriptor)
+        sync_folder(folder)
+
+    def _read(self, path: Path) -> tuple[str | None, str | None]:
+        """Return the mark in the file of the lock, and who holds the lock or did last."""
+        text = os.pread(self.descriptor, 400, 0).decode(errors="replace").rstrip("\0")
+        held = _HELD.fullmatch(text)
+        if held is None:
+            raise FormatError(
+                f"{path}: is in the way, it is no lock of torchrg; move it away, or choose another "
+                "directory."
+            )
+        return held[1], held[2]
+
+    def _take(self) -> bool:
+        """Return whether the lock could be had."""
+        import fcntl
+
+        try:
+            fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
 
     def __enter__(self) -> "DirectoryLock":
         return self
@@ -221,11 +294,11 @@ class DirectoryLock:
         os.close(self.descriptor)
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        return _hold, (reduction.DupFd(self.descriptor),)
+        return _hold, (reduction.DupFd(self.descriptor), self.mark)
 
 
-def _hold(duplicate: Any) -> DirectoryLock:  # noqa: ANN401
+def _hold(duplicate: Any, mark: str) -> DirectoryLock:  # noqa: ANN401
     """Return the lock in a process that was started with it."""
     lock = DirectoryLock.__new__(DirectoryLock)
-    lock.descriptor = duplicate.detach()
+    lock.descriptor, lock.mark = duplicate.detach(), mark
     return lock

@@ -1,20 +1,35 @@
 """What a batch is made of: scans, where they come from, and the job that converts one."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.datasets import describe_planes
+from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_arrays
 from torchrg.errors import FormatError
-from torchrg.io import CloudStream, atomic_path
-from torchrg.io.files import remove_leftovers
+from torchrg.io import CloudStream
+from torchrg.io.files import make_mark, remove_leftovers
 from torchrg.io.stream import Extent
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import FARTHEST, Cloud, Segmentation
+
+_LOOKED_AT = 10_000
+"""Points, spread over a cloud or its first chunk, that tell where most are."""
+_MIDDLE = (0.25, 0.75)
+_FAR_OFF = 1000
+"""Extent of a cloud over that of its middle half, along any axis: float32 has seven digits, so that
+beyond it steps are 1e-4 of where most points are."""
+
+_FIELDS = {
+    "plane": "labels",
+    "normal": "normals",
+    "curvature": "curvature",
+    "color": "color",
+    "superpoint": "superpoints",
+}
+"""Fields of a cloud by the arrays of a folder that hold them."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +104,21 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Job:
-    """One scan to convert, with everything that a process on any machine needs for it."""
+    """One scan to convert, with everything that a process on any machine needs for it.
+
+    Attributes:
+        source: The data set.
+        scan: One of its scans.
+        out: Where results go.
+        mark: Of the names that results are written under before they have their own; see
+            :func:`torchrg.io.files.marked_parts`. What a killed process leaves is removed by those
+            who know it.
+    """
 
     source: Source
     scan: Scan
     out: Path
+    mark: str = field(default_factory=make_mark, compare=False)
 
     @property
     def folder(self) -> Path:
@@ -103,7 +128,7 @@ class Job:
     def remove_leftovers(self) -> None:
         """Remove what a process that was killed left half-written."""
         if self.folder.is_dir():
-            remove_leftovers(self.folder)
+            remove_leftovers(self.folder, self.mark)
 
 
 class Task(Protocol):
@@ -118,21 +143,36 @@ class Task(Protocol):
 
 
 def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
-    """Return a warning if some points of a cloud are not finite; raise FormatError if none is.
+    """Return a warning if points of a cloud are missing or far off; raise FormatError if all are.
 
     Example:
-        >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]])))
-        ('1 of 2 points are not finite; they stay in place, unlabelled',)
+        >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
+        ('2 of 3 points are not finite or beyond 1e+12; they stay in place, unlabelled',)
     """
-    num_points, num_finite, *_ = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
-    num_bad = num_points - num_finite
-    if num_finite == 0:
+    extent = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
+    num_points, num_bad = extent.num_points, extent.num_points - extent.num_finite
+    if extent.num_finite == 0:
         raise FormatError(
-            f"{cloud.source}: expected finite points, got none in {num_bad:,} points."
+            f"{cloud.source}: expected finite points, got none in {num_bad:,} points; those beyond "
+            f"{FARTHEST:g} count as missing: use another unit, or look where they come from."
         )
-    if not num_bad:
-        return ()
-    return (f"{num_bad:,} of {num_points:,} points are not finite; they stay in place, unlabelled",)
+    notes = []
+    if num_bad:
+        notes.append(
+            f"{num_bad:,} of {num_points:,} points are not finite or beyond {FARTHEST:g}; they "
+            "stay in place, unlabelled"
+        )
+    first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
+    known = first.coordinates[first.finite][:: max(len(first) // _LOOKED_AT, 1)]
+    if len(known):
+        low, high = np.quantile(known, _MIDDLE, axis=0)
+        size, width = (extent.high - extent.low).max(), float((high - low).max())
+        if width > 0 and size > _FAR_OFF * width:
+            notes.append(
+                f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which "
+                "costs the others their precision; remove those that are none"
+            )
+    return tuple(notes)
 
 
 def write_results(
@@ -147,7 +187,8 @@ def write_results(
 
     Into a folder that exists; ``coord`` ``(*, 3)`` in the dtype to be written, the segmentation of
     the same leading axes, further ``fields`` by name. ``origin`` is where the origin of the
-    segmentation is, in the coordinates of ``coord``. Returns the names of the files.
+    segmentation is, in the coordinates of ``coord``. Returns the names of the files; those of
+    others are never replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,
@@ -156,10 +197,12 @@ def write_results(
         "plane": segmentation.labels.numpy().astype(np.int32),
         **(fields or {}),
     }
-    for name, values in arrays.items():
-        with atomic_path(folder / f"{name}.npy") as beside:
-            np.save(beside, np.ascontiguousarray(values), allow_pickle=False)
-    table = describe_planes(segmentation.planes, origin=origin)
-    with atomic_path(folder / "planes.json") as beside:
-        beside.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
-    return [*(f"{name}.npy" for name in arrays), "planes.json"]
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    return write_arrays(folder, arrays, describe_planes(segmentation.planes, origin=origin))
+
+
+def read_results(folder: Path) -> Cloud:
+    """Return a converted scan, or any folder in Pointcept's layout, as a cloud with its results."""
+    sample = read_pointcept_scene(folder)
+    fields = {_FIELDS[name]: values.numpy() for name, values in sample.items() if name in _FIELDS}
+    return Cloud(sample["coord"].numpy(), fields, source=str(folder))

@@ -30,7 +30,7 @@ from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import estimate_points, read_cloud
+from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.structures import Cloud, Segmentation
 
@@ -55,12 +55,17 @@ class FolderSource:
         out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
             no other folder below it can be.
         superpoint: Whether superpoints are written as ``superpoint.npy`` too.
+        columns: Names for the columns of text and of bare ``.npy`` arrays; see
+            :func:`torchrg.read_cloud`.
+        suffixes: Which files are clouds. Default: all that can be read.
     """
 
     root: Path
     settings: PipelineConfig
     out: Path
     superpoint: bool = False
+    columns: tuple[str, ...] | None = None
+    suffixes: tuple[str, ...] = tuple(FORMATS)
     bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4 + 4
 
     @property
@@ -70,11 +75,12 @@ class FolderSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return {"kind": "folder", "superpoint": self.superpoint}
+        described = {"kind": "folder", "superpoint": self.superpoint}
+        return described if self.columns is None else described | {"columns": list(self.columns)}
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
-        scenes = FolderOfClouds(self.root).scenes
+        scenes = FolderOfClouds(self.root, suffixes=self.suffixes).scenes
         file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
         if file is not None and self.in_place:
             raise ConfigError(
@@ -99,19 +105,21 @@ class FolderSource:
         first = scan.inputs[0]
         is_file = first.parent.relative_to(self.root).as_posix() != scan.name
         if is_file:
-            cloud = read_cloud(first)
+            cloud = read_cloud(first, columns=self.columns if takes_columns(first) else None)
         else:
             sample = read_pointcept_scene(first.parent)
             # Pointcept's colours are 0 to 255 in any type.
             colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
             cloud = Cloud(sample["coord"].numpy(), colors, source=str(first.parent))
-        warnings = check_finite(cloud)
+        warnings = (*cloud.notes, *check_finite(cloud))
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         color = cloud.fields.get("color")
         parts = _superpoints(cloud, seg, color, begin) if self.superpoint else None
         begin("write")
         origin = cloud.origin.tolist()
         if is_file:
+            if others := [name for name in cloud.fields if name != "color"]:
+                warnings += (f"left out: {', '.join(others)}",)
             found = {"color": color, "superpoint": parts}
             fields = {name: values for name, values in found.items() if values is not None}
             files = write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)

@@ -1,6 +1,8 @@
 """A cloud in tiles, as a command does it: within a limit of memory, alone in its directory."""
 
 import contextlib
+import hashlib
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,8 +19,18 @@ from torchrg.batch.run import LOCK, DirectoryLock, Reports
 from torchrg.batch.scans import Converted, Scan
 from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.files import marked_parts, remove_leftovers
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiling import TILE_SIZE, TileFiles, TileTask, run_in_turn, segment_tiles
+from torchrg.tiling import (
+    TILE_SIZE,
+    Done,
+    TileFiles,
+    TileTask,
+    Written,
+    make_folder,
+    run_in_turn,
+    segment_tiles,
+)
 
 _BASE_BYTES = 500_000_000
 """Of a process before the first point: Python, torch, scipy."""
@@ -71,6 +83,23 @@ def choose_workers(num_points: int, tile_size: int, memory_limit: int) -> int:
     return max(min(torch.get_num_threads(), room, num_points // _LEAST_POINTS_A_WORKER), 1)
 
 
+def folder_of_work(target: Path, workdir: Path | None = None) -> Path:
+    """Return the folder for the work on one result: in a directory for such folders, or beside it.
+
+    It is the same for every command with this result, and no command with another one has it.
+
+    Example:
+        >>> folder_of_work(Path("out/room.npz")).as_posix()
+        'out/.room.npz.tiles'
+        >>> folder_of_work(Path("/out/room.npz"), Path("scratch")).as_posix()
+        'scratch/room.npz.16b363c9.tiles'
+    """
+    if workdir is None:
+        return target.with_name(f".{target.name}.tiles")
+    place = hashlib.sha256(os.fsencode(os.path.realpath(target))).hexdigest()
+    return workdir / f"{target.name}.{place[:8]}.tiles"
+
+
 @contextlib.contextmanager
 def segmented_in_tiles(
     sources: Sequence[Path],
@@ -79,39 +108,47 @@ def segmented_in_tiles(
     settings: PipelineConfig,
     *,
     tile_size: int,
+    target: Path | None = None,
     workers: int = 1,
     start: Callable[[Sequence["TileJob"]], Reports] | None = None,
     on_stage: Callable[[str, int, int], None] | None = None,
+    columns: str | None = None,
 ) -> Iterator[Segmentation]:
-    """Segment files as one cloud, and remove the working directory when the result is used.
+    """Segment files as one cloud, and remove the work when the result is used.
 
-    Where the work or what is done with the result ends early, the directory stays, and the same
-    call goes on from there.
+    Where the work or what is done with the result ends early, it stays, and the same call goes on
+    from there.
 
     Args:
         sources: The files.
         chunks: Their points.
-        folder: Working directory; another process that works there is refused.
+        folder: Of the work alone; see :func:`torchrg.tiling.segment_tiles`. Another process that
+            works there is refused.
         settings: Of the pipeline.
         tile_size: Points of a tile.
+        target: The file that the caller writes the result to. What an earlier call was writing when
+            it was killed is removed.
         workers: Processes of one thread that work on tiles side by side, as many as there is memory
             for; with one, this process works on tile after tile, on its threads.
         start: Starts another engine on the jobs of a stage.
         on_stage: See :func:`torchrg.tiling.segment_tiles`.
+        columns: Names that were given for the columns of the files.
 
     Yields:
         The segmentation.
 
     Raises:
-        FormatError: If another process works in the directory, or a tile failed.
+        ConfigError: If the folder holds one of the files.
+        FormatError: If the folder holds something else, another process works there, or a tile
+            failed.
     """
+    _check_outside(folder, sources if target is None else [*sources, target])
     inputs = [{"name": path.name, "sha256": hash_file(path)} for path in sources]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{folder}: cannot be made: {error.strerror or error}.") from error
-    files = TileFiles(folder)
-    with DirectoryLock(folder) as lock:
+    named = {} if columns is None else {"columns": columns}
+    make_folder(folder)
+    with DirectoryLock(folder) as lock, marked_parts(lock.mark):
+        if target is not None:
+            remove_leftovers(target.resolve().parent, lock.mark)
         if start is None and workers > 1:
             start = partial(
                 run_local, workers=workers, memory_limit=sys.maxsize, lock=lock, work=work_on_tile
@@ -122,21 +159,31 @@ def segmented_in_tiles(
                 folder,
                 settings,
                 tile_size=tile_size,
-                identity={"inputs": inputs, "versions": describe_versions()},
+                identity={"inputs": inputs, "versions": describe_versions(), **named},
                 run=run_in_turn if start is None else partial(_run_jobs, start=start),
                 on_stage=on_stage,
             )
         except BaseException:
-            if not files.is_begun:
-                _remove(files)
+            if not TileFiles(folder).is_begun:
+                _remove_work(folder)
             raise
-        _remove(files)
+        _remove_work(folder)
 
 
-def _remove(files: TileFiles) -> None:
-    """Remove the working directory, unless something else is in it."""
-    (files.folder / LOCK).unlink(missing_ok=True)
-    files.remove_all()
+def _check_outside(folder: Path, files: Sequence[Path]) -> None:
+    """Refuse files of the user in the folder of the work."""
+    for file in files:
+        if folder.resolve() in file.resolve().parents:
+            raise ConfigError(
+                f"{file}: expected a file outside of {folder}, which is for the work on it alone; "
+                "move it, or choose another directory for the work."
+            )
+
+
+def _remove_work(folder: Path) -> None:
+    """Remove what the work has made, and its folder unless something else is in it."""
+    (folder / LOCK).unlink(missing_ok=True)
+    TileFiles(folder).remove_all()
 
 
 @dataclass(frozen=True)
@@ -155,20 +202,29 @@ class TileJob:
         """Do nothing: a tile is written where it belongs."""
 
 
-def work_on_tile(job: TileJob) -> ScanReport:
+@dataclass(frozen=True)
+class TileReport(ScanReport):
+    """What became of a tile, and what has been written for it."""
+
+    written: tuple[Written, ...] = ()
+
+
+def work_on_tile(job: TileJob) -> TileReport:
     """Work on a tile; what goes wrong is in the report."""
+    written: list[Written] = []
 
     def work(begin: Callable[[str], None]) -> Converted:
         begin(job.task.stage)
-        job.task.run()
+        written.extend(job.task.run())
         return Converted(job.task.num_points, 0, ())
 
-    return report_on(job.task.name, work)
+    report = report_on(job.task.name, work)
+    return TileReport(**vars(report), written=tuple(written))
 
 
 def _run_jobs(
     tasks: Sequence[TileTask], start: Callable[[Sequence[TileJob]], Reports]
-) -> Iterator[TileTask]:
+) -> Iterator[Done]:
     """Run tasks on an engine, and yield each that is done; raise FormatError for one that fails."""
     by_name = {task.name: task for task in tasks}
     if not tasks:
@@ -177,6 +233,6 @@ def _run_jobs(
         for report in reports:
             if report is None:
                 continue
-            if report.status == "failed":
+            if not isinstance(report, TileReport) or report.status == "failed":
                 raise FormatError(f"{report.name}: {report.reason}")
-            yield by_name[report.name]
+            yield by_name[report.name], report.written

@@ -7,6 +7,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 from io import UnsupportedOperation
 
+from torchrg.cli.ending import (
+    INTERRUPTED,
+    INTERRUPTED_LINE,
+    USAGE_ERROR,
+    fail,
+    raising_interrupts,
+)
+from torchrg.errors import ConfigError, TorchrgError
+
 COMMANDS = {
     "segment": "label the planes of scans",
     "depth": "label the planes of depth images and of organised clouds",
@@ -38,9 +47,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 done; 2 wrong use or bad input; 3 some items of a batch failed; 130 interrupted.
     """
-    from torchrg.cli.console import INTERRUPTED, fail
-    from torchrg.errors import TorchrgError
-
     arguments = list(sys.argv[1:] if argv is None else argv)
     name = next(iter(arguments), "")
     try:
@@ -61,14 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         return fail(f"{error.filename or name}: {error.strerror or error}.")
     except KeyboardInterrupt:
-        return fail("interrupted; every file written is complete.", code=INTERRUPTED)
+        return fail(INTERRUPTED_LINE, code=INTERRUPTED)
 
 
 def _run(arguments: list[str]) -> int:
     """Run the command that the first argument names."""
-    from torchrg.cli.console import USAGE_ERROR
-    from torchrg.errors import ConfigError
-
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if arguments else USAGE_ERROR
@@ -80,5 +83,7 @@ def _run(arguments: list[str]) -> int:
         return 0
     if name not in COMMANDS:
         raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
-    code: int = importlib.import_module(f"torchrg.cli.{name}").run(rest)
+    command = importlib.import_module(f"torchrg.cli.{name}")
+    with raising_interrupts():
+        code: int = command.run(rest)
     return code

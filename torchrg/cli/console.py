@@ -5,10 +5,8 @@ import dataclasses
 import io
 import os
 import re
-import signal
-import sys
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -18,28 +16,31 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from torchrg.cli.ending import INTERRUPTED as INTERRUPTED
+from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
+from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
+from torchrg.cli.ending import fail as fail
+from torchrg.cli.ending import warn as warn
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
+from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import FORMATS, check_output
-from torchrg.io.files import check_place
+from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
+from torchrg.io.fields import COLUMNS_RULE, notes_on_results
+from torchrg.io.files import check_place, make_folder
 from torchrg.render.page import check_library
-
-USAGE_ERROR = 2
-SOME_FAILED = 3
-INTERRUPTED = 130
+from torchrg.structures import Cloud
 
 Arguments = TypeVar("Arguments")
 
 
-def fail(message: str, *, code: int = USAGE_ERROR) -> int:
-    """Print one line on stderr and return the exit code."""
-    print(f"torchrg: {' '.join(message.split())}", file=sys.stderr)
-    return code
-
-
-def warn(message: str) -> None:
-    """Print one warning line on stderr."""
-    fail(f"warning: {message}")
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Print warnings as single lines."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    for warning in caught:
+        warn(str(warning.message))
 
 
 def parse(
@@ -112,6 +113,45 @@ class PlaneSettings:
         return cls(resolved=load_config(values["--config"] or values["--preset"]))
 
 
+ColumnsFlag = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="X,Y,Z,...",
+        help="Names of the columns of text and of bare .npy arrays, in their order, as "
+        f"x,y,z,intensity,r,g,b; _ leaves one out. {COLUMNS_RULE} What was taken is printed.",
+    ),
+]
+"""Type of the argument --columns."""
+
+
+@dataclass(frozen=True)
+class ColumnNames:
+    """What the flag --columns says: names for the columns of files that have none of their own.
+
+    Example:
+        >>> names = ColumnNames.parse("x,y,z,_", ["a.txt", "b.ply"])
+        >>> names.of("a.txt"), names.of("b.ply")
+        (('x', 'y', 'z', '_'), None)
+    """
+
+    names: tuple[str, ...] | None = None
+
+    @classmethod
+    def parse(
+        cls, text: str | None, paths: Iterable[str | os.PathLike[str]] | None
+    ) -> "ColumnNames":
+        """Return the names in a text, which are for some of the files, if these are known."""
+        if text is None:
+            return cls()
+        if paths is not None and not any(map(takes_columns, paths)):
+            raise ConfigError("expected text or .npy for --columns, got files that name their own.")
+        return cls(tuple(name.strip() for name in text.split(",")))
+
+    def of(self, path: str | os.PathLike[str]) -> tuple[str, ...] | None:
+        """Return the names for the columns of a file; None for one that says them itself."""
+        return self.names if takes_columns(path) else None
+
+
 SettingsFlags = Annotated[PlaneSettings, tyro.conf.arg(name="")]
 """Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
 
@@ -125,6 +165,25 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
             f"expected --intrinsics fx,fy,cx,cy, four numbers without blanks, got {text!r}."
         ) from None
     return fx, fy, cx, cy
+
+
+def note_input(
+    source: str, cloud: Cloud, target: Path, results: Collection[str] = RESULT_FIELDS
+) -> None:
+    """Warn of what reading took for granted, and of own fields that results take the names of."""
+    written = () if _is_archive(target) else notes_on_results(cloud.fields, results)
+    for note in (*cloud.notes, *written):
+        warn(f"{source}: {note}.")
+
+
+def without(target: Path, fields: Collection[str]) -> str:
+    """Return the words for a report on which fields of a cloud its result does not hold."""
+    return f" (without its own {', '.join(fields)})" if fields and _is_archive(target) else ""
+
+
+def _is_archive(target: Path) -> bool:
+    """Whether a result goes to the format that holds it alone, without fields of the cloud."""
+    return target.suffix.lower() == ".npz"
 
 
 def use_threads(threads: int | None) -> None:
@@ -150,16 +209,6 @@ def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None
 def num_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def terminate_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send, end the command as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def run_each(
@@ -195,7 +244,7 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     an existing directory; several need a directory, which is made.
 
     Raises:
-        FormatError: If there is no input, two results would share a name, or ``out`` cannot be
+        FormatError: If there is no input, two results would share a name, or one cannot be
             written.
     """
     if not inputs:
@@ -207,24 +256,41 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     if given in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
     results = [out / f"{path.stem}{suffix}" for path in inputs]
-    counts = Counter(results)
+    first: dict[str, Path] = {}
     for result, source in zip(results, inputs, strict=True):
-        if counts[result] > 1:
-            raise FormatError(f"{source}: another input has the same name; run them one by one.")
-    out.mkdir(parents=True, exist_ok=True)
+        other = first.setdefault(folded_name(result.name), source)
+        if other is not source:
+            raise FormatError(
+                f"{source}: another input has the same name, {other}, and {out / result.name} is "
+                "one place; give them different directories."
+            )
+    make_folder(out)
+    for result in results:
+        check_place(result)
     return results
 
 
 def check_apart(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     """Raise FormatError if a result would take the place of an input or of another result."""
-    taken = {path.resolve() for path in inputs}
+    taken = {str(path.resolve()) for path in inputs}
+    files = {_file_number(path) for path in inputs} - {None}
     for path in results:
-        if path.resolve() in taken:
+        place = str(path.resolve())
+        if not taken.isdisjoint((place, folded_name(place))) or _file_number(path) in files:
             raise FormatError(
                 f"{path}: expected a place of its own for each result, got one of an input or of "
                 "another result; choose another."
             )
-        taken.add(path.resolve())
+        taken.add(folded_name(place))
+
+
+def _file_number(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from others, whatever the case of its name; None without a file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 DRAWINGS = (".png", ".html")
@@ -244,8 +310,11 @@ def picture_paths(
         raise FormatError(
             f"{picture}: expected a directory for {len(results)} pictures, got a file name."
         )
-    picture.mkdir(parents=True, exist_ok=True)
-    return [picture / f"{path.stem}.png" for path in results]
+    make_folder(picture)
+    pictures = [picture / f"{path.stem}.png" for path in results]
+    for path in pictures:
+        check_place(path)
+    return [*pictures]
 
 
 def check_drawing(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:

@@ -2,8 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NoReturn
@@ -27,15 +26,16 @@ from torchrg.batch.run import (
     run_plan,
     write_report,
 )
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Source, read_results
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli import console
 from torchrg.config import DepthConfig
-from torchrg.datasets.pointcept import read_pointcept_scene
+from torchrg.datasets.folder import files_below
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.render.gallery import draw_entry, write_index
+from torchrg.io import FORMATS
+from torchrg.io.files import check_place, make_folder
+from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
-from torchrg.structures import Cloud
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,32 @@ class FolderArguments(CloudArguments):
     """Convert every cloud below a folder: normals, curvature, plane labels, table of planes.
 
     Clouds are files (.npz .npy .ply .pcd .las .laz .e57 .xyz .txt) and folders in Pointcept's
-    layout; with ROOT for OUT, the latter are completed in place.
+    layout; with ROOT for OUT, the latter are completed in place. The results of ROOT/a/b.ply are in
+    OUT/a/b. Links are followed, and each file is converted once.
     """
+
+    columns: console.ColumnsFlag = None
+    suffixes: tuple[str, ...] = tuple(FORMATS)
+    """Which files are clouds, where two differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        return FolderSource(root, self.settings.resolved, out, self.superpoint)
+        names = console.ColumnNames.parse(self.columns, _places_below(root)).names
+        return FolderSource(
+            root,
+            self.settings.resolved,
+            out,
+            self.superpoint,
+            columns=names,
+            suffixes=self.suffixes,
+        )
+
+
+def _places_below(root: Path) -> list[Path] | None:
+    """Return the files below a folder without a word on links, None where there is no folder."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return files_below(root) if root.is_dir() else None
 
 
 @dataclass(frozen=True)
@@ -162,16 +182,19 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
-    with _warnings_as_lines():
+    with console.warnings_as_lines():
         jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)
     if arguments.dry_run:
         print(format_plan(_look_at(jobs, arguments)))
         return 0
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{out}: cannot be made: {error.strerror or error}.") from error
-    with DirectoryLock(out) as lock, console.terminate_as_interrupt():
+    make_folder(out)
+    check_place(out / REPORT)
+    pages = _pages_of(arguments)
+    if pages is not None:
+        make_folder(pages)
+        check_gallery(pages, [job.scan.name for job in jobs])
+    with DirectoryLock(out) as lock:
+        jobs = [dataclasses.replace(job, mark=lock.mark) for job in jobs]
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
 
 
@@ -226,10 +249,11 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
         shown, engine = _Progress(bar, sizes, unit=arguments.unit), arguments.engine
         report = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
+    code = _finish(report, out, unit=arguments.unit)
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
-    return _finish(report, out, unit=arguments.unit)
+    return code
 
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
@@ -237,27 +261,15 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     done = {scan.name: scan for scan in report.scans if scan.status in ("converted", "kept")}
     jobs = [job for job in plan.jobs if job.scan.name in done]
     entries = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{folder}: cannot be made: {error.strerror or error}.") from error
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
         name = job.scan.name
         words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
         try:
-            cloud = _read_result(job.folder)
+            cloud = read_results(job.folder)
             entries.append(draw_entry(folder, name, cloud, words=words))
-        except TorchrgError as error:
+        except (TorchrgError, OSError) as error:
             console.warn(f"{name}: no page: {error}")
     print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
-
-
-def _read_result(folder: Path) -> Cloud:
-    """Return a converted scan as a cloud with the fields of a result."""
-    sample = read_pointcept_scene(folder)
-    names = {"plane": "labels", "normal": "normals", "curvature": "curvature", "color": "color"}
-    fields = {names[name]: values.numpy() for name, values in sample.items() if name in names}
-    return Cloud(sample["coord"].numpy(), fields, source=str(folder))
 
 
 class _Progress:
@@ -302,13 +314,3 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
         return console.fail(message, code=console.SOME_FAILED)
     print(f"{state} -> {out}")
     return 0
-
-
-@contextmanager
-def _warnings_as_lines() -> Iterator[None]:
-    """Print warnings as single lines."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        yield
-    for warning in caught:
-        console.warn(str(warning.message))

@@ -30,8 +30,9 @@ from torchrg.depth import (
     segment_depth,
 )
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import check_output, estimate_points, read_cloud, write_cloud
-from torchrg.io.files import check_place, remove_leftovers
+from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
+from torchrg.io.fields import notes_on_results
+from torchrg.io.files import check_place, make_mark, marked_parts, remove_leftovers
 from torchrg.render import color_planes, write_png
 from torchrg.structures import Cloud
 
@@ -82,21 +83,27 @@ class Labelled(NamedTuple):
     num_seen: int
     num_labelled: int
     num_planes: int
+    notes: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a user should know."""
-        return () if self.num_planes else ("no plane found: no region is large enough.",)
+        none = () if self.num_planes else ("no plane found: no region is large enough",)
+        return tuple(f"{note}." for note in (*self.notes, *none))
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image to label, with everything that another process needs for it."""
+    """One image to label, with everything that another process needs for it.
+
+    Results are written under names that bear the ``mark`` before they have their own.
+    """
 
     scan: Scan
     target: Path
     picture: Path | None
     arguments: Arguments
+    mark: str = dataclasses.field(default_factory=make_mark, compare=False)
 
     @property
     def source(self) -> Path:
@@ -107,7 +114,7 @@ class Frame:
         """Remove what a process that was killed left half-written."""
         for path in (self.target, self.picture):
             if path is not None:
-                remove_leftovers(path.parent, of=path.name)
+                remove_leftovers(path.resolve().parent, self.mark)
 
 
 def run(argv: list[str]) -> int:
@@ -121,8 +128,7 @@ def run(argv: list[str]) -> int:
     frames = _list_frames(sources, arguments)
     if len(frames) == 1:
         return _label_one(frames[0])
-    with console.terminate_as_interrupt():
-        return _label_sequence(frames)
+    return _label_sequence(frames)
 
 
 def list_images(inputs: Sequence[Path]) -> tuple[Path, ...]:
@@ -172,6 +178,8 @@ def _list_frames(sources: tuple[Path, ...], arguments: Arguments) -> list[Frame]
     ]
     drawn = [picture for picture in pictures if picture is not None]
     console.check_apart([*targets, *drawn], sources)
+    for picture in drawn:
+        check_place(picture)
     return [
         Frame(Scan(str(source), (source,), _size_of(source)), target, picture, arguments)
         for source, target, picture in zip(sources, targets, pictures, strict=True)
@@ -256,7 +264,8 @@ def report_frame(frame: Frame) -> ScanReport:
 
     def convert(begin: Callable[[str], None]) -> Converted:
         begin("planes")
-        found = label_frame(frame)
+        with marked_parts(frame.mark):
+            found = label_frame(frame)
         files = tuple(path.name for path in (frame.target, frame.picture) if path is not None)
         height, width = found.shape
         return Converted(height * width, found.num_planes, files, warnings=found.warnings)
@@ -277,6 +286,8 @@ def label_frame(frame: Frame) -> Labelled:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.from_numpy(cloud.origin)
     seg = segment_depth(depth, intrinsics, arguments.depth, pose=pose)
+    is_beside = target.suffix.lower() not in (".png", ".npz")
+    notes = notes_on_results(cloud.fields, RESULT_FIELDS) if is_beside else []
     if _is_png(target):
         write_png(target, seg.labels + 1)
     else:
@@ -297,6 +308,7 @@ def label_frame(frame: Frame) -> Labelled:
         int((depth > 0).sum()),
         int((seg.labels >= 0).sum()),
         len(seg.planes.count),
+        (*cloud.notes, *notes),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from torchrg.cli.console import parse
+from torchrg.cli.console import ColumnNames, ColumnsFlag, parse
 from torchrg.io import read_cloud
 from torchrg.neighbors import search_knn
 from torchrg.structures import Cloud
@@ -22,13 +22,18 @@ class Arguments:
 
     file: Annotated[Path, tyro.conf.Positional]
     """Cloud to read."""
+    columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments and print what the file holds."""
     arguments = parse(Arguments, argv, prog="torchrg info")
-    for name, value in describe_cloud(read_cloud(arguments.file)).items():
+    names = ColumnNames.parse(arguments.columns, [arguments.file])
+    cloud = read_cloud(arguments.file, columns=names.of(arguments.file))
+    for name, value in describe_cloud(cloud).items():
         print(f"{name:<12}{value}")
+    for note in cloud.notes:
+        print(f"{'note':<12}{note}")
     return 0
 
 

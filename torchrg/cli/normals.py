@@ -16,8 +16,12 @@ from torchrg.cli import console
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
+from torchrg.io.fields import put_results
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import Orientation
+
+RESULTS = ("normals", "curvature", "sharp", "valid")
+"""What is written of each point."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class Arguments:
     """Points handled at a time; bounds memory, never changes a result."""
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
+    columns: console.ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
@@ -53,6 +58,7 @@ def run(argv: list[str]) -> int:
     console.use_threads(arguments.threads)
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
+    console.ColumnNames.parse(arguments.columns, arguments.inputs)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     console.check_apart(outputs, arguments.inputs)
     return console.run_each(_estimate_file, arguments, arguments.inputs, outputs)
@@ -61,7 +67,9 @@ def run(argv: list[str]) -> int:
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
-    cloud = read_cloud(source)
+    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    cloud = read_cloud(source, columns=names.of(source))
+    console.note_input(f"{source}", cloud, target, RESULTS)
     check_finite(cloud)
     check_output(target, cloud)
     settings, size = arguments.normals, arguments.chunk_size
@@ -76,12 +84,13 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
             fit = fit._replace(normals=turned)
     provenance = describe_run(source, settings)
     provenance |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
+    if arguments.columns is not None:
+        provenance["columns"] = arguments.columns
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    found = {"normals": fit.normals, "curvature": fit.curvature, "sharp": sharp, "valid": fit.valid}
+    found = dict(zip(RESULTS, (fit.normals, fit.curvature, sharp, fit.valid), strict=True))
     # As with segmentations, .npz holds the results alone, other formats the cloud's fields too.
     kept = {} if target.suffix.lower() == ".npz" else cloud.fields
-    fields = {name: values for name, values in kept.items() if name not in found}
-    fields |= {name: values.numpy() for name, values in found.items()}
+    fields = put_results(kept, {name: values.numpy() for name, values in found.items()})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
     num_valid = int(fit.valid.sum())
     if num_valid < len(cloud):
@@ -89,4 +98,5 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         console.warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    print(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}")
+    without = console.without(target, cloud.fields)
+    print(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}{without}")

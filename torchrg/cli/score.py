@@ -7,18 +7,34 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
+import numpy as np
 import tyro
 from tqdm import tqdm
 
 from torchrg.batch.report import format_table
-from torchrg.cli.console import parse
-from torchrg.datasets.folder import natural_key
-from torchrg.errors import FormatError
-from torchrg.io import FORMATS, atomic_path, read_cloud
+from torchrg.batch.scans import read_results
+from torchrg.cli.console import (
+    ColumnNames,
+    ColumnsFlag,
+    check_apart,
+    parse,
+    warn,
+    warnings_as_lines,
+)
+from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
+from torchrg.errors import ConfigError, FormatError
+from torchrg.io import atomic_path, read_cloud
 from torchrg.io.files import check_place
-from torchrg.metrics import score_labels, score_normals, score_partition
+from torchrg.metrics import (
+    differing_rows,
+    match_points,
+    score_labels,
+    score_normals,
+    score_partition,
+)
+from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, Any]]
 """Indices by part (``labels``, ``normals``, ``superpoints``) and name."""
@@ -35,16 +51,24 @@ _MOST_NAMED = 5
 
 @dataclass(frozen=True)
 class Arguments:
-    """Score labels and normals against a truth of the same points in the same order.
+    """Score labels and normals against a truth of the same points.
 
-    Two files, or two folders: then files of the same name are compared, and the mean over the
-    scans is printed below them.
+    Two scans, or two folders: then scans of the same name are compared, and the mean over them is
+    printed below. A scan is a file, or a folder as torchrg convert writes it.
     """
 
     predicted: Annotated[Path, tyro.conf.Positional]
-    """File with labels or normals, as torchrg segment writes it, or a folder of such files."""
+    """Scan with labels or normals, as torchrg segment and convert write it, or a folder of
+    such."""
     truth: Annotated[Path, tyro.conf.Positional]
     """File with the true labels or normals, or a folder with such a file for each result."""
+    match: Literal["rows", "nearest"] = "rows"
+    """Which points are compared: those of one row, which must be the same, or each point of the
+    truth with the nearest one of the prediction. Every point of the truth counts once. One without
+    a match counts as unlabelled, and predicted points that are nearest to none count nowhere."""
+    match_distance: float | None = None
+    """How far the nearest point may be to match, in the unit of the cloud. Default: it must be the
+    same point but for the rounding of the files, in any order."""
     superpoints: bool = False
     """Score superpoints against the true labels, as torchrg segment --superpoints writes them."""
     ignore: int | None = None
@@ -56,19 +80,26 @@ class Arguments:
     """Print one JSON object instead of a table; for folders with the keys "scans" and "mean"."""
     csv: Path | None = None
     """Also write a CSV file: a row for each scan in natural order, for folders the mean last."""
+    columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, score what both sides have, and print it."""
     arguments = parse(Arguments, argv, prog="torchrg score")
+    distance = arguments.match_distance
+    if distance is not None and (arguments.match != "nearest" or not distance > 0):
+        raise ConfigError(f"expected --match-distance > 0 with --match nearest, got {distance}.")
     predicted, truth = arguments.predicted, arguments.truth
-    if predicted.is_dir() != truth.is_dir():
-        file, folder = (truth, predicted) if predicted.is_dir() else (predicted, truth)
+    of_folders = _holds_scans(predicted)
+    if of_folders != _holds_scans(truth):
+        file, folder = (truth, predicted) if of_folders else (predicted, truth)
         raise FormatError(f"{file}: expected a folder, as {folder} is one; or give two files.")
     if arguments.csv is not None:
         check_place(arguments.csv)
-    if predicted.is_dir():
-        pairs = _pair_scans(predicted, truth).items()
+        check_apart([arguments.csv], [predicted, truth])
+    if of_folders:
+        with warnings_as_lines():
+            pairs = _pair_scans(predicted, truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
         scores = _mean(scans)
@@ -82,7 +113,7 @@ def run(argv: list[str]) -> int:
     if arguments.json:
         print(json.dumps(printed))
         return 0
-    if predicted.is_dir():
+    if of_folders:
         _print_scans(scans)
     for part, values in scores.items():
         print(part)
@@ -91,12 +122,17 @@ def run(argv: list[str]) -> int:
     return 0
 
 
-def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
-    """Return both files of each scan of two folders by name, in natural order.
+def _holds_scans(path: Path) -> bool:
+    """Return whether a path is a folder of scans, and not one scan."""
+    return path.is_dir() and not is_scene(path)
 
-    The name is the path below the folder without its suffix.
-    """
-    ours, theirs = _scans_of(predicted), _scans_of(truth)
+
+def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
+    """Return both places of each scan of two folders by name, in natural order."""
+    ours, theirs = (
+        {scene.name: scene.path for scene in FolderOfClouds(folder).scenes}
+        for folder in (predicted, truth)
+    )
     for folder, missing in (
         (truth, ours.keys() - theirs.keys()),
         (predicted, theirs.keys() - ours.keys()),
@@ -108,26 +144,6 @@ def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     return {name: (path, theirs[name]) for name, path in ours.items()}
 
 
-def _scans_of(folder: Path) -> dict[str, Path]:
-    """Return the files of a folder, and of those below it, by name in natural order."""
-    found: dict[str, Path] = {}
-    for path in folder.rglob("*"):
-        inside = path.relative_to(folder)
-        hidden = any(part.startswith(".") for part in inside.parts)
-        if hidden or path.suffix.lower() not in FORMATS or not path.is_file():
-            continue
-        name = inside.with_suffix("").as_posix()
-        if name in found:
-            first, second = sorted((found[name].name, path.name))
-            raise FormatError(
-                f"{folder}: expected one file for each scan, got {first} and {second}; move one."
-            )
-        found[name] = path
-    if not found:
-        raise FormatError(f"{folder}: expected scans ({' '.join(FORMATS)}), got none.")
-    return {name: found[name] for name in sorted(found, key=natural_key)}
-
-
 def _named(names: Iterable[str]) -> str:
     """Return the first names, and how many more there are."""
     ordered = sorted(names, key=natural_key)
@@ -136,13 +152,21 @@ def _named(names: Iterable[str]) -> str:
 
 
 def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
-    """Return the scores of whatever two files of the same points both have."""
-    ours, theirs = read_cloud(predicted), read_cloud(truth)
-    if len(ours) != len(theirs):
-        raise FormatError(
-            f"{predicted}: expected as many points as {truth} ({len(theirs):,}), got {len(ours):,}."
-        )
+    """Return the scores of whatever two scans of the same points both have."""
+    names = ColumnNames.parse(arguments.columns, (predicted, truth))
+    ours, theirs = (
+        read_results(path) if path.is_dir() else read_cloud(path, columns=names.of(path))
+        for path in (predicted, truth)
+    )
+    for cloud in (ours, theirs):
+        for note in cloud.notes:
+            warn(f"{cloud.source}: {note}.")
     scores: Scores = {}
+    if arguments.match == "rows":
+        _check_rows(predicted, truth, ours, theirs)
+    else:
+        ours, matched = _nearest(arguments, predicted, truth, ours, theirs)
+        scores = {"match": matched}
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _known(score(ours.fields[part], theirs.fields[part])._asdict())
@@ -159,9 +183,69 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
             ignore=arguments.ignore,
         )
         scores["superpoints"] = _known(found._asdict())
-    if not scores:
+    if not scores.keys() - {"match"}:
         raise FormatError(f"{predicted}: shares neither labels nor normals with {truth}.")
     return scores
+
+
+def _check_rows(predicted: Path, truth: Path, ours: Cloud, theirs: Cloud) -> None:
+    """Refuse two scans whose rows are not the same points, and say what would compare them."""
+    if len(ours) != len(theirs):
+        raise FormatError(
+            f"{predicted}: expected as many points as {truth} ({len(theirs):,}), got "
+            f"{len(ours):,}; --match nearest compares each point with the nearest."
+        )
+    rows = differing_rows(ours, theirs)
+    if len(rows) == 0:
+        return
+    got, expected = (
+        " ".join(f"{value:.9g}" for value in cloud.coordinates[rows[0]]) for cloud in (ours, theirs)
+    )
+    where = f"{len(rows):,} of {len(ours):,} rows, the first {rows[0]}: {got} for {expected}"
+    if _are_same(ours, theirs) and _are_same(theirs, ours):
+        raise FormatError(
+            f"{predicted}: expected the points of {truth} in their order, got another order "
+            f"({where}); add --match nearest."
+        )
+    raise FormatError(
+        f"{predicted}: expected the points of {truth}, got others ({where}); check the file, or "
+        "add --match nearest --match-distance D to take the nearest points within D."
+    )
+
+
+def _are_same(ours: Cloud, theirs: Cloud) -> bool:
+    """Return whether each of their points is one of ours."""
+    return bool(((match_points(ours, theirs) >= 0) | ~theirs.finite).all())
+
+
+def _nearest(
+    arguments: Arguments, predicted: Path, truth: Path, ours: Cloud, theirs: Cloud
+) -> tuple[Cloud, dict[str, Any]]:
+    """Return the results of ours at their points, and how many of these have none."""
+    rows = match_points(ours, theirs, arguments.match_distance)
+    found = rows >= 0
+    num_lost = int(np.count_nonzero(~found))
+    if num_lost == len(rows):
+        raise FormatError(
+            f"{predicted}: expected points near those of {truth}, got none within the distance; "
+            "check place and unit of both, or raise --match-distance."
+        )
+    if num_lost:
+        warn(
+            f"{truth}: {num_lost:,} of {len(rows):,} points have no match in {predicted} and count "
+            "as unlabelled."
+        )
+    fields = {}
+    for name in ("labels", "normals", "superpoints"):
+        if name in ours.fields:
+            values = ours.fields[name]
+            nothing = UNLABELED if values.ndim == 1 else 0
+            dtype = np.result_type(values.dtype, np.int8)
+            fields[name] = np.full((len(rows), *values.shape[1:]), nothing, dtype)
+            fields[name][found] = values[rows[found]]
+    num_used = len(np.unique(rows[found]))
+    matched = {"points": len(rows), "unmatched": num_lost, "unused": len(ours) - num_used}
+    return Cloud(theirs.coordinates, fields, source=ours.source), matched
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,14 +20,16 @@ from torchrg.batch.tiles import (
     TileJob,
     choose_tile_size,
     choose_workers,
+    folder_of_work,
     segmented_in_tiles,
     work_on_tile,
 )
 from torchrg.cli import console
-from torchrg.config import PipelineConfig, SuperpointsConfig
+from torchrg.config import SuperpointsConfig
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import (
+    RESULT_FIELDS,
     CloudStream,
     check_output,
     estimate_points,
@@ -40,8 +42,14 @@ from torchrg.io.stream import Extent
 from torchrg.neighbors import sample_voxels
 from torchrg.pipeline import segment_planes
 from torchrg.render import make_page, write_page
-from torchrg.render.gallery import Entry, draw_entry, draw_planes, with_results, write_index
-from torchrg.render.page import check_library
+from torchrg.render.gallery import (
+    Entry,
+    check_gallery,
+    draw_entry,
+    draw_planes,
+    with_results,
+    write_index,
+)
 from torchrg.structures import Cloud, Segmentation
 from torchrg.transforms import partition_voxels, segment_voxels
 
@@ -78,14 +86,16 @@ class Arguments:
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
+    columns: console.ColumnsFlag = None
     merge: bool = False
     """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
     limit_memory: float | None = None
     """Gigabytes that a cloud may take. One that would take more is segmented in tiles on disk, with
     the same result. Default: half of what is free."""
     workdir: Path | None = None
-    """Directory for the work on such a cloud, some 500 bytes a point, removed when the result is
-    written. A command that ended early goes on from there. Default: one beside the result."""
+    """Directory in which such a cloud has a folder for the work on it, some 500 bytes a point,
+    removed when the result is written. A command that ended early goes on from there. Default: the
+    folder is beside the result."""
     engine: Literal["local", "ray"] = "local"
     """Where tiles are worked on: in this process, or as tasks on Ray (pip install
     'torchrg[ray]')."""
@@ -111,14 +121,14 @@ def run(argv: list[str]) -> int:
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
+    console.ColumnNames.parse(arguments.columns, arguments.inputs)
     firsts = tuple(sources[0] for sources in clouds if sources)
     outputs = console.output_paths(firsts, arguments.out)
     console.check_apart(outputs, arguments.inputs)
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
-        _check_pages(arguments)
-    with console.terminate_as_interrupt():
-        code = console.run_each(_segment, arguments, clouds, outputs, pictures)
+        _check_pages(arguments, pictures)
+    code = console.run_each(_segment, arguments, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
@@ -126,11 +136,11 @@ def run(argv: list[str]) -> int:
     return code
 
 
-def _check_pages(arguments: Arguments) -> None:
+def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
     """Refuse pages without a directory for them, or without what they need."""
     if arguments.picture is None or not arguments.picture.is_dir():
         raise ConfigError("expected --pages together with --picture DIRECTORY.")
-    check_library()
+    check_gallery(arguments.picture, [path.stem for path in pictures if path is not None])
 
 
 def _page_of(picture: Path) -> Path:
@@ -167,7 +177,7 @@ def _segment(
     """Segment a cloud of one file or of several, in tiles if it is too large for memory."""
     given = arguments.limit_memory
     limit = available_memory() // 2 if given is None else int(given * 1e9)
-    stream = _stream(sources)
+    stream = _stream(arguments, sources)
     # Of text only reading says how many points there are.
     num_points = stream.num_points or sum(map(estimate_points, sources))
     if memory_of_scan(num_points) > limit:
@@ -183,9 +193,11 @@ def _name_of(sources: tuple[Path, ...]) -> str:
     return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
 
 
-def _stream(sources: tuple[Path, ...]) -> CloudStream:
+def _stream(arguments: Arguments, sources: tuple[Path, ...]) -> CloudStream:
     """Open files as one cloud, and say what they do not share."""
-    stream, notes = merge_streams([stream_cloud(source) for source in sources])
+    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    streams = [stream_cloud(source, columns=names.of(source)) for source in sources]
+    stream, notes = merge_streams(streams)
     for note in notes:
         console.warn(f"{_name_of(sources)}: {note}.")
     return stream
@@ -211,11 +223,11 @@ def _segment_tiles(
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    _check_points(source, stream, target)
-    workdir = arguments.workdir or target.with_name(f".{target.stem}.tiles")
+    fields = _check_points(arguments, source, stream, target)
+    folder = folder_of_work(target, arguments.workdir)
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
-        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {workdir}, from "
+        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {folder}, from "
         "which the same command goes on",
         flush=True,
     )
@@ -229,22 +241,35 @@ def _segment_tiles(
         with segmented_in_tiles(
             sources,
             stream,
-            workdir,
+            folder,
             settings,
             tile_size=tile_size,
+            target=target,
             workers=choose_workers(num_points, tile_size, limit),
             start=_engine(arguments, limit),
             on_stage=show,
+            columns=arguments.columns,
         ) as seg:
-            write_cloud(target, stream, seg, provenance=_describe(sources, settings))
-            _report(source, seg, stream.extent, target, time.perf_counter() - begin)
+            write_cloud(target, stream, seg, provenance=_describe(arguments, sources))
+            seconds, without = time.perf_counter() - begin, console.without(target, fields)
+            _report(source, seg, stream.extent, f"{target}{without}", seconds)
 
 
-def _check_points(source: str, cloud: Cloud | CloudStream, target: Path) -> None:
-    """Warn of points that are not finite, before the work; refuse what cannot be written."""
+def _check_points(
+    arguments: Arguments, source: str, cloud: Cloud | CloudStream, target: Path
+) -> tuple[str, ...]:
+    """Warn of what is not as it seems, before the work; refuse what cannot be written.
+
+    Returns the names of the fields of the cloud.
+    """
+    levels = range(len(arguments.partition.strengths) if arguments.superpoints else 0)
+    parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
+    first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
+    console.note_input(source, first, target, (*RESULT_FIELDS, *parts))
     for note in check_finite(cloud):
         console.warn(f"{source}: {note}.")
     check_output(target, cloud)
+    return tuple(first.fields)
 
 
 def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
@@ -264,9 +289,12 @@ def _is_depth_image(cloud: Cloud) -> bool:
     return find_intrinsics(pixels) is not None
 
 
-def _describe(sources: tuple[Path, ...], settings: PipelineConfig) -> dict[str, Any]:
+def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]:
     """Return the provenance of a cloud of one file or of several."""
+    settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings)
+    if arguments.columns is not None:
+        provenance["columns"] = arguments.columns
     if len(sources) > 1:
         provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
     return provenance
@@ -281,8 +309,12 @@ def _segment_whole(
 ) -> None:
     """Segment a cloud, with a progress bar on a terminal and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
-    cloud = read_cloud(sources[0]) if len(sources) == 1 else stream.read()
-    _check_points(source, cloud, target)
+    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    if len(sources) == 1:
+        cloud = read_cloud(sources[0], columns=names.of(sources[0]))
+    else:
+        cloud = stream.read()
+    _check_points(arguments, source, cloud, target)
     if _is_depth_image(cloud):
         console.warn(
             f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
@@ -295,7 +327,7 @@ def _segment_whole(
             seg = segment_planes(cloud.points, settings, on_stage=advance)
         else:
             seg = segment_voxels(cloud.points, voxels, settings, on_stage=advance)
-        parts, provenance = None, _describe(sources, settings)
+        parts, provenance = None, _describe(arguments, sources)
         if arguments.superpoints:
             advance("superpoints")
             parts = partition_voxels(
@@ -316,10 +348,11 @@ def _segment_whole(
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         print(f"{source}: superpoints of each level: {found}")
-    _report(source, seg, Extent.of(cloud), target, time.perf_counter() - begin)
+    without = console.without(target, cloud.fields)
+    _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
 
 
-def _report(source: str, seg: Segmentation, extent: Extent, target: Path, seconds: float) -> None:
+def _report(source: str, seg: Segmentation, extent: Extent, target: str, seconds: float) -> None:
     """Print the line about a result, after a warning if there is no plane in it."""
     if len(seg.planes.count) == 0:
         is_place = (extent.low == extent.high).all()

@@ -9,7 +9,14 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchrg.cli.console import check_drawing, is_page, parse
+from torchrg.cli.console import (
+    ColumnNames,
+    ColumnsFlag,
+    check_drawing,
+    is_page,
+    parse,
+    warn,
+)
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud
 from torchrg.io.fields import WIDEN
@@ -63,6 +70,7 @@ class Arguments:
     """Cloud of the same points with true labels or normals, to show errors on a page."""
     max_points: int = MAX_POINTS
     """Of more points a page shows a random sample of so many, and says so."""
+    columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
@@ -71,14 +79,17 @@ def run(argv: list[str]) -> int:
     check_drawing(arguments.out)
     up = None if arguments.up is None else _direction(arguments.up)
     write = _write_page if is_page(arguments.out) else _write_picture
-    said = write(arguments, _read(arguments.file), up)
+    said = write(arguments, _read(arguments.file, arguments), up)
     print(f"{arguments.file} -> {arguments.out} ({said})")
     return 0
 
 
-def _read(path: Path) -> Cloud:
+def _read(path: Path, arguments: Arguments) -> Cloud:
     """Read a cloud with colours of 8 bits, which is what screens show."""
-    cloud = read_cloud(path)
+    paths = [given for given in (arguments.file, arguments.beside, arguments.truth) if given]
+    cloud = read_cloud(path, columns=ColumnNames.parse(arguments.columns, paths).of(path))
+    for note in cloud.notes:
+        warn(f"{path}: {note}.")
     color = cloud.fields.get("color")
     if color is None or color.dtype == np.uint8:
         return cloud
@@ -108,8 +119,8 @@ def _write_page(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str
     """Write a page, and return what there is to say about it."""
     page = make_page(
         cloud,
-        beside=None if arguments.beside is None else _read(arguments.beside),
-        truth=None if arguments.truth is None else _read(arguments.truth),
+        beside=None if arguments.beside is None else _read(arguments.beside, arguments),
+        truth=None if arguments.truth is None else _read(arguments.truth, arguments),
         color=arguments.color,
         view=arguments.view,
         up=up,

@@ -2,8 +2,9 @@
 
 import os
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import unicodedata
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
-from torchrg.io import FORMATS, read_cloud
+from torchrg.io import FORMATS, read_cloud, takes_columns
 
 _NUMBERED = {"instance", "plane", "superpoint"}
 """Arrays whose numbers begin again in each scene."""
@@ -62,6 +63,8 @@ class SceneDataset(Dataset[Any]):
 class FolderOfClouds(SceneDataset):
     """All readable clouds below a folder, in natural order; hidden files are passed over.
 
+    Links are followed and each file is read once; see :func:`files_below`.
+
     A sample has ``coord`` ``(N, 3)`` float32 about ``origin`` ``(1, 3)`` float64, the fields of the
     file (``normal``, ``color``, ``labels``, ``intensity``, ...), and ``name``, the path below
     ``root`` without the suffix. A folder with ``coord.npy`` is one cloud, as Pointcept keeps them;
@@ -70,14 +73,18 @@ class FolderOfClouds(SceneDataset):
     Args:
         root: The folder.
         suffixes: Which files are clouds. Default: all of :data:`torchrg.io.FORMATS`.
+        columns: Names for the columns of text and of bare ``.npy`` arrays; see
+            :func:`torchrg.read_cloud`.
         transform: Called with each sample.
 
     Attributes:
-        scenes: Name, path and input files of each cloud. Names that would be equal without the
-            suffix keep it.
+        scenes: Name, path and input files of each cloud.
 
     Raises:
-        FormatError: If there is no such folder, or no cloud in it.
+        FormatError: If there is no such folder, no cloud in it, or two of one name.
+
+    Warns:
+        UserWarning: If links are passed over.
     """
 
     def __init__(
@@ -85,37 +92,43 @@ class FolderOfClouds(SceneDataset):
         root: str | os.PathLike[str],
         *,
         suffixes: Sequence[str] = tuple(FORMATS),
+        columns: Sequence[str] | None = None,
         transform: Callable[[Mapping[str, Any]], Any] | None = None,
     ) -> None:
         self.root = Path(root)
         self.transform = transform
+        self.columns = columns
         known = {suffix.lower() for suffix in suffixes}
         paths = [
             path
-            for path in files_below(self.root, is_item=_is_scene)
+            for path in files_below(self.root, is_item=is_scene)
             if path.is_dir() or path.suffix.lower() in known
         ]
         if not paths:
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
             )
-        names = [path.relative_to(self.root) for path in paths]
-        short = [
-            name if path.is_dir() else name.with_suffix("")
-            for name, path in zip(names, paths, strict=True)
-        ]
-        uses = Counter(short)
-        self.scenes = [
-            Scene((brief if uses[brief] == 1 else name).as_posix(), path, _files_of(path))
-            for brief, name, path in zip(short, names, paths, strict=True)
-        ]
+        self.scenes = [Scene(self._name_of(path), path, _files_of(path)) for path in paths]
+        first: dict[str, Path] = {}
+        for name, path, _ in self.scenes:
+            if first.setdefault(name, path) != path:
+                one, other = (place.relative_to(self.root) for place in (first[name], path))
+                raise FormatError(
+                    f"{root}: expected one file for each scan, got {one} and {other}; move or "
+                    "rename one, or choose between them by suffixes."
+                )
+
+    def _name_of(self, path: Path) -> str:
+        """Return the name of a cloud: the path without the suffix, whatever else there is."""
+        inside = path.relative_to(self.root)
+        return (inside if path.is_dir() else inside.with_suffix("")).as_posix()
 
     def read_sample(self, index: int) -> dict[str, Any]:
         """Return the sample of a cloud."""
         name, path, _ = self.scenes[index]
         if path.is_dir():
             return {**read_pointcept_scene(path), "name": name}
-        cloud = read_cloud(path)
+        cloud = read_cloud(path, columns=self.columns if takes_columns(path) else None)
         fields = {
             _FIELD_KEYS.get(field, field): as_tensor(str(path), field, values)
             for field, values in cloud.fields.items()
@@ -143,7 +156,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> dict[str, Any]:
         FormatError: If there is no such folder or no scene in it, or a file is damaged.
         ShapeError: If some scenes have an array that others have not.
     """
-    paths = [path for path in files_below(Path(folder), is_item=_is_scene) if path.is_dir()]
+    paths = [path for path in files_below(Path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
         raise FormatError(f"{folder}: expected folders with coord.npy, got none.")
     scenes: list[dict[str, Any]] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
@@ -155,7 +168,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> dict[str, Any]:
     return collate_offset(scenes)
 
 
-def _is_scene(folder: Path) -> bool:
+def is_scene(folder: Path) -> bool:
     """Whether a folder is a cloud itself, in Pointcept's layout."""
     return (folder / "coord.npy").is_file()
 
@@ -176,22 +189,57 @@ def check_folder(folder: Path) -> None:
 
 def files_below(
     folder: Path, *, is_item: Callable[[Path], bool] = lambda folder: False
-) -> Iterator[Path]:
-    """Yield the files below a folder in natural order, without hidden ones.
+) -> list[Path]:
+    """Return the files below a folder in natural order, without hidden ones, each file once.
 
-    A folder that ``is_item`` itself is yielded in place of what is in it.
+    A folder that ``is_item`` itself stands for what is in it. Links to files and folders are
+    followed, but not those to a folder that they are in, which have no end. What is there under
+    several names has the one without links, or else the one that comes first.
+
+    Warns:
+        UserWarning: If something is passed over because it is there under another name.
     """
     check_folder(folder)
-    if is_item(folder):
-        yield folder
-        return
-    for path in listed(folder):
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            yield from files_below(path, is_item=is_item)
+    found: list[Path] = []
+    seen: set[str] = set()
+    links: list[Path] = []
+    passed: list[Path] = []
+
+    def take(path: Path, real: str) -> None:
+        if real in seen:
+            passed.append(path)
+            return
+        seen.add(real)
+        if not path.is_dir() or is_item(path):
+            found.append(path)
+            return
+        for entry in listed(path):
+            if entry.is_symlink() and not entry.name.startswith("."):
+                links.append(entry)
+            elif not entry.name.startswith("."):
+                take(entry, os.path.join(real, entry.name))  # noqa: PTH118 Paths are slow here.
+
+    take(folder, os.path.realpath(folder))
+    while links:
+        link = links.pop(0)
+        place, target = (Path(os.path.realpath(path)) for path in (link.parent, link))
+        if place.is_relative_to(target):
+            passed.append(link)
         else:
-            yield path
+            take(link, str(target))
+    warn_of_links(folder, passed)
+    return sorted(found, key=lambda path: [natural_key(p) for p in path.relative_to(folder).parts])
+
+
+def warn_of_links(folder: Path, passed: Sequence[Path]) -> None:
+    """Warn of what is passed over in a folder because it is there under another name, if any is."""
+    if passed:
+        more = f" and {len(passed) - 1:,} more" if len(passed) > 1 else ""
+        warnings.warn(
+            f"{folder}: passed over {passed[0].relative_to(folder)}{more}: a link leads there from "
+            "another name, or to a folder that it is in, and each file counts once.",
+            stacklevel=3,
+        )
 
 
 def listed(folder: str | os.PathLike[str]) -> list[Path]:
@@ -212,3 +260,16 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     ]
     # Names that differ in case or leading zeros only still have one order.
     return (*key, (2, name))
+
+
+def folded_name(name: str) -> str:
+    """Return what names have in common that some file systems take for the same.
+
+    Those of macOS and Windows do not tell case apart, nor how letters with accents are put
+    together, and what is written on others is carried there.
+
+    Example:
+        >>> folded_name("B\u00fcro") == folded_name("bu\u0308RO")
+        True
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())

@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
+from torchrg.io.files import make_folder
 from torchrg.io.npy import map_array
 from torchrg.structures import PLANE_KINDS, Planes, Segmentation
 
@@ -102,25 +103,48 @@ def write_pointcept_scene(
     place = Path(folder)
     arrays = _arrays_of(place, sample, segmentation, superpoint=superpoint)
     owned = _owned(place)
-    kept = {name for name in arrays if name not in owned and (place / f"{name}.npy").exists()}
+    # What only torchrg makes is never kept: one from elsewhere is in the way.
+    kept = {
+        name
+        for name in arrays.keys() - {"plane", "curvature", "superpoint"} - owned
+        if (place / f"{name}.npy").exists()
+    }
     _check_kept(place, arrays, kept)
-    new = [name for name in arrays if name not in kept]
-    table = {"written": new, **describe_planes(segmentation.planes, origin=origin)}
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FormatError(f"{place}: cannot be made: {error.strerror or error}.") from error
+    new = {name: values for name, values in arrays.items() if name not in kept}
+    return write_arrays(place, new, describe_planes(segmentation.planes, origin=origin))
+
+
+def write_arrays(
+    place: Path, arrays: Mapping[str, NDArray[Any]], planes: Mapping[str, Any]
+) -> list[str]:
+    """Write arrays by name as ``.npy`` and the table of planes, beside what others have there.
+
+    What an earlier call wrote, as ``planes.json`` says, is replaced or removed; nothing else is.
+    All files are complete before the first appears.
+
+    Returns:
+        Names of the files written.
+
+    Raises:
+        FormatError: If a file from elsewhere is in the way, or the folder cannot be written.
+    """
+    owned = _owned(place)
+    for name in arrays:
+        path = place / f"{name}.npy"
+        if name not in owned and os.path.lexists(path):
+            raise FormatError(f"{path}: was not written by torchrg; move it away to have another.")
+    make_folder(place)
     for name in owned - set(arrays):
         (place / f"{name}.npy").unlink(missing_ok=True)
     with ExitStack() as stack:
         # Files take their places in reverse: the claim on them first, the coordinates last.
-        beside = [stack.enter_context(atomic_path(place / f"{name}.npy")) for name in new]
+        for name, values in arrays.items():
+            beside = stack.enter_context(atomic_path(place / f"{name}.npy"))
+            with beside.open("wb") as stream:
+                npy_format.write_array(stream, values, allow_pickle=False)
         claim = stack.enter_context(atomic_path(place / _TABLE))
-        for name, path in zip(new, beside, strict=True):
-            with path.open("wb") as stream:
-                npy_format.write_array(stream, arrays[name], allow_pickle=False)
-        claim.write_text(json.dumps(table, indent=1), encoding="utf-8")
-    return [*(f"{name}.npy" for name in new), _TABLE]
+        claim.write_text(json.dumps({"written": [*arrays], **planes}, indent=1), encoding="utf-8")
+    return [*(f"{name}.npy" for name in arrays), _TABLE]
 
 
 def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
@@ -229,8 +253,6 @@ def _check_kept(place: Path, arrays: Mapping[str, NDArray[Any]], kept: set[str])
     """Check that what stays in a folder belongs to the points that are written."""
     for name in sorted(kept):
         path = place / f"{name}.npy"
-        if name in ("plane", "curvature", "superpoint"):
-            raise FormatError(f"{path}: was not written by torchrg; move it away to have another.")
         values = map_array(path)
         _check_rows(path, values, len(arrays[name]))
         if name == "coord" and not np.array_equal(values.astype(np.float32), arrays[name]):

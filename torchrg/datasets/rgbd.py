@@ -5,7 +5,6 @@ among the choices of ``torchrg convert rgbd``, and a test.
 """
 
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,14 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_shapes
-from torchrg.datasets.folder import Scene, SceneDataset, check_folder, files_below, listed
+from torchrg.datasets.folder import (
+    Scene,
+    SceneDataset,
+    check_folder,
+    files_below,
+    listed,
+    warn_of_links,
+)
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
     read_color,
@@ -133,11 +139,14 @@ class RGBDFrames(SceneDataset):
         self.frames = tuple(frames)
         self.transform = transform
         self.scenes = [Scene(frame.name, frame.depth, frame.files) for frame in self.frames]
-        twice = [name for name, count in Counter(s.name for s in self.scenes).items() if count > 1]
-        if twice:
-            raise ConfigError(
-                f"RGBDFrames: expected frames of different names, got {twice[0]!r} twice."
-            )
+        first: dict[str, Path] = {}
+        for number, (name, path, _) in enumerate(self.scenes):
+            first.setdefault(name, path)
+            if len(first) <= number:
+                raise ConfigError(
+                    f"RGBDFrames: expected frames of different names, got {name!r} twice, for "
+                    f"{first[name]} and {path}; move or rename one."
+                )
 
     @classmethod
     def from_folder(
@@ -368,11 +377,17 @@ LAYOUTS: dict[str, Finder] = {
 def _recordings(root: Path, mark: str) -> Iterator[tuple[str, Path]]:
     """Yield name and folder of the recordings in a folder, which may be one itself.
 
-    Every recording has an entry in it whose name fits the pattern ``mark``.
+    Every recording has an entry in it whose name fits the pattern ``mark``. One that is there under
+    several names has the one without links, or else the one that comes first.
     """
     check_folder(root)
     candidates = [root, *(path for path in listed(root) if path.is_dir())]
-    found = [path for path in candidates if any(path.glob(mark))]
+    marked = [path for path in candidates if any(path.glob(mark))]
+    own: dict[Path, Path] = {}
+    for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
+        own.setdefault(path.resolve(), path)
+    found = [path for path in marked if own[path.resolve()] == path]
+    warn_of_links(root, [path for path in marked if path not in found])
     if not found:
         raise FormatError(f"{root}: expected recordings with {mark} in them, got none.")
     for folder in found:

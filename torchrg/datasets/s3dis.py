@@ -176,6 +176,10 @@ def _store(entry: Path, room: Room) -> Room:
         for name in _ARRAYS:
             np.save(beside / f"{name}.npy", getattr(room, name), allow_pickle=False)
         (beside / "report.json").write_text(json.dumps(_plain(room.report)), encoding="utf-8")
+        # On the disk before the folder has its name, which says that all is there.
+        for path in beside.iterdir():
+            with path.open("rb+") as stream:
+                os.fsync(stream.fileno())
         if entry.exists() and _load(entry) is None:
             shutil.rmtree(entry, ignore_errors=True)
         try:

@@ -1,7 +1,7 @@
 """Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -40,6 +40,7 @@ from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
     "FORMATS",
+    "RESULT_FIELDS",
     "CloudStream",
     "atomic_path",
     "check_output",
@@ -47,6 +48,7 @@ __all__ = [
     "merge_streams",
     "read_cloud",
     "stream_cloud",
+    "takes_columns",
     "write_cloud",
 ]
 
@@ -57,51 +59,60 @@ class Format(NamedTuple):
     Attributes:
         open: Reads the header of a file of so many bytes, not 0, and gives a table of its points,
             in chunks. Opening it, or reading the damaged chunk, raises FormatError if the file is
-            damaged.
+            damaged. Where columns can be without names, these come third.
         write: Writes a cloud, going through its chunks once or several times. Raises FormatError if
             the format cannot hold it.
         count: Number of points by the header, from path, open file and size; an estimate where the
             header does not say. May raise anything of a damaged file.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
+        takes_columns: Whether columns can be without names.
     """
 
-    open: Callable[[Path, int], Table]
+    open: Callable[..., Table]
     write: Callable[[Path, CloudStream], None]
     count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
     check: Callable[[Path, Cloud | CloudStream | None], None] | None = None
+    takes_columns: bool = False
 
 
+RESULT_FIELDS = ("labels", "normals", "curvature")
+"""What a segmentation writes of each point beside the fields of the cloud."""
 FORMATS: dict[str, Format] = {
     ".npz": Format(open_npz, write_npz, count_npz),
-    ".npy": Format(open_npy, write_npy, count_npy),
+    ".npy": Format(open_npy, write_npy, count_npy, takes_columns=True),
     ".ply": Format(open_ply, write_ply, count_ply),
     ".pcd": Format(open_pcd, write_pcd, count_pcd),
     ".las": Format(open_las, write_las, count_las, check_las),
     ".laz": Format(open_las, write_las, count_las, check_las),
     ".e57": Format(open_e57, write_e57, count_e57, check_e57),
-    ".xyz": Format(open_text, write_text, count_text),
-    ".txt": Format(open_text, write_text, count_text),
+    ".xyz": Format(open_text, write_text, count_text, takes_columns=True),
+    ".txt": Format(open_text, write_text, count_text, takes_columns=True),
 }
 """What is known of each format, by suffix."""
 
 
-def read_cloud(path: str | os.PathLike[str]) -> Cloud:
+def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Cloud:
     r"""Read a point cloud; the suffix says how.
 
     Convention:
         Coordinates and fields stay as they are in the file, points that are not finite included.
         Fields have one name whatever the format calls them, see :mod:`torchrg.io.fields`:
-        ``labels`` int64, ``normals``, ``curvature``, ``intensity``, ``color`` uint8.
+        ``labels`` int64, ``normals``, ``curvature``, ``intensity``, ``color`` uint8. What had to be
+        taken for granted, as the names of columns without any, and what was left out, as the faces
+        of a mesh, is in :attr:`torchrg.Cloud.notes`.
 
     Args:
         path: A file with a suffix of :data:`FORMATS`, in any case.
+        columns: Names of the columns of text and of a bare ``.npy`` array, in their order: ``x``,
+            ``y``, ``z`` and any others, ``_`` for one to leave out. Default: those that the file
+            says, else those of :data:`torchrg.io.fields.COLUMNS_RULE`.
 
     Returns:
         The cloud, with at least one point.
 
     Raises:
-        FormatError: If the file is missing, damaged, or not of a known format. The message begins
-            with the path and names the place and the repair.
+        FormatError: If the file is missing, damaged, or not of a known format, or if ``columns``
+            are not its. The message begins with the path and names the place and the repair.
         MissingDependencyError: If the format needs an optional package.
 
     Example:
@@ -115,10 +126,15 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """
     source = Path(path)
     with reporting_unreadable(source):
-        return read_table(source, _open(source))
+        return read_table(source, _open(source, columns))
 
 
-def stream_cloud(path: str | os.PathLike[str], *, chunk_size: int = CHUNK_SIZE) -> CloudStream:
+def stream_cloud(
+    path: str | os.PathLike[str],
+    *,
+    columns: Sequence[str] | None = None,
+    chunk_size: int = CHUNK_SIZE,
+) -> CloudStream:
     r"""Read a point cloud in chunks, for clouds larger than memory; the suffix says how.
 
     Convention:
@@ -130,6 +146,7 @@ def stream_cloud(path: str | os.PathLike[str], *, chunk_size: int = CHUNK_SIZE) 
 
     Args:
         path: A file with a suffix of :data:`FORMATS`, in any case.
+        columns: As of :func:`read_cloud`.
         chunk_size: Most points of a chunk, at least 1. Chunks may be smaller.
 
     Returns:
@@ -153,14 +170,30 @@ def stream_cloud(path: str | os.PathLike[str], *, chunk_size: int = CHUNK_SIZE) 
         raise ConfigError(f"stream_cloud: expected chunk_size of at least 1, got {chunk_size}.")
     source = Path(path)
     with reporting_unreadable(source):
-        return stream_table(source, _open(source), chunk_size)
+        return stream_table(source, _open(source, columns), chunk_size)
 
 
-def _open(path: Path) -> Table:
+def takes_columns(path: str | os.PathLike[str]) -> bool:
+    """Whether names can be given for the columns of a file, which its format does not ask for.
+
+    Example:
+        >>> takes_columns("scan.txt"), takes_columns("scan.ply")
+        (True, False)
+    """
+    found = FORMATS.get(Path(path).suffix.lower())
+    return found is not None and found.takes_columns
+
+
+def _open(path: Path, columns: Sequence[str] | None) -> Table:
     """Open a file by its suffix."""
-    size = check_file(path)
+    size, found = check_file(path), _format_of(path)
+    if columns is not None and not found.takes_columns:
+        raise FormatError(
+            f"{path}: expected text or .npy for names of columns, got a file that has its own; "
+            "leave them out."
+        )
     with np.errstate(**SILENT):
-        return _format_of(path).open(path, size)
+        return found.open(path, size) if columns is None else found.open(path, size, columns)
 
 
 def write_cloud(
@@ -178,7 +211,10 @@ def write_cloud(
 
     Convention:
         A segmentation is written as ``label``, normals and ``curvature`` of each point, beside the
-        cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. ``.npz``
+        cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. A field of
+        the cloud whose name a result takes is kept under another: ``label_input``,
+        ``normals_input`` and so on; where there is such a field already, it is that which stays.
+        ``.npz``
         holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the table of
         :class:`torchrg.structures.Planes` as ``plane_normal``, ``plane_offset``,
         ``plane_centroid``, ``plane_area``, ``plane_count``, ``plane_rms``, ``plane_extent``,
@@ -233,11 +269,10 @@ def write_cloud(
         write_npz(target, _checked(target, stream, own), segmentation, provenance, superpoints)
         return
     if superpoints is not None:
-        stream = stream.with_fields(lambda rows: superpoints.rows(rows).by_level())
+        stream = stream.with_results(lambda rows: superpoints.rows(rows).by_level())
     if segmentation is not None:
-        names = ("labels", "normals", "curvature")
-        results = {name: getattr(segmentation, name) for name in names}
-        stream = stream.with_fields(
+        results = {name: getattr(segmentation, name) for name in RESULT_FIELDS}
+        stream = stream.with_results(
             lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
         )
     found.write(target, _checked(target, stream))

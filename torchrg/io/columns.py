@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import WIDEN, Columns
+from torchrg.io.fields import LEFT_OUT, WIDEN, Columns, name_aside
 from torchrg.io.files import atomic_path
 from torchrg.io.stream import CloudStream
 from torchrg.structures import Cloud
 
 Limits = tuple[int, int]
 """Least and largest of whole numbers."""
+_LABELS_ASIDE = name_aside("labels")
 
 
 class Spelling(NamedTuple):
@@ -27,6 +28,7 @@ class Spelling(NamedTuple):
         curvature: Name of the curvature.
         color_bits: Width of a channel, 8 or 16; colours of 16 bits are rounded to 8, not widened.
         vectors: Whether other fields of several columns stay one, shape ``(N, C)``.
+        blanks: Whether names keep their blanks, which become ``_`` elsewhere.
     """
 
     normals: tuple[str, str, str] = ("nx", "ny", "nz")
@@ -34,6 +36,7 @@ class Spelling(NamedTuple):
     curvature: str = "curvature"
     color_bits: int = 8
     vectors: bool = False
+    blanks: bool = False
 
 
 def flatten_stream(path: Path, stream: CloudStream, spelling: Spelling) -> Iterator[Columns]:
@@ -56,9 +59,12 @@ def flatten_cloud(
         axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")
     }
     for name, values in cloud.fields.items():
+        if name == LEFT_OUT:
+            raise FormatError(f"{path}: expected names of fields, got {name!r}; rename it.")
         values = _storable(path, name, values, spelling)
-        if name == "labels":
-            values = narrow_integers(values, ("i4",), (limits or {}).get("label"))
+        if name in ("labels", _LABELS_ASIDE):
+            limit = (limits or {}).get("label" if name == "labels" else name)
+            values = narrow_integers(values, ("i4",), limit)
         for column_name, column in _spread(name, values, spelling):
             if column_name in columns:
                 raise FormatError(
@@ -105,18 +111,22 @@ def _storable(path: Path, name: str, values: NDArray[Any], spelling: Spelling) -
 
 def _spread(name: str, values: NDArray[Any], spelling: Spelling) -> list[tuple[str, NDArray[Any]]]:
     """Cut a field into named columns."""
-    word = "_".join(name.split()) or "field"
-    if values.shape[1:] in ((), (1,)):
-        single = {"labels": "label", "curvature": spelling.curvature}.get(name, word)
-        return [(single, values.reshape(-1))]
+    names = spell(name, values.shape[1:], spelling)
+    parts = [values.reshape(-1)] if values.shape[1:] == (1,) else [values]
+    if len(names) > 1:
+        parts = [values[:, i] for i in range(len(names))]
+    return list(zip(names, parts, strict=True))
+
+
+def spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[str, ...]:
+    """Return the names of the columns of a field of which rows have a shape."""
+    word = (name if spelling.blanks else "_".join(name.split())) or "field"
+    if row_shape in ((), (1,)):
+        return ({"labels": "label", "curvature": spelling.curvature}.get(name, word),)
     triples = {"normals": spelling.normals, "color": spelling.color}
-    if name in triples and values.shape[1] == 3:
-        names: tuple[str, ...] = triples[name]
-    elif spelling.vectors:
-        return [(word, values)]
-    else:
-        names = tuple(f"{word}_{i}" for i in range(values.shape[1]))
-    return [(column_name, values[:, i]) for i, column_name in enumerate(names)]
+    if name in triples and row_shape == (3,):
+        return triples[name]
+    return (word,) if spelling.vectors else tuple(f"{word}_{i}" for i in range(row_shape[0]))
 
 
 def wide_limits(path: Path, stream: CloudStream, spelling: Spelling) -> dict[str, Limits]:

@@ -3,13 +3,14 @@
 Points go through pye57's ``libe57``, because ``pye57.E57`` itself (0.4.19) writes coordinates in
 single precision and knows no field beyond colour, intensity, row and column. Normals are the
 standard's extension ``nor``; labels, curvature and other fields are in an extension ``torchrg``.
-Pictures and what else a file holds beside points are not kept.
+Of what a file holds beside points, names and poses of scans and the coordinate system are kept.
 """
 
 import re
 import uuid
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -22,7 +23,7 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
 from torchrg.io.fields import Columns
-from torchrg.io.files import DAMAGES, atomic_path, check_promise, refusing
+from torchrg.io.files import DAMAGES, asking_system, atomic_path, check_promise, refusing
 from torchrg.io.stream import CloudStream, Table
 from torchrg.structures import Cloud
 
@@ -41,6 +42,8 @@ _EXTENSIONS = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "torchrg": "urn:torchrg:point-fields",
 }
+_SYSTEM_NODE, SYSTEM = "coordinateMetadata", "coordinate_metadata"
+"""Where the coordinate reference system is in a file, and in the header of a cloud."""
 _ENDS = ("Minimum", "Maximum")
 _PAGE_BYTES = 1024
 """The standard's page, the last four bytes of which are the CRC-32C of the others."""
@@ -55,7 +58,7 @@ def open_e57(path: Path, size: int) -> Table:
 
     Every scan is moved by its pose, and its normals with it. Points marked as invalid are kept as
     not-a-number. Of several scans, ``scan`` is the number of each point's; a field that some scans
-    lack is zero there.
+    lack is zero there, and written for the others alone.
     """
     pye57 = _pye57("read")
     _check_pages(path)
@@ -67,6 +70,7 @@ def open_e57(path: Path, size: int) -> Table:
             path, 0, num_points // 8, f"{num_points:,} points", available=size, at_least=True
         )
         scans = tuple(_scan_of(header) for header in headers)
+        system, num_pictures = _beside_points(file.root)
         empty = [
             _to_world(path, {name: np.empty(0, code) for name, code in _letters(pye57, h)}, scan)
             for h, scan in zip(headers, scans, strict=True)
@@ -77,6 +81,17 @@ def open_e57(path: Path, size: int) -> Table:
         name: np.result_type(*(block.get(name, np.uint8) for block in empty))
         for name in dict.fromkeys(name for block in empty for name in block)
     }
+    scans = tuple(
+        scan._replace(lacks=tuple(name for name in dtypes if name not in block))
+        for scan, block in zip(scans, empty, strict=True)
+    )
+    lacking = [scan for scan in scans if scan.lacks]
+    notes: tuple[str, ...] = ()
+    if lacking:
+        names = dict.fromkeys(name for scan in lacking for name in scan.lacks)
+        notes += (f"{len(lacking)} of {len(scans)} scans lack {', '.join(names)}, zero there",)
+    if num_pictures:
+        notes += (f"pictures left out: {num_pictures}",)
 
     def conformed(block: _Block, number: int) -> _Block:
         count = len(block["x"])
@@ -97,7 +112,17 @@ def open_e57(path: Path, size: int) -> Table:
                 for block in _read_points(pye57, file, file.get_header(number), chunk_size):
                     yield conformed(_to_world(path, block, scan), number)
 
-    return Table(read, num_points, header={"scans": scans})
+    header = {"scans": scans} | ({SYSTEM: system} if system else {})
+    return Table(read, num_points, header=header, notes=notes)
+
+
+def _beside_points(root: Any) -> tuple[str, int]:  # noqa: ANN401
+    """Return the coordinate reference system of a file, empty if it names none, and its pictures.
+
+    The system is WKT as a rule.
+    """
+    system = root[_SYSTEM_NODE].value() if root.isDefined(_SYSTEM_NODE) else ""
+    return system, len(root["images2D"]) if root.isDefined("images2D") else 0
 
 
 @contextmanager
@@ -123,20 +148,59 @@ def write_e57(path: Path, stream: CloudStream) -> None:
     """
     pye57 = _pye57("write")
     plan = _plan(path, stream)
-    summaries = [_Summary() for _ in plan.groups]
+    summaries = [_Summary(group.scan) for group in plan.groups]
     for number, block in _scan_blocks(path, stream, plan):
         summaries[number].add(block)
     errors = (pye57.libe57.E57Exception, ValueError, RuntimeError)
     with (
         refusing(f"{path}: cannot be written: ", *errors),
         atomic_path(path) as beside,
-        pye57.E57(str(beside), "w") as file,
+        _writing(pye57.libe57, beside) as image,
     ):
-        for prefix, uri in _EXTENSIONS.items():
-            file.image_file.extensionsAdd(prefix, uri)
+        scans = _write_header(pye57.libe57, image, stream.header.get(SYSTEM, ""))
         for number, blocks in groupby(_scan_blocks(path, stream, plan), key=itemgetter(0)):
             scan, summary = plan.groups[number].scan, summaries[number]
-            _write_points(pye57.libe57, file, scan, summary, (block for _, block in blocks))
+            points = (block for _, block in blocks)
+            _write_points(pye57.libe57, image, scans, scan, summary, points)
+
+
+@contextmanager
+def _writing(libe57: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
+    """Open a file to write; of one that fails, the first error is told, not that of closing it."""
+    image = None
+    try:
+        with asking_system(path, libe57.E57Exception):
+            image = libe57.ImageFile(str(path), "w")
+            yield image
+            image.close()
+    except BaseException:
+        if image is not None:
+            with suppress(libe57.E57Exception):
+                image.close()
+        raise
+
+
+def _write_header(libe57: Any, image: Any, system: str) -> Any:  # noqa: ANN401
+    """Write what is said about a file as a whole, and return the node of its scans.
+
+    There is no date, so that equal clouds differ in their identifiers alone.
+    """
+    for prefix, uri in {"": libe57.E57_V1_0_URI, **_EXTENSIONS}.items():
+        image.extensionsAdd(prefix, uri)
+    facts = {
+        "formatName": "ASTM E57 3D Imaging Data File",
+        "guid": f"{{{uuid.uuid4()}}}",
+        "versionMajor": libe57.E57_FORMAT_MAJOR,
+        "versionMinor": libe57.E57_FORMAT_MINOR,
+        "e57LibraryVersion": libe57.E57_LIBRARY_ID,
+        _SYSTEM_NODE: system,
+        "creationDateTime": {"dateTimeValue": 0.0, "isAtomicClockReferenced": 0},
+    }
+    _set_facts(libe57, image, image.root(), facts)
+    scans, pictures = libe57.VectorNode(image, True), libe57.VectorNode(image, True)
+    image.root().set("data3D", scans)
+    image.root().set("images2D", pictures)
+    return scans
 
 
 def count_e57(path: Path, stream: BinaryIO, size: int) -> int:
@@ -171,12 +235,14 @@ class Scan(NamedTuple):
     """A scan of an E57 file: its name, and how its points were moved to where they are.
 
     The rotation is a quaternion w x y z of any length, where zero turns nothing; the translation is
-    added after it.
+    added after it. ``lacks`` are the columns that other scans of the file have and this one has
+    not.
     """
 
     name: str = "torchrg"
     rotation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
     translation: tuple[float, ...] = (0.0, 0.0, 0.0)
+    lacks: tuple[str, ...] = ()
 
     @property
     def is_moved(self) -> bool:
@@ -290,8 +356,14 @@ def _to_world(path: Path, block: _Block, scan: Scan) -> _Block:
         if name in block:
             points[block.pop(name) != 0] = np.nan
     scan.turn_normals(block)
-    named = {_CHANNELS.get(name, name.rpartition(":")[2]): c for name, c in block.items()}
+    plain = Counter(map(_plain, block))
+    named = {_plain(name) if plain[_plain(name)] == 1 else name: c for name, c in block.items()}
     return {**named, **dict(zip("xyz", scan.to_world(points).T, strict=True))}
+
+
+def _plain(name: str) -> str:
+    """Return the name of a column by that of a field, without the extension it belongs to."""
+    return _CHANNELS.get(name, name.rpartition(":")[2])
 
 
 def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -362,12 +434,12 @@ def _scan_blocks(path: Path, stream: CloudStream, plan: _Plan) -> Iterator[tuple
                 left = plan.groups[number].count
             stop = min(start + left, len(chunk))
             block = {name: column[start:stop] for name, column in columns.items()}
-            yield number, _to_scan(block, plan.groups[number].scan)
+            yield number, _to_scan(path, block, plan.groups[number].scan)
             left -= stop - start
             start = stop
 
 
-def _to_scan(block: _Block, scan: Scan) -> _Block:
+def _to_scan(path: Path, block: _Block, scan: Scan) -> _Block:
     """Move points back to the frame of their scan, and give the fields the standard's names."""
     points = scan.to_scan(np.stack([block.pop(axis) for axis in "xyz"], axis=1))
     scan.turn_normals(block, back=True)
@@ -375,8 +447,14 @@ def _to_scan(block: _Block, scan: Scan) -> _Block:
     # 2: there is nothing meaningful in the coordinates.
     named: _Block = {_STATE: np.where(finite, np.uint8(0), np.uint8(2))}
     for name, column in block.items():
-        word = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
-        named[name if name in _STANDARD else f"torchrg:{word}"] = column
+        word = re.sub(r"[^A-Za-z0-9_.-]|^(?=[^A-Za-z_])", "_", name)
+        new = name if name in _STANDARD else f"torchrg:{word}"
+        if new in named:
+            raise FormatError(
+                f"{path}: expected fields of different names in letters and digits, got {word!r} "
+                "twice; rename one."
+            )
+        named[new] = column
     if not finite.all():
         points = np.where(finite[:, None], points, 0)
     return {**dict(zip(_AXES, points.T, strict=True)), **named}
@@ -389,10 +467,12 @@ class _Summary:
         longest: Points of its longest block.
         limits: Least and largest values of whole numbers, of an intensity that is finite, and of
             coordinates that are not marked as invalid.
+        lacks: Columns that the scan came without and that are still zero.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, scan: Scan) -> None:
         self.longest = 0
+        self.lacks = set(scan.lacks)
         self.limits: dict[str, tuple[Any, Any]] = {}
 
     def add(self, block: _Block) -> None:
@@ -400,6 +480,8 @@ class _Summary:
         self.longest = max(self.longest, len(block[_STATE]))
         there = block[_STATE] == 0
         for name, column in block.items():
+            if _plain(name) in self.lacks and column.any():
+                self.lacks.remove(_plain(name))
             if name in _AXES:
                 column = column[there]
             elif name == "intensity":
@@ -414,15 +496,20 @@ class _Summary:
 
 def _write_points(
     libe57: Any,  # noqa: ANN401
-    file: Any,  # noqa: ANN401
+    image: Any,  # noqa: ANN401
+    scans: Any,  # noqa: ANN401
     scan: Scan,
     summary: _Summary,
     blocks: Iterator[_Block],
 ) -> None:
-    """Add a scan to a file, its columns by the standard's names and in its own frame."""
-    image, first = file.image_file, next(blocks)
+    """Add a scan to those of a file, its columns by the standard's names and in its own frame."""
+    first = next(blocks)
     is_marked = summary.limits[_STATE] != (0, 0)
-    names = [name for name in first if name != _STATE or is_marked]
+    names = [
+        name
+        for name in first
+        if _plain(name) not in summary.lacks and (name != _STATE or is_marked)
+    ]
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
     # libe57 keeps the addresses of the columns, so they have to live until it is done.
@@ -439,10 +526,10 @@ def _write_points(
             kept[name] = np.empty(summary.longest, "q")
         buffer = libe57.SourceDestBuffer(image, name, kept[name], summary.longest, True, True)
         buffers.append(buffer)
-    node = _tree(libe57, image, _facts(scan, names, summary))
+    node = _set_facts(libe57, image, libe57.StructureNode(image), _facts(scan, names, summary))
     points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
     node.set("points", points)
-    file.data3d.append(node)
+    scans.append(node)
     writer = points.writer(buffers)
     for block in chain([first], blocks):
         count = len(block[_STATE])
@@ -482,13 +569,12 @@ def _facts(scan: Scan, names: Sequence[str], summary: _Summary) -> dict[str, Any
     return facts
 
 
-def _tree(libe57: Any, image: Any, facts: dict[str, Any]) -> Any:  # noqa: ANN401
-    """Return a node for each fact."""
+def _set_facts(libe57: Any, image: Any, node: Any, facts: dict[str, Any]) -> Any:  # noqa: ANN401
+    """Add a node for each fact to another, and return that."""
     kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
-    node = libe57.StructureNode(image)
     for name, fact in facts.items():
         if isinstance(fact, dict):
-            node.set(name, _tree(libe57, image, fact))
+            node.set(name, _set_facts(libe57, image, libe57.StructureNode(image), fact))
         else:
             node.set(name, kinds[type(fact)](image, fact))
     return node

@@ -1,14 +1,15 @@
 """From the columns of a file to a cloud and back: one name for what every format calls otherwise.
 
 Read as ``labels``: ``label``; as ``normals``: ``nx ny nz``, ``normal_x ...``, ``NormalX ...``,
-``normal``; as ``color``: ``red green blue``, ``diffuse_red ...``, ``r g b``, ``rgb``, ``colors``;
-as ``intensity``: ``intensities``. Case does not matter, nor CloudCompare's prefix ``scalar_``.
+``normal``; as ``color``: ``red green blue``, ``diffuse_red ...``, ``r g b``, ``rgb``, ``colors``,
+``rf gf bf``; as ``intensity``: ``intensities``. Case does not matter, nor CloudCompare's prefix
+``scalar_``.
 ``name_0``, ``name_1``, ... of one type become one field ``name`` of as many columns. Everything
 else keeps its name.
 """
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -43,15 +44,28 @@ _TRIPLES = {
     ("red", "green", "blue"): "color",
     ("diffuse_red", "diffuse_green", "diffuse_blue"): "color",
     ("r", "g", "b"): "color",
+    ("rf", "gf", "bf"): "color",
 }
 """torchrg's names by those of three columns, in lower case."""
 _MAY_BE_COLOR = re.compile(
-    r"(scalar_)?((diffuse_)?(red|green|blue)|[rgb]|rgb|colors?)(_[0-9]+|_value)*|column_[456]",
+    r"(scalar_)?((diffuse_)?(red|green|blue)|[rgb]f?|rgb|colors?)(_[0-9]+|_value)*|column_[4567]",
     re.IGNORECASE,
 )
-"""Names of columns that may turn out to be colours, ``column_4`` to ``column_6`` without names."""
+"""Names of columns that may turn out to be colours, ``column_4`` to ``column_7`` without names."""
 _GUESSED_WIDTHS = (6, 7)
 """Columns of a table without names whose meaning the values tell."""
+LEFT_OUT = "_"
+"""Name of a column that is not read, as in PCD."""
+_MOST_GUESSED = max(_GUESSED_WIDTHS)
+FIRST_ROWS = _MOST_GUESSED + 1
+"""Rows that :func:`check_first_rows` looks at."""
+COLUMNS_RULE = (
+    "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
+    "a unit normal, or a colour of whole numbers from 0 to 255, where all values fit. Of seven, "
+    "the same is asked of the last three and of the three before the last; if one of both fits, it "
+    "is taken, with intensity before a colour. Any other column is column_4, column_5 and so on."
+)
+"""How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
 """Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
 WIDEN = 257
@@ -126,12 +140,12 @@ def assemble_cloud(
         axes = [rest.pop(name) for name in names]
         if any(axis.ndim != 1 for axis in axes):
             raise FormatError(f"{path}: expected one number a point in each of x, y, z.")
-        places = _stacked(axes)
+        places = _stacked(path, axes)
     else:
         places = rest.pop(coordinates)
     points = checked_coordinates(path, places)
-    sources = _sources(rest)
-    fields = {name: _joined([rest[part] for part in parts]) for name, parts in sources.items()}
+    sources = sources_of(rest)
+    fields = {name: _joined(path, [rest[n] for n in parts]) for name, parts in sources.items()}
     if "labels" in fields:
         fields["labels"] = _labels(path, fields["labels"])
     if "normals" in fields:
@@ -159,8 +173,9 @@ def checked_coordinates(path: Path, coordinates: NDArray[Any]) -> NDArray[np.flo
 def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
     """Check that an array of this shape and type can be coordinates."""
     if len(shape) != 2 or shape[1] != 3:
+        repair = "transpose" if len(shape) == 2 and shape[0] == 3 else "reshape"
         raise FormatError(
-            f"{path}: expected coordinates of shape (N, 3), got {shape}; reshape them."
+            f"{path}: expected coordinates of shape (N, 3), got {shape}; {repair} them."
         )
     if dtype.kind not in "fiu":
         raise FormatError(
@@ -172,6 +187,50 @@ def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) 
         )
 
 
+def name_aside(name: str) -> str:
+    """Return the name under which a cloud's own field is kept when a result takes its name.
+
+    Example:
+        >>> name_aside("labels"), name_aside("normals")
+        ('label_input', 'normals_input')
+    """
+    return f"{'label' if name == 'labels' else name}_input"
+
+
+def put_results(
+    fields: Mapping[str, NDArray[Any]], results: Mapping[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of a cloud with those of a result beside them.
+
+    What a result has the name of is kept as :func:`name_aside` says, unless there is such a field
+    already: then the cloud is a result itself, and its input's own field stays.
+
+    Example:
+        >>> first = put_results({"labels": np.array([7])}, {"labels": np.array([0])})
+        >>> again = put_results(first, {"labels": np.array([1])})
+        >>> {name: values.tolist() for name, values in again.items()}
+        {'label_input': [7], 'labels': [1]}
+    """
+    kept = {name: values for name, values in fields.items() if name not in results}
+    aside = {name_aside(name): fields[name] for name in results if name in fields}
+    return {**aside, **kept, **results}
+
+
+def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[str]:
+    """Return what to tell people of fields that :func:`put_results` renames or leaves out."""
+    shown = {name: "label" if name == "labels" else name for name in results if name in fields}
+    kept = [name for name in shown if name_aside(name) not in fields]
+    lost = [name for name in shown if name not in kept]
+    notes = []
+    if kept:
+        names = ", ".join(f"{shown[name]} as {name_aside(name)}" for name in kept)
+        notes.append(f"its own fields are kept beside the result's: {names}")
+    if lost:
+        names, stay = ", ".join(shown[name] for name in lost), ", ".join(map(name_aside, lost))
+        notes.append(f"its own {names} left out for the result's; {stay} stay")
+    return notes
+
+
 class Naming(NamedTuple):
     """Names that depend on the values of all points, and which columns are kept.
 
@@ -179,10 +238,12 @@ class Naming(NamedTuple):
         facts: What a chunk of columns shows.
         names: Columns by the names they get, from the columns of the file and the facts that any
             of the chunks showed.
+        is_guess: Whether the names are taken for granted, which people are told.
     """
 
     facts: Callable[[Columns], set[str]]
     names: Callable[[Collection[str], Collection[str]], dict[str, str]]
+    is_guess: bool = False
 
 
 def number_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -191,53 +252,122 @@ def number_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
     The first three are ``x y z``, a fourth alone is ``intensity``, others are ``column_4``,
     ``column_5`` and so on; where there are six or seven, :func:`name_numbered` knows better.
     """
-    names = ["x", "y", "z", *(f"column_{i}" for i in range(4, values.shape[1] + 1))]
-    if len(names) == 4:
-        names[3] = "intensity"
-    return {name: values[:, i] for i, name in enumerate(names)}
+    return {name: values[:, i] for i, name in enumerate(_numbers(values.shape[1]))}
 
 
-def naming_of(num_columns: int) -> Naming | None:
-    """Return how a table without names, of so many columns, gets better ones."""
-    return Naming(numbered_facts, name_numbered) if num_columns in _GUESSED_WIDTHS else None
+def _numbers(num_columns: int) -> list[str]:
+    """Return the names that columns without names have before their values are looked at."""
+    names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
+    return names if num_columns != 4 else [*names[:3], "intensity"]
+
+
+def rule_for(num_columns: int) -> tuple[Naming | None, tuple[str, ...]]:
+    """Return how so many columns without names get better ones, and what to tell people of them.
+
+    Nothing of three columns, and of others nothing yet where the values tell.
+    """
+    if num_columns in _GUESSED_WIDTHS:
+        return Naming(numbered_facts, name_numbered, is_guess=True), ()
+    return None, (note_on_names(_numbers(num_columns)),) if num_columns > 3 else ()
+
+
+def note_on_names(names: Iterable[str]) -> str:
+    """Return the line that says which names columns without any were given."""
+    return (
+        f"its columns have no names and are taken as {' '.join(names)}; if they are others, name "
+        "them with --columns"
+    )
 
 
 def name_numbered(columns: Collection[str], facts: Collection[str]) -> dict[str, str]:
     """Name the six or seven columns of a table of which :func:`numbered_facts` are known.
 
-    Three are x y z, the next three a colour (whole numbers 0 to 255) or a unit normal, and a
-    seventh of whole numbers beside them is ``label``. What fits none of this keeps its name.
+    By :data:`COLUMNS_RULE`. Of seven columns of small whole numbers, programs mean ``intensity red
+    green blue`` or ``red green blue label``; which of these is not told by values, so both keep
+    their numbers.
 
     Example:
-        >>> columns = number_columns(np.array([[0.5, 0.5, 0.5, 255.0, 128.0, 0.0]]))
+        >>> columns = number_columns(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
         >>> list(name_numbered(columns, numbered_facts(columns)))
-        ['x', 'y', 'z', 'red', 'green', 'blue']
+        ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
     """
     old, names = list(columns), list(columns)
-    if "has lengths" in facts and "not unit" not in facts:
-        names[3:6] = ["nx", "ny", "nz"]
-    elif "not bytes" not in facts:
-        names[3:6] = ["red", "green", "blue"]
-    if len(names) == 7 and names[3] != "column_4" and "no label" not in facts:
-        names[6] = "label"
+    found: dict[int, tuple[str, str, str]] = {}
+    for start in _triples_of(columns):
+        if f"lengths {start}" in facts and f"not unit {start}" not in facts:
+            found[start] = ("nx", "ny", "nz")
+        elif f"not bytes {start}" not in facts:
+            found[start] = ("red", "green", "blue")
+    if len(found) == 1:
+        ((start, triple),) = found.items()
+        names[start : start + 3] = triple
+        if start > 3 and "red" in triple:
+            names[3] = "intensity"
     return dict(zip(names, old, strict=True))
 
 
+def _triples_of(columns: Collection[str]) -> range:
+    """Return where three columns next to each other begin that are not the coordinates."""
+    return range(3, len(columns) - 2)
+
+
 def numbered_facts(columns: Columns) -> set[str]:
-    """Return what the columns of a table without names show that the further ones are not."""
-    values = list(columns.values())
-    three = np.stack(values[3:6], axis=1)
-    squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
-    # Unit vectors may be zero or not numbers where there is none.
-    lengths = squares[np.isfinite(squares) & (squares != 0)]
-    facts = {"has lengths"} if len(lengths) else set()
-    if (np.abs(lengths - 1) >= _UNIT_TOLERANCE).any():
-        facts.add("not unit")
-    if three.size and not (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
-        facts.add("not bytes")
-    if len(columns) == 7 and not are_whole(values[6]):
-        facts.add("no label")
+    """Return what the columns of a table without names show that three of them are not.
+
+    Each fact ends in the number of the first of the three, from zero.
+    """
+    values, facts = list(columns.values()), set[str]()
+    for start in _triples_of(columns):
+        three = np.stack(values[start : start + 3], axis=1)
+        squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
+        # Unit vectors may be zero or not numbers where there is none.
+        lengths = squares[np.isfinite(squares) & (squares != 0)]
+        if len(lengths):
+            facts.add(f"lengths {start}")
+        if (np.abs(lengths - 1) >= _UNIT_TOLERANCE).any():
+            facts.add(f"not unit {start}")
+        if three.size and not (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
+            facts.add(f"not bytes {start}")
     return facts
+
+
+def name_columns(table: NDArray[Any], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table, shape ``(N, C)``, by names that are given, or by the rule."""
+    if names is None:
+        return number_columns(table)
+    return {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
+
+
+def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
+    """Check names that are given for columns: one for each, and each once but for ``_``."""
+    kept = [name for name in names if name != LEFT_OUT]
+    if not {"x", "y", "z"} <= {name.lower() for name in kept} or len(set(kept)) != len(kept):
+        raise FormatError(
+            f"{path}: expected names of columns that differ, x, y and z among them, got "
+            f"{','.join(names)}; {LEFT_OUT} leaves a column out."
+        )
+    if len(names) != num_columns:
+        raise FormatError(
+            f"{path}: expected names for {num_columns} columns, got {len(names)} "
+            f"({','.join(names)}); {LEFT_OUT} leaves a column out."
+        )
+
+
+def check_first_rows(path: Path, rows: NDArray[Any]) -> None:
+    """Refuse tables of numbers without names that are no points: a pose, or points across.
+
+    The rows are the first :data:`FIRST_ROWS`, or all if there are fewer, shape ``(n, C)``.
+    """
+    num_rows, num_columns = rows.shape
+    if rows.shape == (4, 4) and rows[3].tolist() == [0, 0, 0, 1]:
+        raise FormatError(
+            f"{path}: expected points, got a matrix of 4 x 4, a pose; name the file of the cloud."
+        )
+    if 3 <= num_rows <= _MOST_GUESSED < num_columns:
+        raise FormatError(
+            f"{path}: expected a row for each point, got {num_rows} rows of {num_columns:,} "
+            "numbers; transpose them."
+        )
 
 
 def are_whole(values: NDArray[Any]) -> bool:
@@ -247,7 +377,7 @@ def are_whole(values: NDArray[Any]) -> bool:
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
-def _sources(columns: Columns) -> dict[str, list[str]]:
+def sources_of(columns: Columns) -> dict[str, list[str]]:
     """Return the columns that each field is made of; the first of two equal names wins it.
 
     Triples and numbered columns are joined, the others renamed. Shapes and types decide, no values.
@@ -269,10 +399,10 @@ def _sources(columns: Columns) -> dict[str, list[str]]:
     return fields
 
 
-def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+def _joined(path: Path, parts: list[NDArray[Any]]) -> NDArray[Any]:
     """Return several single columns as one field, or one column as it is, in native byte order."""
     if len(parts) > 1:
-        return _stacked(parts)
+        return _stacked(path, parts)
     return np.ascontiguousarray(parts[0], dtype=parts[0].dtype.newbyteorder("="))
 
 
@@ -308,9 +438,16 @@ def _numbered(columns: Columns) -> dict[str, list[str]]:
     }
 
 
-def _stacked(columns: list[NDArray[Any]]) -> NDArray[Any]:
+def _stacked(path: Path, columns: list[NDArray[Any]]) -> NDArray[Any]:
     """Put single columns side by side, in native byte order."""
-    dtype = np.result_type(*columns)
+    try:
+        dtype = np.result_type(*columns)
+    except TypeError as error:
+        kinds = ", ".join(str(column.dtype) for column in columns)
+        raise FormatError(
+            f"{path}: expected columns of one kind side by side, got {kinds}; convert them to "
+            "numbers."
+        ) from error
     stacked = np.empty((len(columns[0]), len(columns)), dtype)
     for i, column in enumerate(columns):
         stacked[:, i] = column

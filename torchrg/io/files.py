@@ -6,7 +6,8 @@ import re
 import secrets
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 from torchrg.errors import FormatError
@@ -24,16 +25,19 @@ DAMAGES = (
     struct.error,
 )
 """What libraries raise on damaged files beside their own errors, found by flipping bytes."""
-_BESIDE = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")
-"""Names that :func:`atomic_path` writes under."""
+_MORE_BYTES = 1 << 20
+"""More than a library writes at a time, so that they do not fit where its last did not."""
+_mark: ContextVar[str | None] = ContextVar("_mark", default=None)
+"""What the names have in common that :func:`atomic_path` writes under here."""
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a path to write to that takes the place of ``path`` once the block has ended well.
 
-    The file is written beside its final place, flushed to the disk, and moved there in one step. If
-    the block raises, nothing is left behind and an older file stays as it was. The suffix is kept.
+    The file is written beside its final place, flushed to the disk, and moved there in one step;
+    then its name is flushed too. If the block raises, nothing is left behind and an older file
+    stays as it was. The suffix is kept.
 
     Args:
         path: Where the file shall be. A symbolic link is followed.
@@ -56,13 +60,15 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         whole
     """
     target = Path(os.path.realpath(path))
-    beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    name = f".{target.stem}.{_mark.get() or make_mark()}{secrets.token_hex(4)}{target.suffix}"
+    beside = target.with_name(name)
     check_place(path)
     try:
         yield beside
         with beside.open("rb+") as stream:
             os.fsync(stream.fileno())
         beside.replace(target)
+        sync_folder(target.parent)
     except OSError as error:
         # NumPy's error of a short write comes without its number; it is a full disk's.
         if error.errno is None and "requested and" in str(error):
@@ -72,34 +78,82 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-def remove_leftovers(folder: Path, *, of: str | None = None) -> None:
-    """Remove what :func:`atomic_path` left in a folder when its process was killed.
+def make_mark() -> str:
+    """Return a mark for the names of one run, which no other file bears."""
+    return secrets.token_hex(8)
 
-    Nothing else may be writing there, or not to the file ``of`` a name, where only its leftovers
-    are to go. Folders in it are left alone.
+
+@contextmanager
+def marked_parts(mark: str) -> Iterator[None]:
+    """Let :func:`atomic_path` write under names that bear a mark in this block, in this thread.
+
+    Whoever knows the mark can then remove what a process left that was killed; without one, nobody
+    can tell whose such a file is.
+    """
+    token = _mark.set(mark)
+    try:
+        yield
+    finally:
+        _mark.reset(token)
+
+
+def remove_leftovers(folder: Path, mark: str) -> None:
+    """Remove what :func:`atomic_path` left in a folder under a mark when its process was killed.
+
+    Nothing may be writing there under the same mark.
 
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     Path(folder, ".a.0123abcd.txt").touch()
-        ...     Path(folder, "a.txt").touch()
-        ...     remove_leftovers(Path(folder))
-        ...     [path.name for path in Path(folder).iterdir()]
-        ['a.txt']
+        ...     for name in ("a.txt", ".a.0123456789abcdef01234567.txt", ".a.other.txt"):
+        ...         Path(folder, name).touch()
+        ...     remove_leftovers(Path(folder), "0123456789abcdef")
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['.a.other.txt', 'a.txt']
     """
+    name = re.compile(rf"\..*\.{mark}[0-9a-f]{{8}}(\.[^.]*)?")
     for path in folder.iterdir():
-        is_of = of is None or path.name.startswith(f".{Path(of).stem}.")
-        if is_of and _BESIDE.fullmatch(path.name):
+        if name.fullmatch(path.name) and path.is_file() and not path.is_symlink():
             path.unlink(missing_ok=True)
 
 
+def sync_folder(folder: Path) -> None:
+    """Flush the names in a folder to the disk, where its file system has a way to do so."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def check_place(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be put at a path: its folder exists, and it is no directory itself."""
+    """Check that a file can be put at a path, so that this is not found out after long work.
+
+    Its folder exists and takes files, and what is there already is a file that may be replaced: not
+    a directory or device, and not read-only.
+    """
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
     if not target.parent.is_dir():
         raise FormatError(f"{path}: there is no folder {target.parent}; make it first.")
+    if target.exists() and not target.is_file():
+        raise FormatError(f"{path}: expected a file to write, got a device; name another.")
+    for place in (target.parent, target):
+        if place.exists() and not os.access(place, os.W_OK):
+            raise FormatError(
+                f"{path}: cannot be written: {place} is read-only; write to another place, or make "
+                "it writable."
+            )
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, if it is not there; raise FormatError if it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be made: {error.strerror or error}.") from error
 
 
 def check_file(path: Path) -> int:
@@ -129,6 +183,23 @@ def check_promise(
             f"{path}: byte {byte}: expected {least}{promised:,} bytes for {content}, got "
             f"{available:,}; the file is cut off or its header is wrong, fetch it again."
         )
+
+
+@contextmanager
+def asking_system(path: Path, *errors: type[BaseException]) -> Iterator[None]:
+    """Raise the operating system's error where that of a library, met while it wrote, hides it.
+
+    What is in the way of a library, a full disk, is in the way of a few more bytes, too. The file
+    is spoilt by them; nobody wants it any more.
+    """
+    try:
+        yield
+    except errors:
+        with path.open("ab") as stream:
+            stream.write(bytes(_MORE_BYTES))
+            stream.flush()
+            os.fsync(stream.fileno())
+        raise
 
 
 @contextmanager

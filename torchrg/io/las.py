@@ -1,7 +1,8 @@
 """LAS and LAZ through laspy (extra ``las``): scale, offset, reference system and dimensions kept.
 
 Normals, curvature and labels are extra dimensions named ``NormalX``, ``NormalY``, ``NormalZ``,
-``Curvature`` and ``label``, the names PDAL knows where it has one.
+``Curvature`` and ``label``, the names PDAL knows where it has one. Extra dimensions that a file
+came with keep their name, type, scale, offset, value for no data and description.
 """
 
 import copy
@@ -17,16 +18,23 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
-from torchrg.io.fields import WIDEN, Columns, Naming, are_whole
-from torchrg.io.files import DAMAGES, atomic_path, check_promise, first_line, refusing
+from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits, spell
+from torchrg.io.fields import WIDEN, Columns, Naming, are_whole, name_aside, sources_of
+from torchrg.io.files import (
+    DAMAGES,
+    asking_system,
+    atomic_path,
+    check_promise,
+    first_line,
+    refusing,
+)
 from torchrg.io.stream import CloudStream, Table
 from torchrg.structures import Cloud
 
 _POINTS_AT_ONCE = 1 << 20
 """So that memory grows with the points that are really there, whatever a header promises."""
 _SPELLING = Spelling(
-    normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16
+    normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True
 )
 _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 """By point format without colour, the one that adds it."""
@@ -38,6 +46,8 @@ _RANGE_BITS = 0b110
 """Options of an extra dimension: its least value is said, and its largest."""
 _UNFIT = "_value"
 """Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
+_UNFIT_DESCRIPTION = "more than the standard one holds"
+"""Of such a dimension, so that one of another program with such a name keeps it; 32 bytes."""
 _LARGEST_INTEGER = 2**31 - 1
 _VERSION_AT, _RECORDS_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 100, 107, 235, 247
 """Places in the header: minor version, number of records, of points, extended records, and the
@@ -68,6 +78,8 @@ def open_las(path: Path, size: int) -> Table:
             yield from map(_columns, reader.chunk_iterator(chunk_size))
 
     standard = set(header.point_format.standard_dimension_names)
+    extra = header.point_format.extra_dimensions
+    ours = {dim.name for dim in extra if dim.description == _UNFIT_DESCRIPTION}
 
     def facts(columns: Columns) -> set[str]:
         return {name for name in standard if name in columns and columns[name].any()}
@@ -75,7 +87,7 @@ def open_las(path: Path, size: int) -> Table:
     def names(columns: Collection[str], used: Collection[str]) -> dict[str, str]:
         unused = _unused(columns, standard, used)
         return {
-            name.removesuffix(_UNFIT) if name.removesuffix(_UNFIT) in unused else name: name
+            name.removesuffix(_UNFIT) if name in ours else name: name
             for name in columns
             if name not in unused
         }
@@ -134,14 +146,21 @@ def write_las(path: Path, stream: CloudStream) -> None:
     with (
         refusing(f"{path}: cannot be written: ", *errors),
         atomic_path(path) as beside,
+        asking_system(beside, *errors),
     ):
-        with laspy.open(beside, mode="w", header=plan.header) as writer:
+        packed = path.suffix.lower() == ".laz"
+        # laspy leaves a file open that it cannot end.
+        with (
+            beside.open("wb+") as file,
+            laspy.open(
+                file, mode="w", header=plan.header, do_compress=packed, closefd=False
+            ) as writer,
+        ):
             for chunk in stream:
                 record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=plan.header)
                 data = laspy.LasData(plan.header, record)
                 data.x, data.y, data.z = chunk.coordinates.T.astype(np.float64)
-                columns = flatten_cloud(path, chunk, _SPELLING, plan.limits)
-                for name, column in _fitted(path, columns, plan.unfit).items():
+                for name, column in plan.columns(path, chunk).items():
                     data[name] = column
                 writer.write_points(data.points)
             if plan.header.version.minor >= 4 and plan.header.evlrs is not None:
@@ -150,17 +169,56 @@ def write_las(path: Path, stream: CloudStream) -> None:
             _erase_date(beside)
 
 
+class _Own(NamedTuple):
+    """An extra dimension that the cloud came with.
+
+    Attributes:
+        dimension: What laspy says about it, under the name it is written by.
+        columns: The columns of the cloud that are its elements.
+    """
+
+    dimension: Any
+    columns: tuple[str, ...]
+
+    def holds(self, columns: Columns) -> bool:
+        """Whether the dimension, in its own type and scale, holds its columns exactly."""
+        values, dimension = self.join(columns), self.dimension
+        dtype = dimension.dtype.base
+        if dimension.is_scaled:
+            steps = np.rint((values - dimension.offsets) / dimension.scales)
+            if not np.isfinite(steps).all():
+                return False
+            back = steps * dimension.scales + dimension.offsets
+            return _fits(steps, dtype) and bool((back == values).all())
+        return _fits(values, dtype)
+
+    def join(self, columns: Columns) -> NDArray[Any]:
+        """Return the values of the dimension, shape ``(N,)`` or ``(N, K)``."""
+        parts = [columns[name] for name in self.columns]
+        return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
+
+
 class _Plan(NamedTuple):
     """What has to be known of all points before the first is written.
 
-    The header holds the extra dimensions; ``unfit`` are the columns that the standard dimension of
-    their name cannot hold; without a date, that of the day is erased.
+    The header holds the extra dimensions, of which ``own`` are those that the cloud came with;
+    ``unfit`` are the columns that the standard dimension of their name cannot hold; without a date,
+    that of the day is erased.
     """
 
     header: Any
     has_date: bool
     unfit: set[str]
     limits: dict[str, Limits]
+    own: list[_Own]
+
+    def columns(self, path: Path, chunk: Cloud) -> dict[str, NDArray[Any]]:
+        """Return the dimensions of a chunk but for its coordinates."""
+        columns = flatten_cloud(path, chunk, _SPELLING, self.limits)
+        joined = {own.dimension.name: own.join(columns) for own in self.own}
+        taken = {name for own in self.own for name in own.columns}
+        others = {name: column for name, column in columns.items() if name not in taken}
+        return joined | _fitted(path, others, self.unfit)
 
 
 def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
@@ -172,7 +230,9 @@ def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
         if number == 0:
             colored = all(name in columns for name in _SPELLING.color)
             header, has_date = _header(laspy, stream, colored=colored)
+            own = _own_dimensions(stream.header.get("las"), chunk)
         merge_limits(limits, columns)
+        own = [dimension for dimension in own if dimension.holds(columns)]
         fitted = _fitted(path, columns, set())
         unfit |= {
             name
@@ -186,16 +246,65 @@ def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
         reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
         header.offsets = middle
         header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
-    columns = flatten_cloud(path, chunk, _SPELLING, limits)
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(name, column.dtype.str[1:])
-            for name, column in _fitted(path, columns, unfit).items()
-            if name not in header.point_format.dimension_names
-        ]
-    )
+    plan = _Plan(header, has_date, unfit, limits, own)
+    described = {known.dimension.name: known.dimension for known in own}
+    standard = set(header.point_format.dimension_names)
+    params = []
+    for name, column in plan.columns(path, chunk).items():
+        known = described.get(name)
+        if known is not None:
+            more = (known.description, known.offsets, known.scales, known.no_data)
+            params.append(laspy.ExtraBytesParams(name, known.dtype, *more))
+        elif name not in standard:
+            ours = _UNFIT_DESCRIPTION if name.removesuffix(_UNFIT) in unfit else ""
+            params.append(laspy.ExtraBytesParams(name, column.dtype.str[1:], ours))
+    header.add_extra_dims(params)
     _claim_no_ranges(header)
-    return _Plan(header, has_date, unfit, limits)
+    return plan
+
+
+def _own_dimensions(header: Any, cloud: Cloud) -> list[_Own]:  # noqa: ANN401
+    """Return the extra dimensions of the file that a cloud came from, as far as it still has them.
+
+    A field that was put aside for a result takes its dimension along, under its new name.
+    """
+    if header is None:
+        return []
+    dimensions = {name: dim for dim in header.point_format.dimensions for name in _parts_of(dim)}
+    fields = sources_of({name: np.empty(0, _type_of(dim)) for name, dim in dimensions.items()})
+    found = dict[str, tuple[str, str]]()
+    for field, parts in fields.items():
+        aside = name_aside(field)
+        is_aside = aside in cloud.fields and aside not in fields
+        name = aside if is_aside else field
+        if name not in cloud.fields:
+            continue
+        spelled = spell(name, cloud.fields[name].shape[1:], _SPELLING)
+        if len(spelled) != len(parts):
+            continue
+        for part, column in zip(parts, spelled, strict=True):
+            new = column if dimensions[part].num_elements == 1 else name
+            found[part] = (column, new if is_aside else dimensions[part].name)
+    own = []
+    for dim in header.point_format.extra_dimensions:
+        elements = [found[part] for part in _parts_of(dim) if part in found]
+        if len(elements) == dim.num_elements:
+            columns, names = zip(*elements, strict=True)
+            own.append(_Own(dim._replace(name=names[0]), columns))
+    return own
+
+
+def _parts_of(dimension: Any) -> list[str]:  # noqa: ANN401
+    """Return the names of the columns that a dimension is read as."""
+    name, count = dimension.name, dimension.num_elements
+    return [name] if count == 1 else [f"{name}_{i}" for i in range(count)]
+
+
+def _type_of(dimension: Any) -> np.dtype[Any]:  # noqa: ANN401
+    """Return the type of the columns that a dimension is read as."""
+    if dimension.is_scaled:
+        return np.dtype(np.float64)
+    return np.dtype(np.uint8) if dimension.dtype is None else dimension.dtype.base
 
 
 def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401
@@ -311,10 +420,8 @@ def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
         values = np.asarray(block[dimension.name])
         if dimension.name in ("X", "Y", "Z"):
             continue
-        if values.ndim == 1:
-            columns[dimension.name] = values
-        else:
-            columns |= {f"{dimension.name}_{i}": part for i, part in enumerate(values.T)}
+        parts = [values] if values.ndim == 1 else values.T
+        columns |= dict(zip(_parts_of(dimension), parts, strict=True))
     return columns
 
 
@@ -360,10 +467,18 @@ def _fitted(path: Path, columns: Columns, unfit: Collection[str]) -> dict[str, N
 
 def _holds(dimension: Any, column: NDArray[Any]) -> bool:  # noqa: ANN401
     """Whether a standard dimension holds all values of a column exactly."""
-    if dimension.dtype is not None and dimension.dtype.kind == "f":
-        return bool((column.astype(dimension.dtype) == column).all())
-    whole = are_whole(column)
-    return whole and bool(column.min() >= dimension.min and column.max() <= dimension.max)
+    if dimension.dtype is not None:
+        return _fits(column, dimension.dtype)
+    return _fits(column, np.dtype(np.uint8)) and bool(column.max() <= dimension.max)
+
+
+def _fits(values: NDArray[Any], dtype: np.dtype[Any]) -> bool:
+    """Whether a type holds all values exactly."""
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return np.array_equal(values.astype(dtype), values, equal_nan=values.dtype.kind == "f")
+    held = np.iinfo(dtype)
+    return are_whole(values) and bool(values.min() >= held.min and values.max() <= held.max)
 
 
 def _erase_date(path: Path) -> None:

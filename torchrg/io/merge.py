@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
+from torchrg.io.e57 import SYSTEM
 from torchrg.io.fields import WIDEN
+from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.io.stream import CloudStream, Extent
 from torchrg.structures import Cloud
 
@@ -20,6 +22,18 @@ _LARGEST_INTEGER = 2**31 - 1
 """Of the coordinates of a LAS file, in steps of its scale."""
 _PROJECTION = "LASF_Projection"
 """Whose records say in which coordinates a LAS file is."""
+_OWN_RECORDS = (_PROJECTION, "laszip encoded")
+_EXTRA_DIMENSIONS = ("LASF_Spec", 4)
+"""Records that follow from what else is in a file: owners, and an owner with a number."""
+_ORIGIN_FACTS = ("system_identifier", "generating_software", "file_source_id", "uuid")
+"""What a LAS header says of where one file comes from."""
+_KINDS = {
+    "las": "header",
+    "scans": "list of scans, with poses,",
+    SYSTEM: "coordinate system",
+    "viewpoint": "viewpoint",
+}
+"""What is in the header of a cloud, for people."""
 
 
 class Merged(NamedTuple):
@@ -61,18 +75,19 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
         and colours of 8 bits become such of 16 where another cloud has these. Coordinates are
         float64 if any are. Of LAS files the header of the first is kept with the finest scale, if
         their point formats are the same and its grid reaches all points; of E57 files all scans
-        are, numbered on in ``scan``.
+        are, numbered on in ``scan``. What else the headers say and the merged one does not is
+        noted.
 
     Args:
         streams: The clouds, at least one; their coordinates are taken to be of one frame and unit.
 
     Returns:
-        The cloud and what was left out. Nothing but the first chunk and the extent of each cloud
-        has been read.
+        The cloud and what was left out, with the notes of the clouds. Nothing but the first chunk
+        and the extent of each has been read.
 
     Raises:
-        FormatError: If there are no clouds, if a file is damaged, or if LAS files name different
-            coordinate reference systems.
+        FormatError: If there are no clouds, if a file is damaged, or if LAS or E57 files name
+            different coordinate reference systems, or LAS files count GPS times differently.
 
     Example:
         >>> clouds = [Cloud(np.eye(3), {"labels": np.arange(3)}), Cloud(np.zeros((1, 3)))]
@@ -84,11 +99,13 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
         raise FormatError("merge: expected at least one cloud, got none; name a file.")
     if len(streams) == 1:
         return Merged(streams[0], [])
-    kept, notes = _kept([_without_points(next(iter(stream))) for stream in streams])
+    clouds = [_without_points(next(iter(stream))) for stream in streams]
+    kept, notes = _kept(clouds)
+    notes += [f"{cloud.source}: {note}" for cloud in clouds for note in cloud.notes]
     times = Counter(stream.source for stream in streams if stream.source)
     notes += [f"{name} is taken {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(streams)
-    header, header_notes = _joined_header(streams)
+    header, header_notes = _joined_header(streams, clouds)
     first_scans = _first_scans(streams) if "scans" in header else None
     if first_scans is not None:
         kept.fields.pop("scan", None)
@@ -97,7 +114,7 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
     def chunks() -> Iterator[Cloud]:
         for number, stream in enumerate(streams):
             for chunk in stream:
-                cast = replace(kept.cast(chunk), header=header)
+                cast = replace(kept.cast(chunk), header=header, notes=())
                 if first_scans is not None:
                     scan = chunk.fields.get("scan", np.zeros(len(chunk), np.int32))
                     fields = {**cast.fields, "scan": scan.astype(np.int32) + first_scans[number]}
@@ -121,7 +138,7 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
 def _without_points(cloud: Cloud) -> Cloud:
     """Return a cloud with all but its points: chunks of many files would fill the memory."""
     fields = {name: values[:0].copy() for name, values in cloud.fields.items()}
-    return Cloud(cloud.coordinates[:0].copy(), fields, header=cloud.header)
+    return replace(cloud, coordinates=cloud.coordinates[:0].copy(), fields=fields)
 
 
 def _kept(clouds: Sequence[Cloud]) -> tuple[_Kept, list[str]]:
@@ -177,47 +194,117 @@ def _first_scans(streams: Sequence[CloudStream]) -> NDArray[np.int32]:
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
 
 
-def _joined_header(streams: Sequence[CloudStream]) -> tuple[Mapping[str, Any], list[str]]:
+def _joined_header(
+    streams: Sequence[CloudStream], clouds: Sequence[Cloud]
+) -> tuple[Mapping[str, Any], list[str]]:
     """Return the header of the merged cloud, and what of the headers is not kept."""
-    headers = [stream.header for stream in streams]
-    if all("scans" in header for header in headers):
-        return {"scans": tuple(scan for header in headers for scan in header["scans"])}, []
-    if all("las" in header for header in headers):
-        return _joined_las(streams)
-    viewpoints = {tuple(header.get("viewpoint", ())) for header in headers}
-    if len(viewpoints) == 1 and viewpoints != {()}:
-        return {"viewpoint": headers[0]["viewpoint"]}, []
-    return {}, []
-
-
-def _joined_las(streams: Sequence[CloudStream]) -> tuple[Mapping[str, Any], list[str]]:
-    """Return a header whose grid holds the points of all files, or none."""
-    headers = [stream.header["las"] for stream in streams]
-    systems = [_system(header) for header in headers]
-    named = [(system, s.source) for system, s in zip(systems, streams, strict=True) if system]
-    for system, source in named[1:]:
-        if system != named[0][0]:
-            raise FormatError(
-                f"{source}: expected the coordinate reference system of {named[0][1]}, got "
-                "another; reproject one of them."
-            )
+    named = [(cloud, system) for cloud in clouds if (system := _system(cloud.header))]
+    for kind in ("las", SYSTEM):
+        own = [(cloud.source, system) for cloud, system in named if kind in cloud.header]
+        _check_equal(own, "coordinate reference system", "reproject one of them")
+    times = [
+        (cloud.source, cloud.header["las"].global_encoding.gps_time_type)
+        for cloud in clouds
+        if "las" in cloud.header and "gps_time" in cloud.fields
+    ]
+    _check_equal(times, "kind of GPS times", "convert one of them, or leave gps_time out")
     notes = []
-    if 0 < len(named) < len(streams):
-        notes.append(f"only {len(named)} of {len(streams)} files name a coordinate system")
+    if 0 < len(named) < len(clouds):
+        notes.append(f"only {len(named)} of {len(clouds)} files name a coordinate system")
+    joined: dict[str, Any] = {}
+    why = dict.fromkeys(_KINDS, "not all files have one")
+    if all("scans" in cloud.header for cloud in clouds):
+        joined["scans"] = tuple(scan for cloud in clouds for scan in cloud.header["scans"])
+        if named:
+            joined[SYSTEM] = named[0][1]
+    if all("las" in cloud.header for cloud in clouds):
+        why["las"] = _reason_to_drop(streams, clouds)
+        if not why["las"]:
+            joined["las"], las_notes = _joined_las(clouds)
+            notes += las_notes
+    if times and "las" in joined:
+        joined["las"].global_encoding.gps_time_type = times[0][1]
+    viewpoints = {tuple(cloud.header.get("viewpoint", DEFAULT_VIEWPOINT)) for cloud in clouds}
+    if len(viewpoints) > 1:
+        why["viewpoint"] = "it differs between files"
+    elif viewpoints != {DEFAULT_VIEWPOINT}:
+        joined["viewpoint"] = viewpoints.pop()
+    for kind, what in _KINDS.items():
+        having = [cloud.source for cloud in clouds if kind in cloud.header]
+        if having and kind not in joined and (kind != "viewpoint" or len(viewpoints) > 1):
+            notes.append(f"the {what} of {having[0]} is not kept: {why[kind]}")
+    if times and "las" not in joined:
+        notes.append("what GPS times count from is not kept with it")
+    return joined, notes
+
+
+def _check_equal(facts: Sequence[tuple[str, Any]], what: str, repair: str) -> None:
+    """Raise FormatError if the facts about two files differ."""
+    for source, fact in facts[1:]:
+        if fact != facts[0][1]:
+            raise FormatError(
+                f"{source}: expected the {what} of {facts[0][0]}, got another; {repair}."
+            )
+
+
+def _reason_to_drop(streams: Sequence[CloudStream], clouds: Sequence[Cloud]) -> str:
+    """Return why the header of the first of LAS files cannot be that of all; empty if it can."""
+    headers = [cloud.header["las"] for cloud in clouds]
+    if len({header.point_format.id for header in headers}) > 1:
+        return "point formats differ"
+    offsets, extents = headers[0].offsets, [stream.extent for stream in streams]
+    reach = np.max([np.abs([e.low - offsets, e.high - offsets]) for e in extents])
+    if reach > _LARGEST_INTEGER * np.min([header.scales for header in headers]):
+        return "its grid does not reach all points"
+    return ""
+
+
+def _joined_las(clouds: Sequence[Cloud]) -> tuple[Any, list[str]]:
+    """Return the header of the first of LAS files with a grid for all, and what is not kept."""
+    headers, source = [cloud.header["las"] for cloud in clouds], clouds[0].source
     joined = copy.deepcopy(headers[0])
     joined.scales = np.min([header.scales for header in headers], axis=0)
-    extents = [stream.extent for stream in streams]
-    reach = np.max([np.abs([e.low - joined.offsets, e.high - joined.offsets]) for e in extents])
-    formats = {header.point_format.id for header in headers}
-    if len(formats) > 1 or reach > _LARGEST_INTEGER * joined.scales.min():
-        why = "point formats differ" if len(formats) > 1 else "its grid does not reach all points"
-        return {}, [*notes, f"the header of {streams[0].source} is not kept: {why}"]
-    return {"las": joined}, notes
+    notes = []
+    facts = [name for name in _ORIGIN_FACTS if len({str(getattr(h, name)) for h in headers}) > 1]
+    if facts:
+        words = ", ".join(name.replace("_", " ") for name in facts)
+        notes.append(f"{words} are those of {source} for all points")
+    first, *others = [set(_records(header)) for header in headers]
+    lost = sorted({record[:2] for records in others for record in records - first})
+    if lost:
+        names = ", ".join(f"{owner} {number}" for owner, number in lost)
+        notes.append(f"records are those of {source}; left out of others: {names}")
+    dimensions = [{dim.name: dim for dim in h.point_format.extra_dimensions} for h in headers]
+    differing = [
+        name
+        for name, dim in dimensions[0].items()
+        if any(_described(own[name]) != _described(dim) for own in dimensions[1:] if name in own)
+    ]
+    if differing:
+        joined.remove_extra_dims(differing)
+        notes.append(f"scale and description of {', '.join(differing)} are left out: files differ")
+    return joined, notes
 
 
-def _system(header: Any) -> frozenset[tuple[int, bytes]]:  # noqa: ANN401
-    """Return the records that say in which coordinate reference system a LAS file is."""
-    records = [*header.vlrs, *(header.evlrs or ())]
+def _described(dimension: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return what a LAS file says of an extra dimension, as values that compare."""
+    parts = (dimension.offsets, dimension.scales, dimension.no_data)
+    return dimension.description, *(None if part is None else part.tolist() for part in parts)
+
+
+def _records(header: Any) -> Iterator[tuple[str, int, bytes]]:  # noqa: ANN401
+    """Yield the records of a LAS file that stand for themselves: owner, number, content."""
+    for record in (*header.vlrs, *(header.evlrs or ())):
+        known = (record.user_id, record.record_id)
+        if record.user_id not in _OWN_RECORDS and known != _EXTRA_DIMENSIONS:
+            yield *known, record.record_data_bytes()
+
+
+def _system(header: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Return what says in which coordinate reference system a file is; empty if nothing does."""
+    if "las" not in header:
+        return header.get(SYSTEM, "")
+    records = [*header["las"].vlrs, *(header["las"].evlrs or ())]
     return frozenset(
         (record.record_id, record.record_data_bytes())
         for record in records

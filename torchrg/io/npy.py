@@ -1,10 +1,10 @@
 """NumPy's own files: ``.npy``, one array, and ``.npz``, several by name. No pickle is ever loaded.
 
 ``.npz``: ``points`` (or ``coord``), shape (N, 3), and any arrays of N rows, which become fields.
-Arrays of another length are left out, and so is what a result says about its planes, under names
-that begin with ``plane_``. See :func:`torchrg.io.write_cloud` for all names of a result.
-``.npy``: an array (N, 3) or wider, see :func:`torchrg.io.fields.name_numbered` for its columns, or
-a structured array with named fields ``x``, ``y``, ``z``.
+Arrays of another length are left out, and so is what a result says about its planes. See
+:func:`torchrg.io.write_cloud` for all names of a result.
+``.npy``: an array (N, 3) or wider, the columns of which are named when it is read or by
+:data:`torchrg.io.fields.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
 """
 
 import io
@@ -13,7 +13,7 @@ import math
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -27,14 +27,29 @@ from torch import Tensor
 
 from torchrg.errors import FormatError
 from torchrg.io.columns import Spelling, flatten_cloud, to_records, wide_limits
-from torchrg.io.fields import Columns, check_coordinates, naming_of, number_columns
+from torchrg.io.fields import (
+    FIRST_ROWS,
+    Columns,
+    check_coordinates,
+    check_first_rows,
+    check_names,
+    name_aside,
+    name_columns,
+    rule_for,
+)
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
 from torchrg.io.stream import CHUNK_SIZE, CloudStream, Table, slices
-from torchrg.structures import PLANE_KINDS, Planes, Segmentation, Superpoints
+from torchrg.structures import PLANE_KINDS, PlaneAdjacency, Planes, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
 _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
-_NOT_PER_POINT = "plane_"
+_NOT_PER_POINT = {
+    *(f"plane_{name}" for name in (*Planes._fields, "of_superpoint")),
+    *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
+    *(f"outline_{name}" for name in ("points", "ring_sizes", "ring_planes")),
+    "provenance",
+}
+"""What a result says beside its points, of however many rows."""
 _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
 _BYTES_AT_ONCE = 1 << 20
@@ -43,26 +58,50 @@ _EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 
 
-def open_npy(path: Path, size: int) -> Table:
-    """Open a ``.npy`` file."""
+def open_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Table:
+    """Open a ``.npy`` file; ``columns`` are names for those of an array that has none."""
     with path.open("rb") as stream:
         layout = _read_header(path, stream, size, content="the array")
-    names = layout.dtype.names
-    if names is None and (len(layout.shape) != 2 or layout.shape[1] < 3):
+    fields = layout.dtype.names
+    if fields is not None:
+        return _open_records(path, layout, fields, columns)
+    if len(layout.shape) != 2 or layout.shape[1] < 3:
         raise FormatError(
             f"{path}: expected an array of shape (N, 3) or wider, got {layout.shape}; reshape it."
         )
-    if names is not None and not layout.is_fortran:
+    num_rows, num_columns = layout.shape
+    check_coordinates(path, (num_rows, 3), layout.dtype)
+
+    def read(chunk_size: int) -> Iterator[Columns]:
+        for rows in _read_rows(lambda: path.open("rb"), layout, chunk_size):
+            yield name_columns(rows, columns)
+
+    if columns is not None:
+        check_names(path, columns, num_columns)
+        return Table(read, num_rows)
+    check_first_rows(path, next(_read_rows(lambda: path.open("rb"), layout, FIRST_ROWS)))
+    naming, notes = rule_for(num_columns)
+    return Table(read, num_rows, naming=naming, notes=notes)
+
+
+def _open_records(
+    path: Path, layout: "_Layout", fields: Sequence[str], columns: Sequence[str] | None
+) -> Table:
+    """Open an array of records."""
+    if columns is not None:
+        raise FormatError(
+            f"{path}: expected no names for columns, as its fields have some: {', '.join(fields)}; "
+            "leave them out."
+        )
+    if not layout.is_fortran:
         layout = layout._replace(shape=(math.prod(layout.shape),))
 
     def read(chunk_size: int) -> Iterator[Columns]:
         for rows in _read_rows(lambda: path.open("rb"), layout, chunk_size):
             flat = rows.reshape(-1)
-            yield number_columns(rows) if names is None else {name: flat[name] for name in names}
+            yield {name: flat[name] for name in fields}
 
-    naming = naming_of(layout.shape[1]) if names is None else None
-    num_points = layout.num_rows if names is None else math.prod(layout.shape)
-    return Table(read, num_points, naming=naming)
+    return Table(read, math.prod(layout.shape))
 
 
 def write_npy(path: Path, stream: CloudStream) -> None:
@@ -105,8 +144,10 @@ def open_npz(path: Path, size: int) -> Table:
     kept = [
         name
         for name, layout in layouts.items()
-        if layout.shape[:1] == shape[:1] and not name.startswith(_NOT_PER_POINT)
+        if layout.shape[:1] == shape[:1] and name not in _NOT_PER_POINT
     ]
+    others = [name for name in layouts if name not in kept and name not in _NOT_PER_POINT]
+    notes = (f"{', '.join(others)} left out: not of {shape[0]:,} rows",) if others else ()
 
     def read(chunk_size: int) -> Iterator[Columns]:
         with _open_archive(path) as archive:
@@ -119,7 +160,7 @@ def open_npz(path: Path, size: int) -> Table:
             for rows in zip(*arrays, strict=True):
                 yield dict(zip(kept, rows, strict=True))
 
-    return Table(read, shape[0], coordinates=coordinates)
+    return Table(read, shape[0], coordinates=coordinates, notes=notes)
 
 
 def write_npz(
@@ -139,7 +180,7 @@ def write_npz(
     }
     if segmentation is None:
         for name, values in next(iter(stream)).fields.items():
-            if name in _COORDINATES:
+            if name in _COORDINATES or name in _NOT_PER_POINT:
                 raise FormatError(
                     f"{path}: expected fields beside points, got {name!r}; rename it."
                 )
@@ -154,6 +195,8 @@ def write_npz(
         arrays |= _table(stream.origin, segmentation.planes)
     if superpoints is not None:
         for name in superpoints.rows(slice(0)).by_level():
+            if name in arrays:
+                arrays.setdefault(name_aside(name), arrays[name])
             arrays[name] = partial(_level, superpoints, name)
         arrays["plane_of_superpoint"] = superpoints.plane.numpy(force=True)
     if provenance is not None:

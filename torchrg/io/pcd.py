@@ -18,7 +18,7 @@ from torchrg.io.columns import Spelling, flatten_stream, write_records
 from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
 from torchrg.io.stream import CloudStream, Table, slices
-from torchrg.io.text import LINES_AT_ONCE, read_ascii
+from torchrg.io.text import LINES_AT_ONCE, read_ascii, words_of
 
 _LONGEST_HEADER = 1 << 16
 _LARGEST_RECORD = 1 << 20
@@ -26,7 +26,7 @@ _LARGEST_RECORD = 1 << 20
 _PADDING = "_"
 _TYPES = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
-_DEFAULT_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+DEFAULT_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and quaternion w x y z of the sensor."""
 _SPELLING = Spelling(normals=("normal_x", "normal_y", "normal_z"), vectors=True)
 _PACKED_COLORS = ("rgb", "rgba")
@@ -78,7 +78,7 @@ def write_pcd(path: Path, stream: CloudStream) -> None:
             f"{path}: expected a grid of {stream.count} points, got {height} rows of {width}; "
             "set grid_shape to None."
         )
-    viewpoint = stream.header.get("viewpoint", _DEFAULT_VIEWPOINT)
+    viewpoint = stream.header.get("viewpoint", DEFAULT_VIEWPOINT)
 
     def header(columns: Columns) -> list[str]:
         values = columns.values()
@@ -151,7 +151,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
                 f"{path}: line {number}: expected the header to end with a line DATA; "
                 "the file is cut off or no PCD file, fetch it again."
             )
-        words = raw.decode("latin-1").split()
+        words = words_of(raw)
         if words and not words[0].startswith("#"):
             lines["FIELDS" if words[0] == "COLUMNS" else words[0]] = (number, words[1:])
     entries = _Entries(path, lines)
@@ -162,7 +162,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     encoding = " ".join(entries.words("DATA"))
     if encoding not in _ENCODINGS:
         raise entries.error("DATA", f"one of {', '.join(_ENCODINGS)}")
-    viewpoint = entries.numbers("VIEWPOINT", 7, _DEFAULT_VIEWPOINT)
+    viewpoint = entries.numbers("VIEWPOINT", 7, DEFAULT_VIEWPOINT)
     dtype = _record_type(entries)
     return _Header(dtype, width, height, viewpoint, encoding, number, stream.tell())
 

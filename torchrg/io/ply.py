@@ -25,7 +25,7 @@ from torchrg.io.columns import (
 from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
 from torchrg.io.stream import CloudStream, Table, slices
-from torchrg.io.text import LINES_AT_ONCE, read_ascii
+from torchrg.io.text import LINES_AT_ONCE, read_ascii, words_of
 
 _TYPES = {
     "char": "i1",
@@ -61,6 +61,12 @@ def open_ply(path: Path, size: int) -> Table:
             f"{path}: expected an element vertex with properties, got elements "
             f"{', '.join(names) or 'none'}; write the points as vertices."
         )
+    others = [
+        f"{element.num_records:,} of {element.name}"
+        for element in elements
+        if element.name != "vertex" and element.num_records
+    ]
+    notes = (f"elements left out, as only vertices are read: {', '.join(others)}",)
     header = header._replace(elements=elements[: names.index("vertex") + 1])
     read_records = _read_binary if header.byte_order else _read_text
 
@@ -71,7 +77,8 @@ def open_ply(path: Path, size: int) -> Table:
                 yield {name.removesuffix(_LIST): records[name] for name in names}
 
     at_once = None if header.byte_order else LINES_AT_ONCE
-    return Table(read, header.elements[-1].num_records, at_once)
+    num_points = header.elements[-1].num_records
+    return Table(read, num_points, at_once, notes=notes if others else ())
 
 
 def write_ply(path: Path, stream: CloudStream) -> None:
@@ -159,7 +166,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     while True:
         number += 1
         raw = stream.readline(_LONGEST_HEADER)
-        words = raw.decode("latin-1").split()
+        words = words_of(raw)
         if number == 1 and words != ["ply"]:
             raise FormatError(f"{path}: line 1: expected 'ply', got {_shown(raw)}.")
         if not raw.endswith(b"\n") or stream.tell() > _LONGEST_HEADER:

@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import Columns, Naming, Span, assemble_cloud, color_spans
+from torchrg.io.fields import (
+    Columns,
+    Naming,
+    Span,
+    assemble_cloud,
+    color_spans,
+    note_on_names,
+    put_results,
+)
 from torchrg.structures import Cloud, origin_of_box
 
 CHUNK_SIZE = 1 << 20
@@ -37,6 +45,7 @@ class Table(NamedTuple):
         coordinates: Name of the column that holds all three; None where they are ``x y z``.
         grid_shape: That of the cloud.
         header: That of the cloud.
+        notes: Those of the cloud but for names that the values decide.
     """
 
     read: Callable[[int], Iterator[Columns]]
@@ -46,6 +55,7 @@ class Table(NamedTuple):
     coordinates: str | None = None
     grid_shape: tuple[int, int] | None = None
     header: Mapping[str, Any] = {}
+    notes: tuple[str, ...] = ()
 
     def assemble(
         self,
@@ -55,14 +65,17 @@ class Table(NamedTuple):
         spans: Mapping[str, Span] | None = None,
     ) -> Cloud:
         """Return the cloud of a chunk of columns, or with no ``spans`` of all of them."""
+        notes = self.notes
         if self.naming is not None:
             names = self.naming.names(columns, facts)
+            notes += (note_on_names(names),) if self.naming.is_guess else ()
             columns = {new: columns[old] for new, old in names.items()}
             if spans is not None:
                 spans = {new: spans[old] for new, old in names.items() if old in spans}
-        return assemble_cloud(
+        cloud = assemble_cloud(
             path, columns, coordinates=self.coordinates, spans=spans, header=self.header
         )
+        return replace(cloud, notes=notes)
 
 
 class _Survey(NamedTuple):
@@ -123,7 +136,8 @@ class CloudStream:
         def cut() -> Iterator[Cloud]:
             for rows in slices(len(cloud), chunk_size):
                 fields = {name: values[rows] for name, values in cloud.fields.items()}
-                yield Cloud(cloud.coordinates[rows], fields, None, cloud.source, cloud.header)
+                points = cloud.coordinates[rows]
+                yield replace(cloud, coordinates=points, fields=fields, grid_shape=None)
 
         return cls(cut, len(cloud), cloud.grid_shape, cloud.source, cloud.header)
 
@@ -136,7 +150,8 @@ class CloudStream:
         columns = join_columns([{**chunk.fields, "": chunk.coordinates} for chunk in chunks])
         fields = dict(columns)
         points = fields.pop("")
-        return Cloud(points, fields, self.grid_shape, self.source, self.header)
+        notes = chunks[0].notes
+        return Cloud(points, fields, self.grid_shape, self.source, self.header, notes)
 
     @cached_property
     def extent(self) -> "Extent":
@@ -164,23 +179,23 @@ class CloudStream:
 
         return replace(self, chunks=changed, measure=lambda: self.extent)
 
-    def with_fields(self, give: Callable[[slice], Columns]) -> "CloudStream":
-        """Add fields, given for the rows of each chunk; they take the place of older ones.
+    def with_results(self, give: Callable[[slice], Columns]) -> "CloudStream":
+        """Add a result, given for the rows of each chunk; own fields of its names are put aside.
+
+        See :func:`torchrg.io.fields.put_results`.
 
         Example:
-            >>> stream = CloudStream.of(Cloud(np.eye(3)), chunk_size=2)
+            >>> stream = CloudStream.of(Cloud(np.eye(3), {"labels": np.full(3, 7)}), chunk_size=2)
             >>> labels = np.array([0, 0, -1])
-            >>> labelled = stream.with_fields(lambda rows: {"labels": labels[rows]})
+            >>> labelled = stream.with_results(lambda rows: {"labels": labels[rows]})
             >>> [chunk.fields["labels"].tolist() for chunk in labelled]
             [[0, 0], [-1]]
+            >>> [chunk.fields["label_input"].tolist() for chunk in labelled]
+            [[7, 7], [7]]
         """
-
-        def joined(chunk: Cloud, rows: slice) -> Cloud:
-            new = give(rows)
-            kept = {name: values for name, values in chunk.fields.items() if name not in new}
-            return replace(chunk, fields={**kept, **new})
-
-        return self.each(joined)
+        return self.each(
+            lambda chunk, rows: replace(chunk, fields=put_results(chunk.fields, give(rows)))
+        )
 
 
 class Extent(NamedTuple):

@@ -1,11 +1,13 @@
-"""Points as text, ``.xyz`` and ``.txt``: one point a line, numbers between spaces or commas.
+"""Points as text, ``.xyz`` and ``.txt``: one point a line, numbers between spaces or marks.
 
-A first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns;
-without it :func:`torchrg.io.fields.name_numbered` does. A line of one number before the first point
-is the count of points that some programs write, and is skipped. The rows of numbers in ASCII files
-of other formats are read here, too.
+Marks are commas, semicolons or tabs; decimals may begin with a comma where that is not the mark. A
+first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns,
+unless names are given; without either :data:`torchrg.io.fields.COLUMNS_RULE` does. A line of one
+number before the first point is the count of points that some programs write. The rows of numbers
+in ASCII files of other formats are read here, too.
 """
 
+import csv
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -16,7 +18,14 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.columns import Spelling, flatten_cloud
-from torchrg.io.fields import Columns, naming_of, number_columns
+from torchrg.io.fields import (
+    FIRST_ROWS,
+    Columns,
+    check_first_rows,
+    check_names,
+    name_columns,
+    rule_for,
+)
 from torchrg.io.files import atomic_path, check_promise
 from torchrg.io.stream import CloudStream, Table
 
@@ -25,34 +34,70 @@ LINES_AT_ONCE = 65_536
 _COUNTED_BYTES = 1 << 16
 """How much of a file is read to tell how long its lines are."""
 _COMMENTS = ("#", "//")
+_MOST_DIGITS = 18
+"""Of a count of points; longer ones fit no file."""
 
 
-def open_text(path: Path, size: int) -> Table:
-    """Open points as text, always in float64."""
+class _Form(NamedTuple):
+    """How the numbers of a line are written.
+
+    Attributes:
+        delimiter: What is between them; None for white space.
+        decimal: What their decimals begin with.
+    """
+
+    delimiter: str | None = None
+    decimal: str = "."
+
+    def split(self, text: str) -> list[str]:
+        """Return the words of a line, decimals after a point."""
+        words = [word.strip().strip("\"'") for word in text.split(self.delimiter)]
+        return [word.replace(self.decimal, ".") for word in words]
+
+
+_FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
+"""The first that makes numbers of all words of a line is its form."""
+
+
+def open_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Table:
+    """Open points as text, always in float64; ``columns`` are names in place of the file's own."""
     with _open_lines(path) as stream:
-        opening = _read_opening(path, stream)
+        opening = _read_opening(path, stream, columns)
+    names = opening.names
     dtype = np.dtype([("row", "f8", (opening.num_columns,))])
 
-    def read(chunk_size: int) -> Iterator[Columns]:
+    def read_rows(chunk_size: int) -> Iterator[NDArray[np.float64]]:
+        num_rows = 0
         with _open_lines(path) as stream:
-            before = opening.line_number - 1
-            for rows in _read_table(
-                path,
-                islice(stream, before, None),
-                dtype,
-                chunk_size,
-                first_line=opening.line_number,
-                delimiter=opening.delimiter,
-                comments=_COMMENTS[0],
-            ):
-                table = rows["row"]
-                if opening.names is None:
-                    yield number_columns(table)
-                else:
-                    yield {name: table[:, i] for i, name in enumerate(opening.names)}
+            lines = islice(stream, opening.line_number - 1, None)
+            first, form = opening.line_number, opening.form
+            for rows in _read_table(path, lines, dtype, chunk_size, first_line=first, form=form):
+                num_rows += len(rows)
+                yield rows["row"]
+        if num_rows < opening.num_points:
+            raise FormatError(
+                f"{path}: expected {opening.num_points:,} points, as the line before them says, "
+                f"got {num_rows:,}; the file is cut off, fetch it again, or delete that line."
+            )
 
-    naming = naming_of(opening.num_columns) if opening.names is None else None
-    return Table(read, None, LINES_AT_ONCE, naming)
+    def read(chunk_size: int) -> Iterator[Columns]:
+        return (name_columns(table, names) for table in read_rows(chunk_size))
+
+    is_comma = opening.form.decimal == ","
+    notes: tuple[str, ...] = ("its commas are taken as decimal points",) if is_comma else ()
+    if names is not None:
+        return Table(read, None, LINES_AT_ONCE, notes=notes)
+    check_first_rows(path, _first_rows(read_rows(FIRST_ROWS)))
+    naming, taken = rule_for(opening.num_columns)
+    return Table(read, None, LINES_AT_ONCE, naming, notes=notes + taken)
+
+
+def _first_rows(tables: Iterator[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the first rows of tables that come one after the other, a few or all."""
+    rows = next(tables)
+    while len(rows) < FIRST_ROWS and (more := next(tables, None)) is not None:
+        rows = np.concatenate([rows, more])
+    return rows[:FIRST_ROWS]
 
 
 def _open_lines(path: Path) -> TextIO:
@@ -113,8 +158,7 @@ def _read_table(
     *,
     first_line: int,
     num_rows: int | None = None,
-    delimiter: str | None = None,
-    comments: str | None = None,
+    form: _Form | None = None,
 ) -> Iterator[NDArray[np.void]]:
     """Read rows of numbers, all by default, a few lines at a time; blank ones do not count.
 
@@ -126,7 +170,7 @@ def _read_table(
         block = list(islice(lines, limit))
         if not block:
             break
-        rows = _parse(path, block, dtype, line_number, delimiter, comments)
+        rows = _parse(path, block, dtype, line_number, form)
         if len(rows) > 0:
             yield rows
         count += len(rows)
@@ -145,12 +189,17 @@ def _parse(
     block: Sequence[str],
     dtype: np.dtype[Any],
     line_number: int,
-    delimiter: str | None,
-    comments: str | None,
+    form: _Form | None,
 ) -> NDArray[np.void]:
-    """Parse a block of lines, and name the first one that is wrong."""
+    """Parse a block of lines, and name the first one that is wrong.
+
+    Without a form numbers stand between white space, and there are no comments.
+    """
+    delimiter, decimal, comments = (None, ".", None) if form is None else (*form, _COMMENTS[0])
 
     def parse(lines: list[str]) -> NDArray[np.void]:
+        if decimal != ".":
+            lines = [line.replace(decimal, ".") for line in lines]
         return np.loadtxt(lines, dtype, delimiter=delimiter, comments=comments, ndmin=1)
 
     numbered = [
@@ -170,11 +219,29 @@ def _parse(
         except (ValueError, OverflowError) as error:
             text = line.strip()
             shown = text if len(text) <= 60 else f"{text[:57]}..."
+            repair = "repair or delete this line"
+            if "," in text and (delimiter, decimal) in ((";", "."), (None, ".")):
+                repair = "write all decimals with points, or all with commas"
             raise FormatError(
                 f"{path}: line {number}: expected {_num_columns(dtype)} numbers, got {shown!r}; "
-                "repair or delete this line."
+                f"{repair}."
             ) from error
     raise FormatError(f"{path}: line {line_number}: expected rows of numbers; write it again.")
+
+
+def words_of(raw: bytes) -> list[str]:
+    r"""Return the words of a line of a header: UTF-8, or Latin-1, which some programs write.
+
+    Example:
+        >>> words_of("property float höhe".encode())
+        ['property', 'float', 'höhe']
+        >>> words_of(b"property float h\xf6he")
+        ['property', 'float', 'höhe']
+    """
+    try:
+        return [word.decode() for word in raw.split()]
+    except UnicodeDecodeError:
+        return [word.decode("latin-1") for word in raw.split()]
 
 
 def _num_columns(dtype: np.dtype[Any]) -> int:
@@ -185,50 +252,100 @@ def _num_columns(dtype: np.dtype[Any]) -> int:
 class _Opening(NamedTuple):
     """What the lines up to the first point say, and the number of that point's line, from one.
 
-    Names are None without a header, the delimiter is None for white space.
+    Names are None without a header. The number of points is 0 where none is said.
     """
 
     names: list[str] | None
-    delimiter: str | None
+    form: _Form
     num_columns: int
     line_number: int
+    num_points: int
 
 
-def _read_opening(path: Path, lines: Iterable[str]) -> _Opening:
+def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None) -> _Opening:
     """Read up to the first line of numbers."""
-    names: list[str] | None = None
+    header, counts = "", list[int]()
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         is_comment = text.startswith(_COMMENTS)
         bare = text.lstrip("#/") if is_comment else text.split(_COMMENTS[0])[0]
-        delimiter = next((mark for mark in ",;" if mark in bare), None)
-        words = [word.strip().strip("\"'") for word in bare.split(delimiter)]
+        form = _form_of(bare)
+        words = form.split(bare)
         are_numbers = [_is_number(word) for word in words]
         if is_comment:
-            names = words if _are_names(words) else names
-        elif not text or (len(words) == 1 and are_numbers[0]):
+            header = bare if _name_lists(bare) else header
+        elif not bare.strip():
             continue
-        elif not any(are_numbers) and names is None:
-            if not _are_names(words):
+        elif len(words) == 1 and are_numbers[0]:
+            is_count = words[0].isdecimal() and len(words[0]) <= _MOST_DIGITS
+            counts.append(int(words[0]) if is_count else 0)
+            if len(counts) > 1:
+                raise FormatError(
+                    f"{path}: line {number}: expected a point after the count of points, got a "
+                    "second count, as in PTX files; export PTS, E57 or PLY."
+                )
+        elif not any(are_numbers) and not header:
+            if not _name_lists(bare) and given is None:
                 raise FormatError(
                     f"{path}: line {number}: expected numbers or names of columns with x, y and z, "
-                    f"got {text[:60]!r}; name the columns, or mark the line as a comment with #."
+                    f"got {text[:60]!r}; name the columns there or with --columns, or mark the "
+                    "line as a comment with #."
                 )
-            names = words
-        elif len(words) < 3 or (names is not None and len(names) != len(words)):
-            expected = "at least 3" if names is None else str(len(names))
+            header = bare
+        elif len(words) < 3:
             raise FormatError(
-                f"{path}: line {number}: expected {expected} numbers, got {text[:60]!r}; "
+                f"{path}: line {number}: expected at least 3 numbers, got {text[:60]!r}; "
                 "repair or delete this line."
             )
         else:
-            return _Opening(names, delimiter, len(words), number)
+            if given is not None:
+                check_names(path, given, len(words))
+                names: list[str] | None = list(given)
+            else:
+                names = _names_of(path, header, words, number) if header else None
+            return _Opening(names, form, len(words), number, max(counts, default=0))
     raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
 
 
-def _are_names(words: list[str]) -> bool:
-    """Whether words are the names of the columns of points, each once."""
-    return {"x", "y", "z"} <= {word.lower() for word in words} and len(set(words)) == len(words)
+def _form_of(text: str) -> _Form:
+    """Return how the numbers of a line are written, or would be if its words were numbers."""
+    for form in _FORMS:
+        if all(map(_is_number, form.split(text))):
+            return form
+    return _Form(next((mark for mark in ";," if mark in text), None))
+
+
+def _name_lists(text: str) -> list[list[str]]:
+    """Return the ways to read a line as names of the columns of points, each name once.
+
+    Names may be in quotes and then hold what is between the others.
+    """
+    found = []
+    for mark in ";,\t ":
+        try:
+            (row,) = csv.reader([text.replace("\t", " ") if mark == " " else text], delimiter=mark)
+        except csv.Error:
+            return []
+        words = [word.strip().strip("\"'") for word in row if mark != " " or word]
+        if {"x", "y", "z"} <= {word.lower() for word in words} and len(set(words)) == len(words):
+            found.append(words)
+    return found
+
+
+def _names_of(path: Path, header: str, words: Sequence[str], number: int) -> list[str]:
+    """Return the names of the columns by the header, as many as the first point has numbers."""
+    lists = _name_lists(header)
+    names = next((names for names in lists if len(names) == len(words)), None)
+    if names is not None:
+        return names
+    most, shown = max(map(len, lists), default=0), " ".join(words)[:60]
+    message = f"{path}: line {number}: expected {most} numbers, got {shown!r}"
+    if most > len(words):
+        raise FormatError(
+            f"{message}, under names that may hold blanks: {header.strip()[:60]!r}; name the "
+            f"{len(words)} columns with --columns, or put _ in place of the blanks."
+        )
+    raise FormatError(f"{message}; repair or delete this line.")
 
 
 def _is_number(word: str) -> bool:

@@ -18,6 +18,7 @@ from torchrg.metrics.labels import (
     score_labels,
     segmentation_covering,
 )
+from torchrg.metrics.matching import differing_rows, match_points
 from torchrg.metrics.normals import NormalScore, score_normals
 from torchrg.metrics.partition import PartitionScore, score_partition
 from torchrg.metrics.protocols import (
@@ -43,6 +44,8 @@ __all__ = [
     "adjusted_rand_index",
     "contingency_table",
     "count_segcomp",
+    "differing_rows",
+    "match_points",
     "match_regions",
     "normalized_mutual_information",
     "score_clusters",

@@ -1,6 +1,6 @@
 """Neighbourhoods: exact search, canonical order, patches, voxels."""
 
-from torchrg.neighbors.knn import gather_patches, search_knn
+from torchrg.neighbors.knn import gather_patches, search_knn, search_nearest
 from torchrg.neighbors.order import canonical_order, finite_rows, restore_rows
 from torchrg.neighbors.voxels import Voxels, restore_points, sample_voxels
 
@@ -13,4 +13,5 @@ __all__ = [
     "restore_rows",
     "sample_voxels",
     "search_knn",
+    "search_nearest",
 ]

@@ -90,6 +90,46 @@ def search_knn(
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
+@sequential_operations()
+def search_nearest(
+    points: NDArray[np.floating], queries: NDArray[np.floating], max_distance: float
+) -> NDArray[np.int64]:
+    """Find the nearest point of each query, if there is one within a distance.
+
+    Convention:
+        Of points at equal distances the one that comes first in :func:`canonical_order` is taken.
+
+    Args:
+        points: Finite points, shape ``(N, 3)``.
+        queries: Finite points, shape ``(M, 3)``, in the same coordinates.
+        max_distance: Points farther than this do not count.
+
+    Returns:
+        Rows of the points, shape ``(M,)``; -1 where none is near enough.
+
+    Example:
+        >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
+        >>> search_nearest(points, np.array([[0.9, 0, 0], [3, 0, 0]]), 0.2).tolist()
+        [1, -1]
+    """
+    from scipy.spatial import cKDTree
+
+    nearest = np.full(len(queries), -1)
+    if len(points) == 0 or len(queries) == 0:
+        return nearest
+    order = canonical_order(points).numpy()
+    is_first = np.ones(len(points), dtype=bool)
+    is_first[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
+    first = order[is_first]
+    tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
+    # Those close to each other find the same parts of the tree in the cache.
+    asked = canonical_order(queries).numpy()
+    for chunk in chunks_of(len(asked), ROWS_AT_ONCE):
+        distances, found = _query(tree, queries[asked[chunk]], 1)
+        nearest[asked[chunk]] = np.where(distances <= max_distance, first[found], -1)[:, 0]
+    return nearest
+
+
 def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int]]:
     """Return first and last row of each cloud of a ragged batch."""
     if offset is None:

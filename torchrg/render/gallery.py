@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import torch
 
-from torchrg.errors import ShapeError
-from torchrg.io.files import atomic_path
+from torchrg.errors import FormatError, ShapeError
+from torchrg.io.files import atomic_path, check_place
 from torchrg.render.colors import color_planes
-from torchrg.render.page import make_page, template_of, write_page
+from torchrg.render.page import check_library, make_page, template_of, write_page
 from torchrg.render.pictures import render_cloud, write_png
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
@@ -59,6 +59,25 @@ def draw_planes(path: str | os.PathLike[str], cloud: Cloud) -> None:
     labels, normals = (torch.from_numpy(cloud.fields[name]) for name in (shown, "normals"))
     colors = color_planes(labels, cloud.points)
     write_png(path, render_cloud(cloud.points, colors, normals=normals.to(cloud.points.dtype)))
+
+
+def check_gallery(folder: Path, names: Sequence[str]) -> None:
+    """Raise before long work if pages of scans, or their index, have no place or cannot be made.
+
+    Raises:
+        FormatError: If a file cannot be written, or a scan has the name of the index.
+        MissingDependencyError: If pages cannot be made.
+    """
+    check_library()
+    check_place(folder / INDEX)
+    for name in names:
+        page = folder / f"{name}.html"
+        if page.parent == folder and page.name.lower() == INDEX:
+            raise FormatError(
+                f"{page}: the page of {name} would take the place of the index; rename the scan."
+            )
+        if page.parent.is_dir():
+            check_place(page)
 
 
 def draw_entry(folder: Path, name: str, cloud: Cloud, *, words: str = "") -> Entry:

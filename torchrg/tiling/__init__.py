@@ -16,7 +16,7 @@ from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiling.files import TileFiles
+from torchrg.tiling.files import TileFiles, Written, make_folder
 from torchrg.tiling.stages import (
     TILE_STAGES,
     TileTask,
@@ -29,7 +29,17 @@ from torchrg.tiling.stages import (
     tabulate_planes,
 )
 
-__all__ = ["STAGES", "TILE_SIZE", "TileFiles", "TileTask", "run_in_turn", "segment_tiles"]
+__all__ = [
+    "STAGES",
+    "TILE_SIZE",
+    "Done",
+    "TileFiles",
+    "TileTask",
+    "Written",
+    "make_folder",
+    "run_in_turn",
+    "segment_tiles",
+]
 
 STAGES = ("points", "order", *TILE_STAGES, "growth", "regions", "planes", "results")
 """Names of the stages in their order."""
@@ -38,15 +48,16 @@ TILE_SIZE = 300_000
 """Points of a tile unless the caller says. With 150,000 ``classic`` takes 0.05 less time and
 ``consensus``, which looks farther, 0.15 more; larger ones leave the cache of freed memory."""
 
-Engine = Callable[[Sequence[TileTask]], Iterable[TileTask]]
+Done = tuple[TileTask, Sequence[Written]]
+"""A task that is done, and what it has written."""
+Engine = Callable[[Sequence[TileTask]], Iterable[Done]]
 """Runs tasks, in any order and anywhere, and yields each when it is done."""
 
 
-def run_in_turn(tasks: Sequence[TileTask]) -> Iterator[TileTask]:
+def run_in_turn(tasks: Sequence[TileTask]) -> Iterator[Done]:
     """Run tasks one after the other, each on as many threads as torch may use."""
     for task in tasks:
-        task.run()
-        yield task
+        yield task, task.run()
 
 
 @sequential_operations()
@@ -67,12 +78,14 @@ def segment_tiles(
     disk; the rest takes about 100 bytes of memory a point, and each tile 2 kB a point of its own.
 
     Called again with the same folder it goes on from the last tile that was done, however the last
-    call ended; a folder with all done gives the result at once.
+    call ended, be it with the power: what the disk has lost is made again. A folder with all done
+    gives the result as soon as it is read.
 
     Args:
         chunks: The cloud, in chunks; read only as long as its points are not all in the folder.
         folder: Where the arrays go, about 500 bytes a point, ten neighbours less or more 40; made
-            if it does not exist. The result lies there: :meth:`TileFiles.remove_all` ends it.
+            if it does not exist, else empty but for hidden files. The result lies there:
+            :meth:`TileFiles.remove_all` removes what this function has made, and nothing else.
         config: Settings. Default: the preset ``consensus``.
         tile_size: Points of a tile.
         identity: What else decides the result, ready for JSON: of which files the chunks are.
@@ -86,7 +99,8 @@ def segment_tiles(
 
     Raises:
         ConfigError: If the settings ask for ``adaptive_k``, which looks at the whole cloud.
-        FormatError: If the folder holds the work of another run, or the disk is full.
+        FormatError: If the folder holds the work of another run or something else, or the disk is
+            full.
 
     Example:
         >>> import tempfile
@@ -111,7 +125,7 @@ def segment_tiles(
 
     def once(stage: str, step: Callable[[], None]) -> None:
         begin(stage, 0, 1)
-        if files.facts(stage) is None:
+        if not files.is_done(stage):
             # Beside the arrays of the whole cloud, what tiles have freed would be too much.
             return_freed_memory()
             step()
@@ -120,16 +134,15 @@ def segment_tiles(
     once("order", lambda: sort_points(files, config, tile_size))
     tiles = list(itertools.pairwise(files.known("order")["bounds"]))
     for stage, work in TILE_STAGES.items():
-        if files.facts(f"{stage} begun") is None:
-            work.begin(files, config)
-            files.note(f"{stage} begun")
         tasks = [
             TileTask(files.folder, stage, number, config, rows) for number, rows in enumerate(tiles)
         ]
-        left = [task for task in tasks if files.facts(task.name) is None]
+        left = [task for task in tasks if not files.is_done(task.name)]
         begin(stage, len(tiles) - len(left), len(tiles))
-        for done, task in enumerate(run(left), len(tiles) - len(left) + 1):
-            files.note(task.name)
+        if left or not tiles:
+            work.begin(files, config)
+        for done, (task, written) in enumerate(run(left), len(tiles) - len(left) + 1):
+            files.note(task.name, written)
             begin(stage, done, len(tiles))
     once("growth", lambda: grow_regions(files, config))
     once("regions", lambda: finish_regions(files, config))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchrg._parallel import sequential_operations
 from torchrg.config import PipelineConfig
+from torchrg.errors import FormatError
 from torchrg.neighbors import finite_rows, restore_rows
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.regions import summarize_planes
@@ -38,7 +39,7 @@ from torchrg.structures import (
     origin_of_box,
 )
 from torchrg.tiling.boxes import Boxes, find_boxes
-from torchrg.tiling.files import TileFiles, released
+from torchrg.tiling.files import TileFiles, Written, reading, released
 from torchrg.tiling.growth import Condensed, condense, join_condensed
 from torchrg.tiling.neighbors import search_tile
 from torchrg.tiling.parts import Part, cut_part
@@ -50,15 +51,17 @@ _ROW_BYTES = 150
 """Of a point on disk beside its neighbours and edges: coordinates, normals, results."""
 
 _FIT = ("normals", "curvature", "valid", "residual_rms", "sharp")
+_RAW = "coordinates.raw"
 _PLANES = "planes.pt"
 _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 
 
 def read_points(files: TileFiles, chunks: Iterable[Cloud]) -> None:
     """Write the points of a cloud that comes in chunks, about the origin that a whole one has."""
-    raw = files.folder / "coordinates.raw"
     low, high, num_points, narrow = np.full(3, np.inf), np.full(3, -np.inf), 0, True
-    with files.writing(raw), raw.open("wb") as stream:
+    files.reserve(_RAW)
+    with files.opened(_RAW) as stream:
+        stream.truncate(0)
         for chunk in chunks:
             coordinates = chunk.coordinates
             num_points += len(coordinates)
@@ -68,15 +71,21 @@ def read_points(files: TileFiles, chunks: Iterable[Cloud]) -> None:
                 kept = coordinates[chunk.finite]
                 low, high = np.minimum(low, kept.min(axis=0)), np.maximum(high, kept.max(axis=0))
     origin = origin_of_box(low, high)
+    found = {"num_points": num_points, "origin": origin.tolist()}
+    if files.facts("points") not in (None, found):
+        raise FormatError(
+            f"{files.path('points')}: is damaged, and the points that are given now are others; "
+            f"give the same again, or remove {files.folder}."
+        )
     files.create("points", np.float32, (num_points, 3))
     dtype = np.float32 if narrow else np.float64
     step = 2**20
     for start in range(0, num_points, step):
         count = min(step, num_points - start) * 3
-        some = np.fromfile(raw, np.float64, count, offset=start * 24).reshape(-1, 3)
-        files.write("points", start, Cloud(some.astype(dtype)).about(origin))
-    raw.unlink()
-    files.note("points", num_points=num_points, origin=origin.tolist())
+        some = np.fromfile(files.folder / _RAW, np.float64, count, offset=start * 24)
+        files.write("points", start, Cloud(some.reshape(-1, 3).astype(dtype)).about(origin))
+    files.remove(_RAW)
+    files.note("points", **found)
 
 
 def sort_points(files: TileFiles, config: PipelineConfig, tile_size: int) -> None:
@@ -95,7 +104,9 @@ def sort_points(files: TileFiles, config: PipelineConfig, tile_size: int) -> Non
     wanted = np.arange(0, len(rows), max(tile_size, 1))
     ends = boxes.starts[np.searchsorted(boxes.starts, wanted)]
     bounds = np.unique(np.append(ends, len(rows))).tolist()
-    files.note("order", num_points=len(rows), k=k, bounds=bounds)
+    # Tiles that are done stay, where the order alone is made again.
+    earlier = files.facts("order") or {"bounds": bounds}
+    files.note("order", num_points=len(rows), k=k, bounds=earlier["bounds"])
 
 
 @dataclass(frozen=True)
@@ -119,16 +130,24 @@ class TileTask:
         """Points of the tile."""
         return self.rows[1] - self.rows[0]
 
-    def run(self) -> None:
-        """Do the work, and write what it found; the same again does no harm."""
+    def run(self) -> list[Written]:
+        """Do the work, and write what it found; the same again does no harm.
+
+        Returns:
+            What has been written, to be noted with the task.
+        """
+        files = TileFiles(self.folder)
         with sequential_operations(), torch.no_grad():
-            work = TILE_STAGES[self.stage].work
-            work(TileFiles(self.folder), slice(*self.rows), self.number, self.config)
+            TILE_STAGES[self.stage].work(files, slice(*self.rows), self.number, self.config)
+        return files.written
 
 
 @dataclass(frozen=True)
 class TileStage:
-    """A stage that runs tile by tile: what it needs once before, and its work on a tile."""
+    """A stage that runs tile by tile: the arrays it needs before, and its work on a tile.
+
+    Arrays that are there already, of a run that ended early, keep their rows.
+    """
 
     begin: Callable[[TileFiles, PipelineConfig], None]
     work: Callable[[TileFiles, slice, int, PipelineConfig], None]
@@ -164,13 +183,16 @@ def _estimate(files: TileFiles, tile: slice, number: int, config: PipelineConfig
 
 
 def _begin_edges(files: TileFiles, config: PipelineConfig) -> None:
-    _, limit = _growing_order(files, config)
-    num_points = files.known("order")["num_points"]
+    num_points, bounds = (files.known("order")[name] for name in ("num_points", "bounds"))
+    lists = ("edges", "sources", "targets") if config.growing.is_order_free else ("edges",)
+    tiles = range(len(bounds) - 1)
+    files.reserve(*(files.path(f"{name}_{number}").name for name in lists for number in tiles))
     files.create("counts", np.int32, (num_points,))
     files.create("components", np.int32, (num_points,))
     files.create("reach", np.float32, (num_points,))
     if config.growing.promotes_late:
         files.create("claims", np.bool_, (num_points, files.known("order")["k"]))
+    _, limit = _growing_order(files, config)
     files.note("limit", value=float(limit))
 
 
@@ -235,10 +257,8 @@ def grow_regions(files: TileFiles, config: PipelineConfig) -> None:
     """Grow the regions of the whole cloud along the edges of its tiles."""
     grow = _grow_in_any_order if config.growing.is_order_free else _grow
     files.save("heads", grow(files, config))
+    files.remove(files.path("edges").name)
     files.note("growth")
-    for number in range(len(files.known("order")["bounds"]) - 1):
-        files.remove(*(f"{name}_{number}" for name in ("edges", "sources", "targets")))
-    files.remove("edges", "claims")
 
 
 def finish_regions(files: TileFiles, config: PipelineConfig) -> None:
@@ -320,15 +340,15 @@ def tabulate_planes(files: TileFiles, config: PipelineConfig) -> None:
     adjacency = None if planes.adjacency is None else tuple(planes.adjacency)
     content = io.BytesIO()
     torch.save({**planes._asdict(), "adjacency": adjacency}, content)
-    path = files.folder / _PLANES
-    with files.writing(path):
-        path.write_bytes(content.getvalue())
+    files.save_bytes(_PLANES, content.getvalue())
     files.note("planes")
 
 
 def load_planes(files: TileFiles) -> Planes:
     """Return the table of planes."""
-    values = torch.load(files.folder / _PLANES, weights_only=True)
+    path = files.folder / _PLANES
+    with reading(path):
+        values = torch.load(path, weights_only=True)
     adjacency = values.pop("adjacency")
     return Planes(**values, adjacency=None if adjacency is None else PlaneAdjacency(*adjacency))
 

@@ -1,0 +1,137 @@
+"""Every scan has a place of its own for its results, or the command ends before it begins."""
+
+import unicodedata
+
+import numpy as np
+import pytest
+
+from torchrg.batch.run import list_jobs
+from torchrg.batch.sources import FolderSource, RGBDSource
+from torchrg.cli import main
+from torchrg.config import load_config
+from torchrg.depth import DepthConfig
+from torchrg.errors import ConfigError, FormatError
+from torchrg.scenes import make_room
+
+CLASSIC = load_config("classic")
+UMLAUT = "Büro"
+
+
+@pytest.fixture
+def root(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    return folder
+
+
+def save(folder, *names, num_points=500):
+    """Write a small room under each name, whatever its suffix says."""
+    points = make_room(num_points=num_points, seed=1).points.numpy()
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with (folder / name).open("wb") as stream:
+            np.save(stream, points)
+
+
+def convert(root, out, *flags):
+    command = ["convert", "folder", str(root), str(out), "--preset", "classic", "--workers", "1"]
+    return main([*command, *flags])
+
+
+def test_scans_that_differ_in_the_suffix_alone_are_refused(root, tmp_path, capsys):
+    save(root, "x.ply", "x.pcd", "x.ply.npz", "y.npy")
+    for flags in ([], ["--dry-run"], ["--only", "y"]):
+        assert convert(root, tmp_path / "out", *flags) == 2
+        captured = capsys.readouterr()
+        assert "expected one file for each scan, got x.pcd and x.ply; " in captured.err
+        assert (captured.err.count("\n"), captured.out) == (1, "")
+    assert not (tmp_path / "out").exists()
+    assert convert(root, tmp_path / "out", "--suffixes", ".npy", ".npz", "--dry-run") == 0
+    assert "2 scans to convert" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["Hall.npy", "hall.npy"], "got one for Hall and hall, which many file systems"),
+        (["a/b.npy", "A/B.npy"], "got one for"),
+        (
+            [f"{unicodedata.normalize(form, UMLAUT)}.npy" for form in ("NFC", "NFD")],
+            "got one for",
+        ),
+        (["straße.npy", "STRASSE.npy"], "got one for"),
+        (["report.json.npy"], "no scan called report.json, as OUT/report.json is a file"),
+        (["Report.JSON/x.npy"], "no scan called Report.JSON/x, as OUT/report.json is a file"),
+    ],
+)
+def test_names_that_lead_to_one_place_are_refused(root, tmp_path, capsys, names, message):
+    save(root, *names)
+    if len({path.name for path in root.rglob("*.npy")}) < len(names):
+        pytest.skip("this file system takes them for the same")
+    assert convert(root, tmp_path / "out") == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert (captured.err.count("\n"), captured.out) == (1, "")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "a/../../x"])
+def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
+    (job,) = faults.make_jobs(tmp_path, {"1_a": "plain"})
+    scan = job.scan.__class__(name, job.scan.inputs, 1)
+    source = job.source.__class__(job.source.root)
+    object.__setattr__(source, "list_scans", lambda: [scan])
+    with pytest.raises(FormatError, match="expected names of scans below a folder"):
+        list_jobs(source, tmp_path / "out")
+
+
+def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
+    for name in ("1.npy", "1.png"):
+        (root / name).touch()
+    source = RGBDSource(root, DepthConfig(), "images", (5.0, 5.0, 2.0, 1.0), 1000)
+    with pytest.raises(ConfigError, match=r"got '1' twice, for .*1.npy and .*1.png; move or"):
+        list_jobs(source, tmp_path / "out")
+
+
+def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
+    for name in ("seq-01", "seq-02"):
+        (root / name).mkdir()
+        (root / name / "frame-000000.depth.png").touch()
+    (root / "loop").symlink_to("seq-01")
+    (root / "seq-01" / "self").symlink_to(".")
+    source = RGBDSource(root, DepthConfig(), "7-scenes")
+    with pytest.warns(UserWarning, match=f"{root}: passed over loop: a link leads there"):
+        jobs = list_jobs(source, tmp_path / "out")
+    assert [job.scan.name for job in jobs] == ["seq-01/frame-000000", "seq-02/frame-000000"]
+    inside = RGBDSource(root / "seq-01", DepthConfig(), "7-scenes")
+    with pytest.warns(UserWarning, match="passed over self: a link leads there"):
+        jobs = list_jobs(inside, tmp_path / "out")
+    assert [job.scan.name for job in jobs] == ["seq-01/frame-000000"]
+
+
+def test_results_are_never_read_as_scans_through_a_link_or_from_above(root, tmp_path):
+    save(root, "hall.npy")
+    (tmp_path / "out" / "hall").mkdir(parents=True)
+    save(tmp_path / "out", "hall/coord.npy")
+    (root / "results").symlink_to(tmp_path / "out")
+    with pytest.raises(ConfigError, match="so that no result is read as a scan"):
+        list_jobs(FolderSource(root, CLASSIC, tmp_path / "out"), tmp_path / "out")
+    (root / "results").unlink()
+    save(root, "in/hall.npy")
+    assert len(list_jobs(FolderSource(root, CLASSIC, tmp_path / "out"), tmp_path / "out")) == 2
+    # The scan in/in/hall.npy would get the folder in/hall below the directory above.
+    with pytest.raises(ConfigError, match="so that no result is read as a scan"):
+        list_jobs(FolderSource(root, CLASSIC, tmp_path), tmp_path)
+
+
+def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, capsys):
+    save(root, "in/a.npy")
+    (root / "in" / "loop").symlink_to("..")
+    (root / "in" / "second").symlink_to("..")
+    for flags in (["--dry-run"], []):
+        assert convert(root, tmp_path / "out", *flags) == 0
+        captured = capsys.readouterr()
+        assert captured.err.startswith(f"torchrg: warning: {root}: passed over in/loop and 1 more")
+        assert captured.err.count("\n") == 1
+    assert "1 of 1 scans are complete" in captured.out
+    assert [path.name for path in (tmp_path / "out" / "in").iterdir()] == ["a"]

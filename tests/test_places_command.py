@@ -1,0 +1,197 @@
+"""Results that have no place are refused before the work, by every command that writes."""
+
+import ctypes
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from torchrg.cli import main
+
+CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000"]
+# prctl(PR_CAPBSET_DROP, ...) of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, by which the superuser
+# writes where nobody may.
+_PR_CAPBSET_DROP, _CAPABILITIES = 24, (1, 2)
+
+
+def obey_permissions():
+    """Let what is run next be a user like others; called between fork and exec."""
+    if os.geteuid() == 0:
+        for capability in _CAPABILITIES:
+            ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
+
+
+SERVER = """
+import contextlib, io, json, os, sys
+from torchrg.cli import main
+for line in sys.stdin:
+    arguments, folder = json.loads(line)
+    os.chdir(folder)
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        with contextlib.redirect_stderr(io.StringIO()) as err:
+            code = main(arguments)
+    print(json.dumps([code, out.getvalue(), err.getvalue()]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A process whom permissions hold, and that runs one command after another."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=obey_permissions,
+    ) as process:
+        yield process
+        process.stdin.close()
+
+
+@pytest.fixture
+def run(server, place):
+    """Run a command there, in the folder of the test; return its code, output and errors."""
+
+    def run(*arguments):
+        print(json.dumps([arguments, str(place)]), file=server.stdin, flush=True)
+        return json.loads(server.stdout.readline())
+
+    return run
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Two rooms, a depth image, a folder that nobody may write into, and files nobody may change.
+
+    A command that begins its work would fail with another message: all inputs are damaged.
+    """
+    for number in (1, 2):
+        (tmp_path / f"room{number}.npz").write_bytes(b"PK\x03\x04 no cloud")
+        (tmp_path / f"{number}.png").write_bytes(b"\x89PNG no image")
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "room.npz").write_bytes(b"PK\x03\x04 no cloud")
+    for name in ("shut", "open", "partly", "indexed"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "shut" / "out").mkdir()
+    for name in ("kept.npz", "kept.png", "kept.html", "kept.csv"):
+        (tmp_path / "open" / name).write_bytes(b"kept")
+        (tmp_path / "open" / name).chmod(0o444)
+    for name in ("room2.npz", "room2.png", "2.png", "1_planes.png", "report.json"):
+        (tmp_path / "partly" / name).write_bytes(b"kept")
+        (tmp_path / "partly" / name).chmod(0o444)
+    (tmp_path / "indexed" / "index.html").write_bytes(b"kept")
+    (tmp_path / "indexed" / "index.html").chmod(0o444)
+    (tmp_path / "shut" / "out").chmod(0o555)
+    (tmp_path / "shut").chmod(0o555)
+    yield tmp_path
+    for folder in ("shut", "shut/out"):
+        (tmp_path / folder).chmod(0o755)
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.is_file() and path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+COMMANDS = [
+    "segment room1.npz --out {}.npz",
+    "segment room1.npz --out open/x.npz --picture {}.png",
+    "segment room1.npz --out open/x.npz --picture {}.html",
+    "normals room1.npz --out {}.npz",
+    "sample {}.npz --num-points 100000000",
+    "depth 1.png --out {}.png",
+    "depth 1.png --out open/x.png --picture {}.png",
+    "view room1.npz --out {}.png",
+    "view room1.npz --out {}.html",
+    "score room1.npz room2.npz --csv {}.csv",
+]
+FOLDERS = [
+    ("segment room1.npz room2.npz --out {}", "partly/room2.npz"),
+    ("segment room1.npz room2.npz --out open --picture {}", "partly/room2.png"),
+    ("segment room1.npz room2.npz --out open --pages --picture {}", "indexed/index.html"),
+    ("normals room1.npz room2.npz --out {}", "partly/room2.npz"),
+    ("depth 1.png 2.png --out {}", "partly/2.png"),
+    ("depth 1.png --out {}", "partly/1_planes.png"),
+    ("convert folder scans {}", "partly/report.json"),
+    ("convert folder scans open --pages {}", "indexed/index.html"),
+]
+
+
+def words_of(command):
+    return [*command.split(), *(CAMERA if command.startswith("depth") else [])]
+
+
+def check_refused(place, run, command, target):
+    before = contents(place)
+    code, out, err = run(*words_of(command))
+    assert (code, err.count("\n"), out) == (2, 1, ""), err
+    assert f"{target}: cannot be written: " in err
+    assert "is read-only; write to another place, or make it writable." in err
+    assert contents(place) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("target", ["shut/x", "open/kept"])
+def test_a_file_that_cannot_be_written_is_told_before_the_work(place, run, command, target):
+    suffix = command.split("{}")[1].split()[0]
+    check_refused(place, run, command.format(target), f"{target}{suffix}")
+
+
+@pytest.mark.parametrize(("command", "kept"), FOLDERS)
+def test_a_directory_with_a_file_that_cannot_be_written_is_told_too(place, run, command, kept):
+    check_refused(place, run, command.format(kept.split("/")[0]), kept)
+
+
+@pytest.mark.parametrize("command", [command for command, _ in FOLDERS])
+def test_a_directory_that_takes_no_files_is_told_before_the_work(place, run, command):
+    for target, message in (("shut/out", "is read-only"), ("shut/new", "cannot be made")):
+        if target == "shut/new" and command.startswith("depth 1.png --out"):
+            continue  # One image goes to a file.
+        code, _, err = run(*words_of(command.format(target)))
+        assert (code, err.count("\n")) == (2, 1), err
+        assert message in err
+    assert not list(place.joinpath("shut", "out").iterdir())
+
+
+def test_a_device_is_no_place(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.csv")
+    np.savez(tmp_path / "a.npz", points=np.eye(3), labels=np.arange(3))
+    command = ["score", *[str(tmp_path / "a.npz")] * 2, "--csv"]
+    assert main([*command, str(tmp_path / "pipe.csv")]) == 2
+    assert "expected a file to write, got a device" in capsys.readouterr().err
+    assert main([*command, str(tmp_path / "a.npz")]) == 2
+    assert "expected a place of its own for each result" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["segment", "normals"])
+def test_inputs_whose_results_would_share_a_file_are_both_named(tmp_path, capsys, command):
+    for name in ("a/x.npz", "b/X.pcd"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    inputs = [str(tmp_path / name) for name in ("a/x.npz", "b/X.pcd")]
+    assert main([command, *inputs, "--out", str(tmp_path / "out")]) == 2
+    line = capsys.readouterr().err
+    assert all(name in line for name in (*inputs, "give them different directories"))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["index", "INDEX"])
+def test_no_page_takes_the_place_of_the_index(tmp_path, capsys, name):
+    pytest.importorskip("pydeck", reason="needs the extra view")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / f"{name}.npy").touch()
+    (tmp_path / "pages").mkdir()
+    segment = ["segment", str(tmp_path / "in" / f"{name}.npy"), "--out", str(tmp_path)]
+    convert = ["convert", "folder", str(tmp_path / "in"), str(tmp_path / "out")]
+    for command in (
+        [*segment, "--pages", "--picture", str(tmp_path / "pages")],
+        [*convert, "--pages", str(tmp_path / "pages")],
+    ):
+        assert main(command) == 2
+        assert f"the page of {name} would take the place of the index" in capsys.readouterr().err
+    assert not list((tmp_path / "pages").iterdir())

@@ -1,0 +1,61 @@
+"""How commands end: with one line and an exit code, also when they are interrupted."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
+
+USAGE_ERROR = 2
+SOME_FAILED = 3
+INTERRUPTED = 130
+
+INTERRUPTED_LINE = "interrupted; every file written is complete."
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+"""Ctrl-C, and what batch systems send."""
+
+
+def fail(message: str, *, code: int = USAGE_ERROR) -> int:
+    """Print one line on stderr and return the exit code."""
+    print(f"torchrg: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def warn(message: str) -> None:
+    """Print one warning line on stderr."""
+    fail(f"warning: {message}")
+
+
+def end_at_once(*_: object) -> NoReturn:
+    """End the process by an interrupt, with its line and nothing else."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"torchrg: {INTERRUPTED_LINE}\n".encode())
+    os._exit(INTERRUPTED)
+
+
+def on_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.Signals, Any]:
+    """Let interrupts be handled, and return how they were.
+
+    Those that are ignored, as in the background of a shell, stay so.
+    """
+    before = {number: signal.getsignal(number) for number in _INTERRUPTS}
+    heard = {number: old for number, old in before.items() if old not in (signal.SIG_IGN, None)}
+    for number in heard:
+        signal.signal(number, handler)
+    return heard
+
+
+@contextlib.contextmanager
+def raising_interrupts() -> Iterator[None]:
+    """Let interrupts raise KeyboardInterrupt, so that what is being written is taken back."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = on_interrupts(signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
