@@ -173,6 +173,10 @@ class SuperpointsConfig:
     """Strength of regularisation of each level, ascending: a region merges with one beside it when
     that costs at most this, in points of opposite sides of a right angle. Twice the strength leaves
     about 0.6 times the superpoints."""
+    counts: tuple[int, ...] | None = None
+    """Number of superpoints of each level, descending, in place of strengths. Fewer are found where
+    the cloud has not so many connected parts of the minimum size, and more where more of its parts
+    do not touch. None: strengths decide."""
     min_size: int = 10
     """Smaller superpoints join the neighbour that it costs least, in distinct points."""
     planes: Literal["pieces", "whole"] = "pieces"
@@ -181,18 +185,29 @@ class SuperpointsConfig:
     max_extent: float | None = None
     """Longest side of the box around a superpoint, in the unit of the cloud; whole planes may have
     longer ones. None: no limit."""
-    color_weight: float = 1.0
+    color_weight: float = 3.0
     """What a squared difference of colours in [0, 1] counts, against one of unit normals."""
 
     def __post_init__(self) -> None:
-        steps = (0.0, *self.strengths, math.inf)
-        ascending = all(a < b for a, b in itertools.pairwise(steps))
-        is_list = len(self.strengths) > 0 and ascending
+        is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths, math.inf)
         _require(self, "strengths", "one or more numbers > 0, ascending", is_list)
+        counts = self.counts
+        is_list = counts is None or (len(counts) > 0 and _ascends(0, *reversed(counts)))
+        _require(self, "counts", "one or more whole numbers > 0, descending, or none", is_list)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
         extent = self.max_extent
         _require(self, "max_extent", "> 0 or none", extent is None or 0 < extent < math.inf)
         _require(self, "color_weight", ">= 0", 0 <= self.color_weight < math.inf)
+
+    @property
+    def num_levels(self) -> int:
+        """Number of partitions, each of which is coarser than the one before it."""
+        return len(self.strengths if self.counts is None else self.counts)
+
+
+def _ascends(*numbers: float) -> bool:
+    """Return whether each number is larger than the one before it."""
+    return all(a < b for a, b in itertools.pairwise(numbers))
 
 
 @dataclass(frozen=True)

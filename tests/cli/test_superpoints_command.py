@@ -36,6 +36,17 @@ def test_the_result_holds_every_level(folder):
     assert provenance["superpoints"]["strengths"] == [0.3, 3.0]
 
 
+@pytest.mark.parametrize("flags", [["--superpoints", "300,40"], ["--superpoints=300,40"]])
+def test_numbers_of_superpoints_are_asked_for_in_a_word(folder, tmp_path, flags):
+    result = tmp_path / "parts.npz"
+    assert main(["segment", str(folder / "room.npz"), "--out", str(result), *flags]) == 0
+    with np.load(result, allow_pickle=False) as found:
+        numbers = [len(np.unique(found[name])) for name in ("superpoints", "superpoints_1")]
+        provenance = json.loads(str(found["provenance"]))
+    assert numbers == [300, 40]
+    assert provenance["superpoints"]["counts"] == [300, 40]
+
+
 def test_every_point_has_the_superpoint_of_its_voxel(folder):
     cloud = read_cloud(folder / "room.npz")
     inverse = sample_voxels(cloud.points, 0.3).inverse.numpy()
@@ -74,5 +85,7 @@ def test_a_wrong_setting_is_told_in_one_line(folder, tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "strengths" in error
+    assert main([*command, "--superpoints", "40,300"]) == 2
+    assert "expected counts" in capsys.readouterr().err
     assert main([*command, "--partition.min-size", "3"]) == 2
     assert "expected --superpoints" in capsys.readouterr().err

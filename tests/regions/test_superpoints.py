@@ -1,6 +1,7 @@
 """Superpoints: a literal form of the merging, and what every partition promises."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from torchrg.regions import partition_points, superpoints
 from torchrg.scenes import RoomLayout, make_room
 
 CONFIG = SuperpointsConfig(strengths=(0.3, 1.0, 4.0), min_size=4)
+
+PLACE_SPACINGS = 5
+"""So few that places count in a cloud of 100 points."""
 
 OFFICE = RoomLayout(
     size=(5.4, 4.4, 2.6),
@@ -53,9 +57,12 @@ def crumpled(rng, count=120, *, crumple=1.0):
 
 def literal_merging(points, normals, planes, config):
     """Whole planes and points merge, those first that are best partners, all from the points."""
-    near = cKDTree(points).query(points, k=9)[1][:, 1:]
+    reach, near = cKDTree(points).query(points, k=9)
+    near = near[:, 1:]
     contacts = [(i, int(j)) for i in range(len(points)) for j in near[i]]
     tensors = np.einsum("ni,nj->nij", normals, normals).reshape(len(points), 9)
+    spacing = np.quantile(reach[:, -1], 0.5, method="lower") / 1.6
+    features = np.hstack([tensors, points / (PLACE_SPACINGS * spacing)])
     groups = {i: {i} for i in range(len(points))}
     of = list(groups)
 
@@ -72,7 +79,7 @@ def literal_merging(points, normals, planes, config):
     def cost(a, b):
         links = [(i, j) for i, j in contacts if {of[i], of[j]} == {a, b}]
         chord = np.mean([2 - 2 * abs(normals[i] @ normals[j]) for i, j in links])
-        mean_a, mean_b = (tensors[list(groups[g])].mean(axis=0) for g in (a, b))
+        mean_a, mean_b = (features[list(groups[g])].mean(axis=0) for g in (a, b))
         n_a, n_b = len(groups[a]), len(groups[b])
         difference = ((mean_a - mean_b) ** 2).sum() + chord + 0.01
         return n_a * n_b / (n_a + n_b) * difference / np.sqrt(len(links))
@@ -114,11 +121,12 @@ def same_partition(a, b):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_merging_is_that_of_literal_loops(seed):
+def test_merging_is_that_of_literal_loops(seed, monkeypatch):
+    monkeypatch.setattr(superpoints, "_PLACE_SPACINGS", PLACE_SPACINGS)
     rng = torch.Generator().manual_seed(seed)
     points, normals, planes = crumpled(rng, 100, crumple=0.1 + 0.3 * seed)
     config = SuperpointsConfig(
-        strengths=(0.008 + 0.1 * seed, 0.05 + 0.4 * seed), min_size=3, planes="whole"
+        strengths=(0.05 + 0.1 * seed, 0.3 + 0.4 * seed), min_size=3, planes="whole"
     )
     order = superpoints.finite_rows(points)
     points, normals, planes = points[order], normals[order], planes[order]
@@ -206,6 +214,66 @@ def test_duplicates_stay_together_and_points_that_are_not_finite_stay_out(room):
     assert torch.bincount(found.labels[:-2]).diff().le(0).all()
 
 
+@pytest.mark.parametrize(
+    ("counts", "planes"), [((5,), "pieces"), ((900, 400, 120, 30), "pieces"), ((300, 40), "whole")]
+)
+def test_numbers_of_superpoints_are_met_and_levels_nested(room, counts, planes):
+    config = SuperpointsConfig(counts=counts, min_size=2, planes=planes)
+    found = partition_points(*room, config)
+    levels = [found.labels, *found.levels]
+    # A made room has more parts that do not touch than the fewest asked for here.
+    fewest = len(partition_points(*room, dataclasses.replace(config, counts=(1,))).plane)
+    for count, level in zip(counts, levels, strict=True):
+        assert len(level.unique()) == max(count, fewest)
+        assert torch.bincount(level).min() >= 2
+    for fine, coarse in itertools.pairwise(levels):
+        assert len(torch.unique(torch.stack([fine, coarse]), dim=1)[0]) == len(fine.unique())
+
+
+def test_more_superpoints_than_parts_of_a_size_are_not_made(room):
+    found = partition_points(*room, SuperpointsConfig(counts=(3000,), min_size=10))
+    assert 300 < len(found.plane) <= 600
+    assert torch.bincount(found.labels).min() >= 10
+
+
+def test_given_numbers_do_not_depend_on_order_unit_or_origin(room):
+    config = SuperpointsConfig(counts=(300, 40))
+    points, normals, planes = room
+    found = partition_points(*room, config)
+    order = torch.randperm(6000, generator=torch.Generator().manual_seed(3))
+    far = points.double() * 2.0**-12 + torch.tensor([2.0**22, -(2.0**21), 0.0])
+    moved = partition_points(far[order], normals[order], planes[order], config)
+    for level, other in zip(
+        (found.labels, *found.levels), (moved.labels, *moved.levels), strict=True
+    ):
+        assert torch.equal(level[order], other)
+
+
+def test_place_alone_parts_a_flat_wall_into_compact_pieces():
+    x, y = torch.cartesian_prod(torch.arange(120.0), torch.arange(30.0)).unbind(1)
+    wall = torch.stack([x, 0 * x, y], dim=1)
+    normals = torch.tensor([0.0, 1, 0]).expand(len(wall), 3)
+    found = partition_points(
+        wall, normals, torch.zeros(len(wall), dtype=torch.int64), SuperpointsConfig(counts=(4,))
+    )
+    sizes = [np.ptp(wall[found.labels == i].numpy(), axis=0) for i in range(4)]
+    assert max(size[0] for size in sizes) < 60
+    assert torch.bincount(found.labels).min() > 450
+
+
+def test_a_picture_flush_with_a_wall_is_cut_out_by_its_colours():
+    x, y = torch.cartesian_prod(torch.arange(60.0), torch.arange(60.0)).unbind(1)
+    wall = torch.stack([x, 0 * x, y], dim=1)
+    picture = (x > 20.5) & (x < 41) & (y > 13.5) & (y < 29)
+    colors = torch.where(picture, 0.2, 0.7)[:, None].expand(-1, 3)
+    normals = torch.tensor([0.0, 1, 0]).expand(len(wall), 3)
+    planes = torch.zeros(len(wall), dtype=torch.int64)
+    config = SuperpointsConfig(counts=(200, 12))
+    found = partition_points(wall, normals, planes, config, colors)
+    for level in (found.labels, *found.levels):
+        assert score_partition(level, picture.long()).asa == 1
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 30])
 def test_few_or_equal_points_are_one_superpoint(count):
     for points in (torch.ones(count, 3), torch.arange(3.0 * count).reshape(count, 3)):
@@ -284,7 +352,14 @@ def test_arguments_are_checked(room):
     seg = segment_planes(points[:100])
     with pytest.raises(ShapeError, match="expected seg of 6,000 points, got 100"):
         make_superpoints(points, seg)
-    for wrong in ({"strengths": ()}, {"strengths": (2.0, 1.0)}, {"max_extent": 0.0}):
+    for wrong in (
+        {"strengths": ()},
+        {"strengths": (2.0, 1.0)},
+        {"counts": ()},
+        {"counts": (0,)},
+        {"counts": (300, 300)},
+        {"max_extent": 0.0},
+    ):
         with pytest.raises(ConfigError, match="SuperpointsConfig: expected"):
             SuperpointsConfig(**wrong)
 

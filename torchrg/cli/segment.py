@@ -1,6 +1,7 @@
 """``torchrg segment``: plane labels of scans."""
 
 import dataclasses
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -79,9 +80,9 @@ class Arguments:
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
     superpoints: bool = False
-    """Add superpoints, a partition of all points: of the first strength as "superpoints", the
-    coarser ones as "superpoints_1" and so on. The picture shows them instead of the planes. Colours
-    of the cloud play a part."""
+    """Add superpoints, a partition of all points: the finest as "superpoints", the coarser ones as
+    "superpoints_1" and so on. Numbers say how many of each: --superpoints 1000,300. The picture
+    shows them instead of the planes. Colours of the cloud play a part."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
@@ -107,6 +108,7 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _refuse_images(argv)
+    argv = _spell_counts(argv)
     start = Arguments(
         inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
     )
@@ -147,6 +149,24 @@ def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
 def _page_of(picture: Path) -> Path:
     """Return where the page of a picture is."""
     return picture.with_suffix(".html")
+
+
+def _spell_counts(argv: list[str]) -> list[str]:
+    """Return arguments in which numbers after ``--superpoints`` have a flag of their own.
+
+    Example:
+        >>> _spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
+        ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
+    """
+    spelled: list[str] = []
+    for argument in argv:
+        is_after = spelled[-1:] == ["--superpoints"]
+        flag, _, numbers = argument.rpartition("=") if "=" in argument else ("", "", argument)
+        if re.fullmatch(r"\d+(,\d+)*", numbers) and (is_after or flag == "--superpoints"):
+            spelled += [flag] * bool(flag) + ["--partition.counts", *numbers.split(",")]
+        else:
+            spelled.append(argument)
+    return spelled
 
 
 def _refuse_images(argv: list[str]) -> None:
@@ -254,7 +274,7 @@ def _check_points(
 
     Returns the names of the fields of the cloud.
     """
-    levels = range(len(arguments.partition.strengths) if arguments.superpoints else 0)
+    levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
     parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
     first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
     console.note_input(source, first, target, (*RESULT_FIELDS, *parts))
