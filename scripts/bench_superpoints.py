@@ -35,7 +35,6 @@ from torchrg.metrics import PartitionScore, score_partition
 from torchrg.neighbors import sample_voxels
 from torchrg.scenes import RoomLayout, Scene, build_room, make_room
 from torchrg.structures import UNLABELED
-from torchrg.transforms import partition_voxels, segment_voxels
 
 COLORS = {"torchrg": "C0", "torchrg, voxels first": "C2", "cut pursuit": "C1"}
 VOXEL = 0.03
@@ -120,11 +119,8 @@ def run_ours(points: Tensor, voxel: float | None) -> tuple[list[Tensor], list[fl
     """Return partitions for all strengths, and the seconds that they took together."""
     config = SuperpointsConfig(strengths=STRENGTHS)
     begin = time.perf_counter()
-    if voxel is None:
-        found = make_superpoints(points, segment_planes(points), config)
-    else:
-        voxels = sample_voxels(points, voxel)
-        found = partition_voxels(points, voxels, segment_voxels(points, voxels), config)
+    seg = segment_planes(points, voxel=voxel)
+    found = make_superpoints(points, seg, config, voxel=voxel)
     seconds = time.perf_counter() - begin
     return [found.labels, *found.levels], [seconds] * len(STRENGTHS)
 

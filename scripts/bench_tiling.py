@@ -27,7 +27,6 @@ from torchrg.config import load_config
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiling import STAGES
 
 ROOM_POINTS = 1_000_000
 ROOM_METRES = 20.0
@@ -175,10 +174,8 @@ def main() -> None:
                 f"{rate:.2f} us a point ({taken['cpu'] / num_points * 1e6:.2f} of CPU), peak "
                 f"{taken['peak_gb']:.2f} GB{disk}{same}"
             )
-            for stage in STAGES if mode == "tiles" else ():
-                if stage in taken["peaks"]:
-                    peak, spent = taken["peaks"][stage], taken["stages"][stage]
-                    print(f"    {stage}: {spent:.1f} s, peak {peak:.2f} GB")
+            for stage, peak in taken.get("peaks", {}).items():
+                print(f"    {stage}: {taken['stages'][stage]:.1f} s, peak {peak:.2f} GB")
 
 
 if __name__ == "__main__":

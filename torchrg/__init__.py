@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from torchrg.pipeline import make_superpoints, segment_planes
     from torchrg.regions import grow_regions
     from torchrg.structures import UNLABELED, Cloud
-    from torchrg.tiling import segment_tiles
 else:
     _MODULES = {
         "UNLABELED": "structures",
@@ -24,7 +23,6 @@ else:
         "read_cloud": "io",
         "search_knn": "neighbors",
         "segment_planes": "pipeline",
-        "segment_tiles": "tiling",
         "write_cloud": "io",
     }
 
@@ -69,7 +67,6 @@ __all__ = [
     "scenes",
     "search_knn",
     "segment_planes",
-    "segment_tiles",
     "transforms",
     "write_cloud",
 ]

@@ -20,17 +20,10 @@ from torchrg.batch.scans import Converted, Scan
 from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import marked_parts, remove_leftovers
+from torchrg.pipeline import segment_planes
+from torchrg.stages import TileTask
+from torchrg.store import TILE_SIZE, FolderStore, Written, make_folder, run_in_turn
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiling import (
-    TILE_SIZE,
-    Done,
-    TileFiles,
-    TileTask,
-    Written,
-    make_folder,
-    run_in_turn,
-    segment_tiles,
-)
 
 _BASE_BYTES = 500_000_000
 """Of a process before the first point: Python, torch, scipy."""
@@ -113,6 +106,7 @@ def segmented_in_tiles(
     start: Callable[[Sequence["TileJob"]], Reports] | None = None,
     on_stage: Callable[[str, int, int], None] | None = None,
     columns: str | None = None,
+    voxel: float | None = None,
 ) -> Iterator[Segmentation]:
     """Segment files as one cloud, and remove the work when the result is used.
 
@@ -122,7 +116,7 @@ def segmented_in_tiles(
     Args:
         sources: The files.
         chunks: Their points.
-        folder: Of the work alone; see :func:`torchrg.tiling.segment_tiles`. Another process that
+        folder: Of the work alone; see :class:`torchrg.store.FolderStore`. Another process that
             works there is refused.
         settings: Of the pipeline.
         tile_size: Points of a tile.
@@ -131,8 +125,9 @@ def segmented_in_tiles(
         workers: Processes of one thread that work on tiles side by side, as many as there is memory
             for; with one, this process works on tile after tile, on its threads.
         start: Starts another engine on the jobs of a stage.
-        on_stage: See :func:`torchrg.tiling.segment_tiles`.
+        on_stage: See :class:`torchrg.store.FolderStore`.
         columns: Names that were given for the columns of the files.
+        voxel: See :func:`torchrg.segment_planes`.
 
     Yields:
         The segmentation.
@@ -154,17 +149,16 @@ def segmented_in_tiles(
                 run_local, workers=workers, memory_limit=sys.maxsize, lock=lock, work=work_on_tile
             )
         try:
-            yield segment_tiles(
-                chunks,
+            store = FolderStore(
                 folder,
-                settings,
+                {"inputs": inputs, "versions": describe_versions(), **named},
                 tile_size=tile_size,
-                identity={"inputs": inputs, "versions": describe_versions(), **named},
                 run=run_in_turn if start is None else partial(_run_jobs, start=start),
-                on_stage=on_stage,
+                on_progress=on_stage,
             )
+            yield segment_planes(chunks, settings, voxel=voxel, store=store)
         except BaseException:
-            if not TileFiles(folder).is_begun:
+            if not FolderStore(folder).is_begun:
                 _remove_work(folder)
             raise
         _remove_work(folder)
@@ -183,7 +177,7 @@ def _check_outside(folder: Path, files: Sequence[Path]) -> None:
 def _remove_work(folder: Path) -> None:
     """Remove what the work has made, and its folder unless something else is in it."""
     (folder / LOCK).unlink(missing_ok=True)
-    TileFiles(folder).remove_all()
+    FolderStore(folder).remove_all()
 
 
 @dataclass(frozen=True)
@@ -224,7 +218,7 @@ def work_on_tile(job: TileJob) -> TileReport:
 
 def _run_jobs(
     tasks: Sequence[TileTask], start: Callable[[Sequence[TileJob]], Reports]
-) -> Iterator[Done]:
+) -> Iterator[tuple[TileTask, Sequence[Written]]]:
     """Run tasks on an engine, and yield each that is done; raise FormatError for one that fails."""
     by_name = {task.name: task for task in tasks}
     if not tasks:

@@ -39,8 +39,7 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.stream import Extent
-from torchrg.neighbors import sample_voxels
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import (
     Entry,
@@ -51,7 +50,6 @@ from torchrg.render.gallery import (
     write_index,
 )
 from torchrg.structures import Cloud, Segmentation
-from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
@@ -322,16 +320,16 @@ def _segment_whole(
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
     with console.stage_bar(sources[0].name, stages) as advance:
-        voxels = None if voxel is None else sample_voxels(cloud.points, voxel)
-        if voxels is None:
-            seg = segment_planes(cloud.points, settings, on_stage=advance)
-        else:
-            seg = segment_voxels(cloud.points, voxels, settings, on_stage=advance)
+        seg = segment_planes(cloud.points, settings, voxel=voxel, on_stage=advance)
         parts, provenance = None, _describe(arguments, sources)
         if arguments.superpoints:
             advance("superpoints")
-            parts = partition_voxels(
-                cloud.points, voxels, seg, arguments.partition, colors=cloud.fields.get("color")
+            parts = make_superpoints(
+                cloud.points,
+                seg,
+                arguments.partition,
+                colors=cloud.fields.get("color"),
+                voxel=voxel,
             )
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     if voxel is not None:

@@ -22,6 +22,10 @@ from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbo
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors
 
+EDGE_STEPS = 2
+"""Steps from neighbour to neighbour, from a point, to all points that decide its edges. A part of a
+cloud with those around it has the same edges: the criteria read the neighbours of both ends."""
+
 _CHUNKS_A_THREAD = 4
 """Chunks tested before any is stored: threads wait for each other only so often."""
 
@@ -110,9 +114,10 @@ def find_edges(
         return _pick(targets, joins & spreads[rows, None])
 
     edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
-    targets, counts = zip(*(others[start] for start in sorted(others)), strict=True)
-    starts = np.concatenate([[0], *counts]).cumsum()
-    return edges, EdgeLists(starts, np.concatenate(targets))
+    rest = [_Edges(np.empty(0, np.int32), np.zeros(1, np.int64))]
+    rest += (others[start] for start in sorted(others))
+    targets, counts = zip(*rest, strict=True)
+    return edges, EdgeLists(np.concatenate(counts).cumsum(), np.concatenate(targets))
 
 
 def _become_seeds(

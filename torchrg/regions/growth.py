@@ -1,8 +1,10 @@
 """Region growing: from points, normals and neighbours to labels."""
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,8 +32,7 @@ _LONG_QUEUE = 32
 """From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
 
 _CLAIMING_SEEDS = 2**13
-"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB. NumPy keeps other
-threads waiting meanwhile, also the one that gives back pages of files."""
+"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB."""
 
 
 @sequential_operations()
@@ -106,7 +107,7 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    heads = torch.from_numpy(_grow(cloud, config, chunk_size)).to(cloud.points.device)
+    heads = torch.from_numpy(grow(cloud, config, chunk_size)).to(cloud.points.device)
     labels = settle_regions(cloud, heads, config, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
@@ -125,12 +126,12 @@ def settle_regions(
     labels = number_by_size(heads, least)
     if config.cut_bridges and bool((labels >= 0).any()):
 
-        def grow(part: GrowingCloud, share: float) -> Tensor:
+        def grow_within(part: GrowingCloud, share: float) -> Tensor:
             part, strict = _within_share(part, config, share)
-            found = torch.from_numpy(_grow(part, strict, chunk_size)).to(part.points.device)
+            found = torch.from_numpy(grow(part, strict, chunk_size)).to(part.points.device)
             return number_by_size(found, config.min_size)
 
-        labels = cut_bridges(cloud, labels, config, grow, chunk_size=chunk_size)
+        labels = cut_bridges(cloud, labels, config, grow_within, chunk_size=chunk_size)
         labels = number_by_size(labels, least)
     if config.is_refined:
         labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
@@ -192,9 +193,9 @@ def checked_cloud(
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
-    colors = None if colors is None else _by_column(colors.to(points.dtype))
+    colors = None if colors is None else by_column(colors.to(points.dtype))
     return GrowingCloud(
-        _by_column(points), _by_column(normals), curvature, neighbors, valid, colors, reach
+        by_column(points), by_column(normals), curvature, neighbors, valid, colors, reach
     )
 
 
@@ -206,17 +207,17 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
     indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
     mask = cloud.neighbors.valid
     return GrowingCloud(
-        _by_column(cloud.points[order]),
-        _by_column(cloud.normals[order]),
+        by_column(cloud.points[order]),
+        by_column(cloud.normals[order]),
         cloud.curvature[order],
         Neighbors(indices, None if mask is None else mask[order]),
         cloud.valid[order],
-        None if cloud.colors is None else _by_column(cloud.colors[order]),
+        None if cloud.colors is None else by_column(cloud.colors[order]),
         None if cloud.reach is None else cloud.reach[order],
     )
 
 
-def _by_column(vectors: Tensor) -> Tensor:
+def by_column(vectors: Tensor) -> Tensor:
     """Return vectors ``(N, C)`` laid out column by column."""
     return vectors.T.contiguous().T
 
@@ -252,47 +253,89 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     return torch.from_numpy(ranks[found]).to(regions.device)
 
 
-def _grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
-    """Return the head of each point's region, by whichever way the settings allow."""
-    order, limit = growing_order(cloud.curvature, cloud.valid, config)
-    valid = cloud.valid.cpu().numpy()
+class GrowthOrder(NamedTuple):
+    """In which order regions begin.
+
+    Attributes:
+        rows: Points that may join a region, by ascending curvature, shape ``(n,)``.
+        num_seeds: How many of them, the first ones, are of at most the limit.
+        limit: The curvature limit, a scalar.
+    """
+
+    rows: NDArray[np.int32]
+    num_seeds: int
+    limit: Tensor
+
+
+class GrowthEdges(NamedTuple):
+    """What regions grow along from some points.
+
+    Attributes:
+        coded: Edges as :func:`find_coded_edges` gives them; where points spread by what they are,
+            those of the others.
+        spreading: Edges of the points that spread by what they are, None where that is a matter of
+            the edge that claims a point.
+        claims: Neighbours that a point merely claims, shape ``(N, K)``, with late promotion.
+    """
+
+    coded: EdgeLists
+    spreading: EdgeLists | None = None
+    claims: NDArray[np.bool_] | None = None
+
+
+def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
+    """Return the head of each point's region."""
+    order = growth_order(cloud.curvature, cloud.valid, config)
+    edges = find_growth_edges(cloud, config, order, chunk_size=chunk_size)
+    return grow_along(edges, order, cloud.neighbors.indices.cpu().numpy(), config)
+
+
+def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> GrowthOrder:
+    """Return the order in which regions begin at valid points ``(N,)``."""
+    rows = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
+    some = curvature[valid]
+    limit = curvature_limit(some, config.curvature_quantile)
+    rows = rows[valid.cpu().numpy()[rows]]
+    return GrowthOrder(rows, int(torch.count_nonzero(some <= limit)), limit)
+
+
+def find_growth_edges(
+    cloud: GrowingCloud, config: GrowingConfig, order: GrowthOrder, *, chunk_size: int
+) -> GrowthEdges:
+    """Return the edges that regions grow along, with room for the seeds."""
     if not config.is_order_free:
-        edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        indices = cloud.neighbors.indices.cpu().numpy()
-        return grow_first_in_first_out(edges, order, valid, claims, indices)
-    seeds = spreading(order, cloud.curvature, limit)
-    edges, others = find_edges(cloud, config, limit, spare=2 * len(seeds), chunk_size=chunk_size)
-    heads = first_to_reach(edges, seeds, len(valid))
-    if leaves_enough(cloud.neighbors.indices.shape[1], config):
-        heads = grow_rest(heads, others, order)
-    return heads
+        coded, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
+        return GrowthEdges(coded, claims=claims)
+    spare = 2 * order.num_seeds
+    spreading, coded = find_edges(cloud, config, order.limit, spare=spare, chunk_size=chunk_size)
+    return GrowthEdges(coded, spreading)
 
 
-def growing_order(
-    curvature: Tensor, valid: Tensor, config: GrowingConfig
-) -> tuple[NDArray[np.int32], Tensor]:
-    """Return the rows of valid points ``(N,)`` by ascending curvature, and its limit, a scalar."""
-    order = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
-    limit = curvature_limit(curvature[valid], config.curvature_quantile)
-    return order[valid.cpu().numpy()[order]], limit
-
-
-def spreading(order: NDArray[np.int32], curvature: Tensor, limit: Tensor) -> NDArray[np.int32]:
-    """Return those of the rows in growing order whose curvature is within the limit."""
-    return order[curvature.cpu().numpy()[order] <= limit.cpu().numpy()]
-
-
-def leaves_enough(k: int, config: GrowingConfig) -> bool:
-    """Tell whether points that no seed reaches may make regions: of at most k neighbours."""
-    return config.min_size <= k
-
-
-def grow_rest(
-    heads: NDArray[np.int32], others: EdgeLists, order: NDArray[np.int32]
+def grow_along(
+    edges: GrowthEdges,
+    order: GrowthOrder,
+    lists: NDArray[np.integer],
+    config: GrowingConfig,
+    reach: Callable[[NDArray[np.int32]], NDArray[np.int32]] | None = None,
 ) -> NDArray[np.int32]:
-    """Let free points that no seed reaches claim free neighbours by the edges of their own."""
+    """Return the head of each point's region.
+
+    ``lists`` ``(N, K)`` are the neighbours of the points. ``reach`` tells which of the seeds
+    reaches each point first, where the edges that spread are elsewhere.
+    """
+    num_points, k = lists.shape
+    if reach is None and edges.spreading is not None:
+        reach = partial(first_to_reach, edges.spreading, num_points=num_points)
+    if reach is None:
+        valid = np.zeros(num_points, dtype=bool)
+        valid[order.rows] = True
+        return grow_first_in_first_out(edges.coded, order.rows, valid, edges.claims, lists)
+    heads = reach(order.rows[: order.num_seeds])
+    if config.min_size > k:
+        return heads
+    # Points that no seed reaches may make regions with neighbours of their own.
     free = heads < 0
-    left = grow_first_in_first_out(others, order[free[order]], free)
+    left = grow_first_in_first_out(edges.coded, order.rows[free[order.rows]], free)
     return np.where(free, left, heads)
 
 
