@@ -92,15 +92,9 @@ class GrowingConfig:
     """Two points join only if each is within this many times the other's residual of the other's
     plane: faces never join across a thin plate. Takes the place of eq. 11 but where a fit is exact
     (residual below ``coplanarity_floor``). Needs the residuals of the normals. None: not tested."""
-    signed_normals: bool = False
-    """Whether opposite normals differ by 180 degrees instead of 0, so that the two faces of a thin
-    wall never join. For normals that are oriented."""
     max_distance: float | None = None
     """A neighbour farther than this does not join, in the unit of the cloud: the k nearest
     neighbours reach across gaps where points are few. None: not tested."""
-    max_color_distance: float | None = None
-    """A neighbour whose colour differs by more than this (Euclidean, in the unit of the colours)
-    does not join. None: not tested."""
     min_size: int = 50
     """Smaller regions are not labelled. With ``absorb`` the points at their borders count."""
     cut_bridges: bool = False
@@ -133,7 +127,7 @@ class GrowingConfig:
         within = self.connectivity is None or 0 <= self.connectivity <= 1
         _require(self, "connectivity", "in [0, 1] or none", within)
         _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
-        for name in ("max_distance", "max_color_distance", "plane_reach"):
+        for name in ("max_distance", "plane_reach"):
             value = getattr(self, name)
             _require(self, name, ">= 0 or none", value is None or value >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)

@@ -43,7 +43,7 @@ from torchrg.regions.growth import (
     find_growth_edges,
     grow_along,
     growth_order,
-    settle_regions,
+    label_regions,
 )
 from torchrg.store import FolderStore, MemoryStore, Written
 from torchrg.structures import UNLABELED, Neighbors, PlaneAdjacency, Segmentation
@@ -247,19 +247,24 @@ def _connect(store: Store, block: slice, number: int, config: PipelineConfig) ->
         for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
     )
     cloud = checked_cloud(
-        config.growing, points, normals, curvature, part.neighbors, valid, None, residual_rms
+        config.growing, points, normals, curvature, part.neighbors, valid, residual_rms
     )
     if cloud.reach is not None:
         store.write("reach", block.start, cloud.reach[part.own])
-    order = _order(store)
-    found = find_growth_edges(cloud, config.growing, order, chunk_size=config.chunk_size)
+    found = find_growth_edges(
+        cloud,
+        config.growing,
+        _order(store),
+        chunk_size=config.chunk_size,
+        whole=isinstance(store, MemoryStore),
+    )
     if isinstance(store, MemoryStore):
         store.save("edges", found)
         return
     if found.claims is not None:
         store.write("claims", block.start, found.claims[part.own])
-    if found.spreading is not None:
-        condensed = condense(found.spreading, part)
+    if found.of_seeds is not None:
+        condensed = condense(found.of_seeds, part)
         store.write("components", block.start, condensed.components)
         store.save(f"sources_{number}", condensed.sources)
         store.save(f"targets_{number}", condensed.targets)
@@ -308,11 +313,11 @@ def grow_regions(store: Store, config: PipelineConfig) -> None:
     """Grow the regions of the whole cloud along the edges of its points."""
     order = _order(store)
     if isinstance(store, FolderStore):
-        heads = _grow_on_disk(store, order, config)
+        roots = _grow_on_disk(store, order, config)
     else:
         lists = store.get("neighbors").cpu().numpy()
-        heads = grow_along(store.get("edges"), order, lists, config.growing)
-    store.save("heads", torch.from_numpy(heads).to(store.lazy("curvature").device))
+        roots = grow_along(store.get("edges"), order, lists, config.growing)
+    store.save("roots", torch.from_numpy(roots).to(store.lazy("curvature").device))
     store.remove("edges")
     store.note("growth")
 
@@ -362,7 +367,7 @@ def finish_regions(store: Store, config: PipelineConfig) -> None:
         _growing_points(store),
         reach=None if config.growing.plane_reach is None else store.get("reach"),
     )
-    labels = settle_regions(cloud, store.get("heads"), config.growing, config.chunk_size)
+    labels = label_regions(cloud, store.get("roots"), config.growing, config.chunk_size)
     store.save("labels", labels)
     store.note("regions")
 

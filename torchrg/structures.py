@@ -19,6 +19,10 @@ FARTHEST = 1e12
 float32, is beyond, and a room in any unit is not. Squares of these are far from float32's end."""
 
 
+Rows = slice | Tensor
+"""A block of points, or the row numbers of some."""
+
+
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """A cloud as it was read: its coordinates untouched, and points fit for float32 arithmetic.
@@ -118,6 +122,27 @@ class Neighbors(NamedTuple):
 
     indices: Tensor
     valid: Tensor | None = None
+
+    def at(self, rows: Rows) -> "Neighbors":
+        """Return the neighbours of some of the points."""
+        return Neighbors(self.indices[rows], None if self.valid is None else self.valid[rows])
+
+    def of(self, values: Tensor, rows: Rows = slice(None)) -> Tensor:
+        """Return the values ``(N,)`` of the neighbours of some points, shape ``(n, K)``.
+
+        Example:
+            >>> Neighbors(torch.tensor([[0, 1], [1, 0]])).of(torch.tensor([0.5, 2.5])).tolist()
+            [[0.5, 2.5], [2.5, 0.5]]
+        """
+        indices = self.indices[rows]
+        return values.index_select(0, indices.reshape(-1)).view(indices.shape)
+
+    def counted(self, rows: Rows = slice(None)) -> Tensor:
+        """Return which entries of some points are neighbours, shape ``(n, K)``, bool."""
+        if self.valid is not None:
+            return self.valid[rows]
+        own = self.indices[rows, 0]
+        return torch.ones(len(own), self.indices.shape[1], dtype=torch.bool, device=own.device)
 
 
 class NormalFit(NamedTuple):

@@ -232,7 +232,7 @@ def test_an_array_that_is_lost_during_the_work_is_one_line(tmp_path):
         ("normals", 0, "neighbors"),
         ("normals", 1, "normals"),
         ("edges", 0, "cloud"),
-        ("regions", 0, "heads"),
+        ("regions", 0, "roots"),
     ):
 
         def lose(begun, number, of, *, stage=stage, at=at, name=name):
@@ -344,11 +344,9 @@ def test_the_points_around_a_tile_decide_its_edges(preset, tmp_path):
         segment(points.numpy(), tmp_path, config, 30, on_stage=stop)
     neighbors = search_knn(points, 12)
     fit = ESTIMATORS[config.normals.method](points, neighbors, config.normals, 4000)
-    cloud = checked_cloud(
-        config.growing, points, *fit[:2], neighbors, fit.valid, None, fit.residual_rms
-    )
-    heads = grow(cloud, config.growing, 4000)
-    assert len(np.unique(heads)) > 20
-    np.testing.assert_array_equal(FolderStore(tmp_path).get("heads"), heads)
+    cloud = checked_cloud(config.growing, points, *fit[:2], neighbors, fit.valid, fit.residual_rms)
+    roots = grow(cloud, config.growing, 4000)
+    assert len(np.unique(roots)) > 20
+    np.testing.assert_array_equal(FolderStore(tmp_path).get("roots"), roots)
     if cloud.reach is not None:
         assert bool(cloud.reach.isinf().any() and cloud.reach.isfinite().any())

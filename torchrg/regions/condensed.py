@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.neighbors.tiles import Part
 from torchrg.regions.edges import EdgeLists
-from torchrg.regions.growth import first_to_reach
+from torchrg.regions.growth import chain_of, first_to_reach
 
 
 class Condensed(NamedTuple):
@@ -109,11 +109,10 @@ def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[
     nodes, places = first_seeds[by_seed], places[by_seed]
     starts = np.zeros(int(offsets[-1]) + 1, dtype=np.int32)
     np.cumsum(np.bincount(sources, minlength=int(offsets[-1])), out=starts[1:])
-    room = np.empty(len(targets) + 2 * len(nodes), dtype=np.int32)
     # The edges of each tile are in the order of their components.
-    room[: len(targets)] = targets
-    heads = first_to_reach(EdgeLists(starts, room), nodes, int(offsets[-1]))
+    edges = EdgeLists(starts, targets).append(chain_of(nodes, len(starts) - 1))
+    roots = first_to_reach(edges, len(starts) - 1)
     seed_of = np.full(int(offsets[-1]) + 1, -1, dtype=np.int32)
     seed_of[nodes] = seeds[places]
-    found: NDArray[np.int32] = seed_of[heads][node_of]
+    found: NDArray[np.int32] = seed_of[roots][node_of]
     return found

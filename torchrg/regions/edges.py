@@ -2,12 +2,14 @@
 
 A criterion is a function that tests the edges from some points, ``rows``, to their K neighbours,
 and returns which of them pass, shape ``(n, K)``, bool. A new one is a setting, a function here, and
-the line of :func:`accept_edges` that calls it.
+the line of :func:`accept_edges` that calls it. It may read the neighbours of both ends of an edge;
+one that reads more also raises :data:`EDGE_STEPS`.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,18 +22,17 @@ from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
-from torchrg.structures import Neighbors
+from torchrg.structures import Neighbors, Rows
+
+Found = TypeVar("Found")
 
 EDGE_STEPS = 2
 """Steps from neighbour to neighbour, from a point, to all points that decide its edges. A part of a
 cloud with those around it has the same edges: the criteria read the neighbours of both ends."""
 
 _CHUNKS_A_THREAD = 4
-"""Chunks tested before any is stored: threads wait for each other only so often."""
-
-
-Rows = slice | Tensor
-"""A block of points, or the rows of some."""
+"""Chunks that each thread tests before their edges are stored. Threads wait for each other at that
+moment, so it should come rarely."""
 
 
 class GrowingCloud(NamedTuple):
@@ -45,9 +46,11 @@ class GrowingCloud(NamedTuple):
         curvature: Shape ``(N,)``.
         neighbors: Neighbours of each point.
         valid: Points that may belong to a region, shape ``(N,)``, bool.
-        colors: Shape ``(N, C)``, floating point, or None.
         reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
             where that is not known, or None.
+        colors: Shape ``(N, C)``, floating point, or None.
+        max_color_distance: Largest difference of colours across which regions grow.
+        signed_normals: Whether opposite normals differ by 180 degrees instead of 0.
     """
 
     points: Tensor
@@ -55,19 +58,25 @@ class GrowingCloud(NamedTuple):
     curvature: Tensor
     neighbors: Neighbors
     valid: Tensor
-    colors: Tensor | None = None
     reach: Tensor | None = None
+    colors: Tensor | None = None
+    max_color_distance: float = math.inf
+    signed_normals: bool = False
 
 
 class EdgeLists(NamedTuple):
     """Edges of a directed graph in compressed rows.
 
-    The edges of point i are ``starts[i]`` to ``starts[i + 1]``. Of the targets, or codes of
-    targets, ``starts[N]`` are used: what is behind them is room for more.
+    The edges of node i are ``starts[i]`` to ``starts[i + 1]`` of the targets, or codes of targets.
     """
 
     starts: NDArray[np.signedinteger]
     targets: NDArray[np.int32]
+
+    def append(self, more: "EdgeLists") -> "EdgeLists":
+        """Return the edges with those of further nodes behind them."""
+        starts = np.concatenate([self.starts, more.starts[1:] + self.starts[-1]])
+        return EdgeLists(starts, np.concatenate([self.targets, more.targets]))
 
 
 def find_coded_edges(
@@ -92,32 +101,41 @@ def find_coded_edges(
             joins &= becomes_seed
         return _pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)
 
-    return _pack(find, cloud, spare=0, chunk_size=chunk_size), claims
+    found = _in_chunks(find, cloud, chunk_size)
+    return _pack(found, cloud.neighbors.indices.numel()), claims
 
 
 def find_edges(
-    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, spare: int, chunk_size: int
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    limit: Tensor,
+    *,
+    chunk_size: int,
+    more: EdgeLists | None = None,
 ) -> tuple[EdgeLists, EdgeLists]:
-    """Return the edges between points of at most the curvature limit, which spread; all others'.
+    """Return the edges of points of at most the curvature limit, and those of all others.
 
-    The first have room for some spare edges, the second are coded as :func:`find_coded_edges` does.
-    Chunks of every size give the same edges.
+    The first have the edges of ``more`` nodes behind them, the second are coded as
+    :func:`find_coded_edges` does. Chunks of every size give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
-    spreads = cloud.curvature <= limit
-    others: dict[int, _Edges] = {}
+    is_seed = cloud.curvature <= limit
 
-    def find(rows: slice) -> _Edges:
+    def find(rows: slice) -> tuple[_Edges, _Edges]:
         joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
-        targets = cloud.neighbors.indices[rows]
-        others[rows.start] = _pick(targets.to(torch.int32) * 2, joins & ~spreads[rows, None])
-        return _pick(targets, joins & spreads[rows, None])
+        targets, seeds = cloud.neighbors.indices[rows], is_seed[rows, None]
+        coded = targets.to(torch.int32) * 2
+        return _pick(targets, joins & seeds), _pick(coded, joins & ~seeds)
 
-    edges = _pack(find, cloud, spare=spare, chunk_size=chunk_size)
-    rest = [_Edges(np.empty(0, np.int32), np.zeros(1, np.int64))]
-    rest += (others[start] for start in sorted(others))
-    targets, counts = zip(*rest, strict=True)
-    return edges, EdgeLists(np.concatenate(counts).cumsum(), np.concatenate(targets))
+    rest: list[_Edges] = []
+
+    def of_seeds() -> Iterator[_Edges]:
+        for edges, others in _in_chunks(find, cloud, chunk_size):
+            rest.append(others)
+            yield edges
+
+    edges = _pack(of_seeds(), cloud.neighbors.indices.numel(), more)
+    return edges, _pack(rest, sum(len(others.targets) for others in rest))
 
 
 def _become_seeds(
@@ -128,8 +146,7 @@ def _become_seeds(
     connected: Tensor | None,
 ) -> Tensor:
     """Tell which neighbours of some points become seeds by the edge from the point, ``(n, K)``."""
-    indices = cloud.neighbors.indices[rows]
-    target = cloud.curvature.index_select(0, indices.reshape(-1)).view(indices.shape)
+    target = cloud.neighbors.of(cloud.curvature, rows)
     if config.seed_rule == "increment":
         becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
     else:
@@ -148,23 +165,21 @@ def accept_edges(
     """Tell which neighbours of some points pass all criteria that are on, cheap ones first.
 
     Returns whether the neighbour joins the region of the point, shape ``(n, K)``, bool; and whether
-    the two are connected, only settled where it joins, None without ``connect``, which tells it of
+    the two are connected, only known where it joins, None without ``connect``, which tells it of
     the edges that it is asked for.
     """
     joins = are_valid(cloud, rows)
-    joins &= within_angle(cloud, rows, config.max_angle_deg, signed=config.signed_normals)
+    joins &= within_angle(cloud, rows, config.max_angle_deg, signed=cloud.signed_normals)
     if config.max_distance is not None:
         joins &= within_distance(cloud, rows, cloud.points, config.max_distance)
-    if config.max_color_distance is not None and cloud.colors is not None:
-        joins &= within_distance(cloud, rows, cloud.colors, config.max_color_distance)
+    if cloud.colors is not None:
+        joins &= within_distance(cloud, rows, cloud.colors, cloud.max_color_distance)
     if cloud.reach is not None:
         joins &= on_planes(cloud, rows, cloud.reach)
     connected: Tensor | None = None
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
-            counted = cloud.neighbors.valid
-            everyone = torch.ones_like(joins) if counted is None else counted[rows]
-            connected = connect(everyone)
+            connected = connect(cloud.neighbors.counted(rows))
         asked = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
         joins &= ~asked | are_coplanar(cloud, rows, asked, connected, config.coplanarity_floor)
     if connect is not None:
@@ -201,36 +216,41 @@ def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
     return _Edges(chosen.cpu().numpy(), np.count_nonzero(accepted.cpu().numpy(), axis=1))
 
 
-def _pack(
-    find: Callable[[slice], _Edges], cloud: GrowingCloud, *, spare: int, chunk_size: int
-) -> EdgeLists:
-    """Collect the edges of successive chunks, found by as many threads as torch uses."""
-    num_points, k = cloud.neighbors.indices.shape
-    # As long as it can get: memory that is not used is not touched.
-    targets = np.empty(num_points * k + spare, dtype=np.int32)
-    starts: NDArray[np.signedinteger]
-    starts = np.zeros(num_points + 1, dtype=np.int32 if len(targets) < 2**31 else np.int64)
-    chunks = chunks_of(num_points, chunk_size)
+def _in_chunks(
+    find: Callable[[slice], Found], cloud: GrowingCloud, chunk_size: int
+) -> Iterator[Found]:
+    """Yield what is found in successive chunks, on as many threads as torch uses."""
+    chunks = chunks_of(len(cloud.points), chunk_size)
     at_once = _CHUNKS_A_THREAD * allowed_threads()
-    used = 0
     for first in range(0, len(chunks), at_once):
-        group = chunks[first : first + at_once]
-        for rows, edges in zip(group, map_tasks(find, group, cloud.points.device), strict=True):
-            targets[used : used + len(edges.targets)] = edges.targets
-            starts[rows.start + 1 : rows.stop + 1] = used + np.cumsum(edges.counts)
-            used += len(edges.targets)
-    return EdgeLists(starts, targets)
+        yield from map_tasks(find, chunks[first : first + at_once], cloud.points.device)
+
+
+def _pack(found: Iterable[_Edges], most: int, more: EdgeLists | None = None) -> EdgeLists:
+    """Join the edges of successive chunks, at most so many, and those of more nodes behind them."""
+    counts, used, spare = [], 0, 0 if more is None else len(more.targets)
+    # As long as it can get: memory that is not used is not touched.
+    targets = np.empty(most + spare, dtype=np.int32)
+    for edges in found:
+        targets[used : used + len(edges.targets)] = edges.targets
+        used += len(edges.targets)
+        counts.append(edges.counts)
+    if more is not None:
+        targets[used : used + spare] = more.targets
+        counts.append(np.diff(more.starts))
+    dtype = np.int32 if len(targets) < 2**31 else np.int64
+    starts = np.concatenate([[0], *counts]).cumsum(dtype=dtype)
+    return EdgeLists(starts, targets[: used + spare])
 
 
 def are_valid(cloud: GrowingCloud, rows: Rows) -> Tensor:
     """Tell which edges lead from one valid point to another one that is its neighbour."""
-    indices, counted = cloud.neighbors
-    own = rows
+    neighbors, own = cloud.neighbors, rows
     if isinstance(own, slice):
-        own = torch.arange(own.start, own.stop, device=indices.device)
-    passed = _of_neighbors(cloud, rows, cloud.valid) & cloud.valid[rows, None]
-    passed &= indices[rows] != own[:, None]
-    return passed if counted is None else passed & counted[rows]
+        own = torch.arange(own.start, own.stop, device=cloud.points.device)
+    passed = neighbors.of(cloud.valid, rows) & cloud.valid[rows, None]
+    passed &= neighbors.indices[rows] != own[:, None]
+    return passed if neighbors.valid is None else passed & neighbors.valid[rows]
 
 
 def within_angle(cloud: GrowingCloud, rows: Rows, max_angle_deg: float, *, signed: bool) -> Tensor:
@@ -239,7 +259,7 @@ def within_angle(cloud: GrowingCloud, rows: Rows, max_angle_deg: float, *, signe
         return torch.ones_like(cloud.neighbors.indices[rows], dtype=torch.bool)
     columns = cloud.normals.unbind(dim=1)
     own = [column[rows, None] for column in columns]
-    theirs = [_of_neighbors(cloud, rows, column) for column in columns]
+    theirs = [cloud.neighbors.of(column, rows) for column in columns]
     return sq_chords(own, theirs, signed=signed) <= deg_to_sq_chord(max_angle_deg)
 
 
@@ -247,7 +267,7 @@ def within_distance(cloud: GrowingCloud, rows: Rows, values: Tensor, limit: floa
     """Tell which neighbours' values ``(N, C)``, places or colours, are within a distance."""
     total = values.new_zeros(())
     for column in values.unbind(dim=1):
-        difference = _of_neighbors(cloud, rows, column) - column[rows, None]
+        difference = cloud.neighbors.of(column, rows) - column[rows, None]
         total = difference.mul_(difference).add_(total)
     return total <= limit**2
 
@@ -257,11 +277,11 @@ def on_planes(cloud: GrowingCloud, rows: Rows, reach: Tensor) -> Tensor:
     own = theirs = cloud.points.new_zeros(())
     columns = zip(cloud.points.unbind(dim=1), cloud.normals.unbind(dim=1), strict=True)
     for place, normal in columns:
-        away = _of_neighbors(cloud, rows, place) - place[rows, None]
+        away = cloud.neighbors.of(place, rows) - place[rows, None]
         own = (away * normal[rows, None]).add_(own)
-        theirs = away.mul_(_of_neighbors(cloud, rows, normal)).add_(theirs)
+        theirs = away.mul_(cloud.neighbors.of(normal, rows)).add_(theirs)
     on_own = own.abs_() <= reach[rows, None]
-    return on_own & (theirs.abs_() <= _of_neighbors(cloud, rows, reach))
+    return on_own & (theirs.abs_() <= cloud.neighbors.of(reach, rows))
 
 
 def are_coplanar(
@@ -277,21 +297,14 @@ def are_coplanar(
     a fraction of the distance to the farthest neighbour.
     """
     needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
-    indices, mask = cloud.neighbors
-    patches = gather_patches(cloud.points, indices[rows][needed])
-    counted = None if mask is None else mask[rows][needed]
+    indices, counted = cloud.neighbors.at(rows).at(needed)
+    patches = gather_patches(cloud.points, indices)
     residuals = plane_residuals(patches, cloud.normals[rows][needed])
     floor = floor_fraction * patch_radii(patches, counted)
     limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[needed])
     result = torch.zeros_like(asked)
     result[needed] = residuals <= limits[:, None]
     return result
-
-
-def _of_neighbors(cloud: GrowingCloud, rows: Rows, values: Tensor) -> Tensor:
-    """Return the values ``(N,)`` of the points' neighbours, shape ``(n, K)``."""
-    indices = cloud.neighbors.indices[rows]
-    return values.index_select(0, indices.reshape(-1)).view(indices.shape)
 
 
 def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:

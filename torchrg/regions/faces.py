@@ -116,7 +116,7 @@ def cut_bridges(
     cores = torch.where(sound, labels + int(cores.max()) + 1, cores)
     is_core = torch.bincount(cores + 1)[1:] > 0
     cores = torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores]
-    around = _gather(cores.to(torch.int32), cloud.neighbors.indices[rows])
+    around = cloud.neighbors.of(cores.to(torch.int32), rows)
     rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
 
@@ -172,12 +172,7 @@ def _are_level(
     """Tell at which points the surface bends no more than is usual in their region."""
     shares = torch.zeros_like(part.curvature, dtype=torch.float64)
     for some in chunks_of(len(shares), chunk_size):
-        counted = part.neighbors.valid
-        counted = (
-            torch.ones_like(part.neighbors.indices[some], dtype=torch.bool)
-            if counted is None
-            else counted[some]
-        )
+        counted = part.neighbors.counted(some)
         alike = within_angle(part, some, max_angle_deg, signed=False) & counted
         shares[some] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
@@ -190,42 +185,33 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> tuple[Growing
     """Return some points as a cloud, and which neighbours are in it and of the point's region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-    indices = cloud.neighbors.indices[rows]
-    places = _gather(row_of, indices)
-    counted = (_gather(labels.to(torch.int32), indices) == labels[rows, None]) & (places >= 0)
-    if cloud.neighbors.valid is not None:
-        counted &= cloud.neighbors.valid[rows]
+    near = cloud.neighbors.at(rows)
+    places = near.of(row_of)
+    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (places >= 0)
+    counted &= near.counted()
     own = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
-    colors, reach = (None if v is None else v[rows] for v in (cloud.colors, cloud.reach))
-    part = GrowingCloud(
-        cloud.points[rows],
-        cloud.normals[rows],
-        cloud.curvature[rows],
-        Neighbors(torch.where(counted, places, own), counted),
-        cloud.valid[rows],
-        colors,
-        reach,
+    part = cloud._replace(
+        points=cloud.points[rows],
+        normals=cloud.normals[rows],
+        curvature=cloud.curvature[rows],
+        neighbors=Neighbors(torch.where(counted, places, own), counted),
+        valid=cloud.valid[rows],
+        reach=None if cloud.reach is None else cloud.reach[rows],
+        colors=None if cloud.colors is None else cloud.colors[rows],
     )
     return part, counted
-
-
-def _gather(values: Tensor, indices: Tensor) -> Tensor:
-    """Return values ``(N,)`` at places ``(n, K)``."""
-    return values.index_select(0, indices.reshape(-1)).view(indices.shape)
 
 
 def _find_edges(
     cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _Edges:
     """Return the edges of some points."""
-    targets = cloud.neighbors.indices[rows].long()
-    inside = _gather(labels, targets) == labels[rows, None]
-    if cloud.neighbors.valid is not None:
-        inside &= cloud.neighbors.valid[rows]
+    near = cloud.neighbors.at(rows)
+    inside = (near.of(labels) == labels[rows, None]) & near.counted()
     passed = torch.zeros_like(inside)
     for some in chunks_of(len(rows), chunk_size):
         passed[some] = accept_edges(cloud, config, rows[some], None)[0]
-    return _Edges(rows, targets, inside, passed & inside)
+    return _Edges(rows, near.indices.long(), inside, passed & inside)
 
 
 def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _Edges) -> Tensor:

@@ -1,9 +1,9 @@
 """Region growing: from points, normals and neighbours to labels."""
 
+import math
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from torchrg.regions.refine import refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 _LONG_QUEUE = 32
-"""From this many waiting seeds on, whole levels go through NumPy; below, one seed at a time."""
+"""From this many waiting seeds on, all of them go through NumPy at once; below, one at a time."""
 
 _CLAIMING_SEEDS = 2**13
 """Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB."""
@@ -44,8 +44,10 @@ def grow_regions(
     config: GrowingConfig | None = None,
     *,
     valid: Tensor | None = None,
-    colors: Tensor | NDArray[np.generic] | None = None,
     residual_rms: Tensor | NDArray[np.floating] | None = None,
+    colors: Tensor | NDArray[np.generic] | None = None,
+    max_color_distance: float = math.inf,
+    signed_normals: bool = False,
     canonical: bool = False,
     chunk_size: int = CHUNK_SIZE,
 ) -> Tensor:
@@ -66,16 +68,20 @@ def grow_regions(
 
     Args:
         points: Finite points, shape ``(N, 3)``.
-        normals: Unit normals, shape ``(N, 3)``; their sign only matters for ``signed_normals``.
+        normals: Unit normals, shape ``(N, 3)``; their sign only matters with ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
         config: Settings. Default: the paper's.
         valid: Points that have a normal, shape ``(N,)``, bool; the others join no region, and no
             region passes through them. Default: all. Points whose normal or curvature is not
             finite never join.
-        colors: Colours of the points, shape ``(N, C)``, for ``max_color_distance``.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
             :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
+        colors: Colours of the points, shape ``(N, C)``. Default: they play no part.
+        max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
+            unit of the colours) does not join.
+        signed_normals: Whether opposite normals differ by 180 degrees instead of 0, so that the two
+            faces of a thin wall never join. For normals that are oriented.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
 
@@ -85,7 +91,8 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If the settings ask for colours or residuals, and there are none.
+        ConfigError: If the settings ask for residuals, and there are none, or
+            ``max_color_distance`` is given without colours, or negative.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -99,31 +106,38 @@ def grow_regions(
         tensor([0])
     """
     config = GrowingConfig() if config is None else config
-    cloud = checked_cloud(
-        config, points, normals, curvature, neighbors, valid, colors, residual_rms
-    )
+    cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
+    cloud = cloud._replace(signed_normals=signed_normals)
+    if colors is not None:
+        cloud = _with_colors(cloud, colors, max_color_distance)
+    elif max_color_distance < math.inf:
+        raise ConfigError(
+            "grow_regions: expected colors, which max_color_distance needs, got None; pass them or "
+            "leave max_color_distance out."
+        )
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    heads = torch.from_numpy(grow(cloud, config, chunk_size)).to(cloud.points.device)
-    labels = settle_regions(cloud, heads, config, chunk_size)
+    roots = torch.from_numpy(grow(cloud, config, chunk_size)).to(cloud.points.device)
+    labels = label_regions(cloud, roots, config, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 
-def settle_regions(
-    cloud: GrowingCloud, heads: Tensor, config: GrowingConfig, chunk_size: int
+def label_regions(
+    cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
     """Return labels of regions that have grown, after all that the settings ask for.
 
-    ``heads`` ``(N,)`` tell the regions apart, as :func:`number_by_size` reads them.
+    ``roots`` ``(N,)`` are what :func:`grow` gives. This step looks at the whole cloud: regions have
+    no bounded reach.
     """
     least = config.min_size
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
         least = min(least, max(least // 2, LEAST_FITTED))
-    labels = number_by_size(heads, least)
+    labels = number_by_size(roots, least)
     if config.cut_bridges and bool((labels >= 0).any()):
 
         def grow_within(part: GrowingCloud, share: float) -> Tensor:
@@ -145,7 +159,6 @@ def checked_cloud(
     curvature: Tensor | NDArray[np.floating],
     neighbors: Neighbors,
     valid: Tensor | None,
-    colors: Tensor | NDArray[np.generic] | None,
     residual_rms: Tensor | NDArray[np.floating] | None,
 ) -> GrowingCloud:
     """Check what the user passed to :func:`grow_regions`, in the order it came in."""
@@ -154,7 +167,6 @@ def checked_cloud(
     normals = as_tensor(caller, "normals", normals).detach()
     curvature = as_tensor(caller, "curvature", curvature).detach()
     valid = None if valid is None else as_tensor(caller, "valid", valid)
-    colors = None if colors is None else as_tensor(caller, "colors", colors)
     check_shapes(
         caller,
         points=(points, "N 3"),
@@ -163,7 +175,6 @@ def checked_cloud(
         neighbors=(neighbors.indices, "N K"),
         neighbors_valid=(neighbors.valid, "N K"),
         valid=(valid, "N"),
-        colors=(colors, "N C"),
     )
     check_floating(caller, points=points, normals=normals, curvature=curvature)
     if valid is not None and valid.dtype != torch.bool:
@@ -172,11 +183,6 @@ def checked_cloud(
         raise ShapeError(
             f"{caller}: expected points and neighbors on one device, got {points.device} and "
             f"{neighbors.indices.device}."
-        )
-    if config.max_color_distance is not None and colors is None:
-        raise ConfigError(
-            f"{caller}: expected colors, which max_color_distance needs, got None; pass them or "
-            "set max_color_distance to None."
         )
     reach = None
     if config.plane_reach is not None:
@@ -193,27 +199,37 @@ def checked_cloud(
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
-    colors = None if colors is None else by_column(colors.to(points.dtype))
-    return GrowingCloud(
-        by_column(points), by_column(normals), curvature, neighbors, valid, colors, reach
-    )
+    columns = by_column(points), by_column(normals)
+    return GrowingCloud(*columns, curvature, neighbors, valid, reach)
+
+
+def _with_colors(
+    cloud: GrowingCloud, colors: Tensor | NDArray[np.generic], max_distance: float
+) -> GrowingCloud:
+    """Return the cloud with colours, and how much they may differ."""
+    colors = as_tensor("grow_regions", "colors", colors)
+    check_shapes("grow_regions", points=(cloud.points, "N 3"), colors=(colors, "N C"))
+    if not max_distance >= 0:
+        raise ConfigError(f"grow_regions: expected max_color_distance >= 0, got {max_distance!r}.")
+    colors = by_column(colors.to(cloud.points.dtype))
+    return cloud._replace(colors=colors, max_color_distance=max_distance)
 
 
 def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
     """Return the cloud, and the rows its neighbours name, in an order ``(N,)`` of old rows."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    indices = cloud.neighbors.indices[order]
-    indices = row_of.index_select(0, indices.reshape(-1)).view(indices.shape)
     mask = cloud.neighbors.valid
-    return GrowingCloud(
-        by_column(cloud.points[order]),
-        by_column(cloud.normals[order]),
-        cloud.curvature[order],
-        Neighbors(indices, None if mask is None else mask[order]),
-        cloud.valid[order],
-        None if cloud.colors is None else by_column(cloud.colors[order]),
-        None if cloud.reach is None else cloud.reach[order],
+    return cloud._replace(
+        points=by_column(cloud.points[order]),
+        normals=by_column(cloud.normals[order]),
+        curvature=cloud.curvature[order],
+        neighbors=Neighbors(
+            cloud.neighbors.of(row_of, order), None if mask is None else mask[order]
+        ),
+        valid=cloud.valid[order],
+        reach=None if cloud.reach is None else cloud.reach[order],
+        colors=None if cloud.colors is None else by_column(cloud.colors[order]),
     )
 
 
@@ -236,16 +252,16 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     ``regions`` ``(N,)`` holds any number below N that is the same in a region and another
     elsewhere, -1 for none. Regions smaller than ``min_size`` become :data:`torchrg.UNLABELED`.
     """
-    heads = regions.cpu().numpy()
-    sizes = np.bincount(heads[heads >= 0], minlength=len(heads))
+    old = regions.cpu().numpy()
+    sizes = np.bincount(old[old >= 0], minlength=len(old))
     kept = np.flatnonzero(sizes >= max(min_size, 1))
     sizes = sizes[kept]
-    # The last entry is what a head of -1 finds.
-    numbers = np.full(len(heads) + 1, UNLABELED, dtype=np.int32)
+    # The last entry is what -1 finds.
+    numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
     numbers[kept] = np.arange(len(kept))
-    found = numbers[heads]
-    firsts = np.full(len(kept) + 1, len(heads))
-    for rows in reversed(chunks_of(len(heads), ROWS_AT_ONCE)):
+    found = numbers[old]
+    firsts = np.full(len(kept) + 1, len(old))
+    for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
         firsts[found[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
     order = np.lexsort((firsts[:-1], -sizes))
     ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
@@ -266,25 +282,33 @@ class GrowthOrder(NamedTuple):
     num_seeds: int
     limit: Tensor
 
+    @property
+    def seeds(self) -> NDArray[np.int32]:
+        """The points of at most the curvature limit."""
+        return self.rows[: self.num_seeds]
+
 
 class GrowthEdges(NamedTuple):
     """What regions grow along from some points.
 
     Attributes:
-        coded: Edges as :func:`find_coded_edges` gives them; where points spread by what they are,
-            those of the others.
-        spreading: Edges of the points that spread by what they are, None where that is a matter of
-            the edge that claims a point.
+        coded: Edges as :func:`find_coded_edges` gives them, of all points or of those that are no
+            seeds.
+        of_seeds: Edges of the points of at most the curvature limit, where such a point is a seed
+            whoever claimed it; None where that is a matter of the edge.
         claims: Neighbours that a point merely claims, shape ``(N, K)``, with late promotion.
     """
 
     coded: EdgeLists
-    spreading: EdgeLists | None = None
+    of_seeds: EdgeLists | None = None
     claims: NDArray[np.bool_] | None = None
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
-    """Return the head of each point's region."""
+    """Return the root of each point's region, by whichever way the settings allow.
+
+    The root of a region is the point it began with. Of a point that is not valid it is -1.
+    """
     order = growth_order(cloud.curvature, cloud.valid, config)
     edges = find_growth_edges(cloud, config, order, chunk_size=chunk_size)
     return grow_along(edges, order, cloud.neighbors.indices.cpu().numpy(), config)
@@ -293,22 +317,27 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray
 def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> GrowthOrder:
     """Return the order in which regions begin at valid points ``(N,)``."""
     rows = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
-    some = curvature[valid]
-    limit = curvature_limit(some, config.curvature_quantile)
+    growing = curvature[valid]
+    limit = curvature_limit(growing, config.curvature_quantile)
     rows = rows[valid.cpu().numpy()[rows]]
-    return GrowthOrder(rows, int(torch.count_nonzero(some <= limit)), limit)
+    return GrowthOrder(rows, int(torch.count_nonzero(growing <= limit)), limit)
 
 
 def find_growth_edges(
-    cloud: GrowingCloud, config: GrowingConfig, order: GrowthOrder, *, chunk_size: int
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    order: GrowthOrder,
+    *,
+    chunk_size: int,
+    whole: bool = True,
 ) -> GrowthEdges:
-    """Return the edges that regions grow along, with room for the seeds."""
+    """Return the edges that regions grow along; of a whole cloud with the chain of its seeds."""
     if not config.is_order_free:
         coded, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
         return GrowthEdges(coded, claims=claims)
-    spare = 2 * order.num_seeds
-    spreading, coded = find_edges(cloud, config, order.limit, spare=spare, chunk_size=chunk_size)
-    return GrowthEdges(coded, spreading)
+    chain = chain_of(order.seeds, len(cloud.points)) if whole else None
+    edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, more=chain)
+    return GrowthEdges(others, edges)
 
 
 def grow_along(
@@ -318,25 +347,26 @@ def grow_along(
     config: GrowingConfig,
     reach: Callable[[NDArray[np.int32]], NDArray[np.int32]] | None = None,
 ) -> NDArray[np.int32]:
-    """Return the head of each point's region.
+    """Return the root of each point's region.
 
     ``lists`` ``(N, K)`` are the neighbours of the points. ``reach`` tells which of the seeds
-    reaches each point first, where the edges that spread are elsewhere.
+    reaches each point first, where the edges of seeds are elsewhere.
     """
     num_points, k = lists.shape
-    if reach is None and edges.spreading is not None:
-        reach = partial(first_to_reach, edges.spreading, num_points=num_points)
-    if reach is None:
+    if reach is not None:
+        roots = reach(order.seeds)
+    elif edges.of_seeds is not None:
+        roots = first_to_reach(edges.of_seeds, num_points)
+    else:
         valid = np.zeros(num_points, dtype=bool)
         valid[order.rows] = True
         return grow_first_in_first_out(edges.coded, order.rows, valid, edges.claims, lists)
-    heads = reach(order.rows[: order.num_seeds])
     if config.min_size > k:
-        return heads
-    # Points that no seed reaches may make regions with neighbours of their own.
-    free = heads < 0
+        return roots
+    # Points that no seed reaches may make regions with free neighbours of their own.
+    free = roots < 0
     left = grow_first_in_first_out(edges.coded, order.rows[free[order.rows]], free)
-    return np.where(free, left, heads)
+    return np.where(free, left, roots)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
@@ -346,40 +376,41 @@ def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
 
 
-def first_to_reach(
-    edges: EdgeLists, seeds: NDArray[np.int32], num_points: int
-) -> NDArray[np.int32]:
+def chain_of(seeds: NDArray[np.int32], num_points: int) -> EdgeLists:
+    """Return the edges of a chain of nodes behind those of a graph of so many points.
+
+    Each node leads to one of the seeds, then to the next node.
+    """
+    targets = np.empty(max(2 * len(seeds) - 1, 0), dtype=np.int32)
+    targets[::2] = seeds
+    targets[1::2] = np.arange(num_points + 1, num_points + len(seeds))
+    starts = np.minimum(2 * np.arange(len(seeds) + 1, dtype=np.int32), len(targets))
+    return EdgeLists(starts, targets)
+
+
+def first_to_reach(edges: EdgeLists, num_points: int) -> NDArray[np.int32]:
     """Return for each point the first of the seeds that reaches it along edges, -1 for none.
 
     This is what growing one region after the other, from each seed that is still free, comes to,
-    if every point spreads alike whoever claimed it: the first seed that reaches a point finds all
-    of its way free. One depth-first search does it, through a chain of extra nodes that each lead
-    to one seed and then to the next node; its edges are written into the room behind the others.
+    if it does not matter for what a point reaches who claimed it: the first seed that reaches a
+    point finds all of its way free. One depth-first search does it: behind the edges of the points
+    are those of the :func:`chain_of` the seeds, where it begins.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import depth_first_order
 
-    heads = np.full(num_points, -1, dtype=np.int32)
-    if len(seeds) == 0:
-        return heads
-    num_nodes = num_points + len(seeds)
-    num_edges = int(edges.starts[-1])
-    total = num_edges + 2 * len(seeds) - 1
-    edges.targets[num_edges:total:2] = seeds
-    edges.targets[num_edges + 1 : total : 2] = np.arange(num_points + 1, num_nodes)
-    ends = num_edges + 2 * np.arange(1, len(seeds) + 1, dtype=edges.starts.dtype)
-    ends[-1] = total
+    roots = np.full(num_points, -1, dtype=np.int32)
+    num_nodes = len(edges.starts) - 1
+    if num_nodes == num_points:
+        return roots
     # The search reads no weights; an array of one repeated value takes no memory.
-    weights = np.broadcast_to(np.float64(1), total)
-    graph = csr_array(
-        (weights, edges.targets[:total], np.concatenate([edges.starts, ends])),
-        shape=(num_nodes, num_nodes),
-    )
+    weights = np.broadcast_to(np.float64(1), len(edges.targets))
+    graph = csr_array((weights, edges.targets, edges.starts), shape=(num_nodes, num_nodes))
     visited, parents = depth_first_order(graph, num_points, directed=True)
     visited = visited[visited < num_points]
-    is_head = parents[visited] >= num_points
-    heads[visited] = visited[is_head][np.cumsum(is_head) - 1]
-    return heads
+    is_root = parents[visited] >= num_points
+    roots[visited] = visited[is_root][np.cumsum(is_root) - 1]
+    return roots
 
 
 def grow_first_in_first_out(
@@ -398,24 +429,24 @@ def grow_first_in_first_out(
     the order of the queue does not matter: all edges given make seeds, and those ``neighbors``
     ``(N, K)`` that the seeds of a region merely ``claim`` join when the seeds are all known.
 
-    Long queues are taken a level at a time: all edges of the waiting seeds in their order. This is
-    the order of the queue, exactly.
+    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue.
+    This claims exactly what one seed after the other does.
 
-    Returns the head of each point's region, -1 where not valid.
+    Returns the root of each point's region, -1 where not valid.
     """
     all_codes, starts = edges.targets, memoryview(edges.starts.data)
     free = bytearray(valid.tobytes())
-    heads = array("i", bytes(4 * len(valid)))
+    roots = array("i", bytes(4 * len(valid)))
     free_view = np.frombuffer(free, dtype=np.bool_)
-    heads_view = np.frombuffer(heads, dtype=np.int32)
-    heads_view[:] = -1
+    roots_view = np.frombuffer(roots, dtype=np.int32)
+    roots_view[:] = -1
     slots = np.empty(len(valid), dtype=np.int32)
-    for head in _still_free(order, free_view):
-        if not free[head]:
+    for root in _still_free(order, free_view):
+        if not free[root]:
             continue
-        free[head] = False
-        heads[head] = head
-        seeds = array("i", [head])
+        free[root] = False
+        roots[root] = root
+        seeds = array("i", [root])
         done = 0
         while done < len(seeds):
             if len(seeds) - done >= _LONG_QUEUE:
@@ -424,7 +455,7 @@ def grow_first_in_first_out(
                 done = len(seeds)
                 targets = codes >> 1
                 free_view[targets] = False
-                heads_view[targets] = head
+                roots_view[targets] = root
                 seeds.frombytes(targets[(codes & 1).astype(bool)].tobytes())
                 continue
             seed = seeds[done]
@@ -433,7 +464,7 @@ def grow_first_in_first_out(
                 target = code >> 1
                 if free[target]:
                     free[target] = False
-                    heads[target] = head
+                    roots[target] = root
                     if code & 1:
                         seeds.append(target)
         if claims is not None and neighbors is not None:
@@ -442,8 +473,8 @@ def grow_first_in_first_out(
                 claimed = neighbors[some][claims[some]]
                 claimed = claimed[free_view[claimed]]
                 free_view[claimed] = False
-                heads_view[claimed] = head
-    return heads_view
+                roots_view[claimed] = root
+    return roots_view
 
 
 def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
