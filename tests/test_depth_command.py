@@ -187,7 +187,7 @@ def test_what_a_killed_process_was_writing_goes_and_nothing_else(tmp_path):
     theirs = (".1.0123abcd.png", ".1.0123456789abcdef01234567.png", "1.png", "1_planes.png")
     for name in (*theirs, f".1.{frame.mark}01234567.png", f".1_planes.{frame.mark}01234567.png"):
         (tmp_path / name).touch()
-    frame.remove_leftovers()
+    frame.clean()
     assert sorted(contents(tmp_path)) == sorted(theirs)
 
 

@@ -9,7 +9,7 @@ LAYERS = [
     {"linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},
-    {"pipeline", "tiling"},
+    {"store", "stages", "pipeline"},
     {"depth", "nn"},
     {"transforms"},
     {"datasets"},

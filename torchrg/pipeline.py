@@ -17,6 +17,10 @@ from torchrg.stages import Store
 from torchrg.store import MemoryStore
 from torchrg.structures import UNLABELED, Cloud, Segmentation, Superpoints
 
+BYTES_PER_POINT = 1_100
+"""Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
+that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
+
 
 @sequential_operations()
 def segment_planes(

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError
+from torchrg.io.files import check_space
 from torchrg.neighbors import (
     canonical_order,
     finite_rows,
@@ -49,6 +50,15 @@ from torchrg.store import FolderStore, MemoryStore, Written
 from torchrg.structures import UNLABELED, Neighbors, PlaneAdjacency, Segmentation
 
 Store = MemoryStore | FolderStore
+
+BYTES_PER_TILE_POINT = 2_000
+"""Memory that a tile takes for each of its own points, with those around it."""
+BYTES_PER_POINT = 100
+"""Memory that the stages on the whole cloud take for each of its points: the regions of
+``consensus``, or the table of planes, 55, with 150 for each point of the largest region, which may
+be a third of all."""
+BYTES_AT_ONCE, POINTS_AT_ONCE = 250, 1_500_000
+"""Memory beside that for each point up to so many: regions that are measured together."""
 
 _ROW_BYTES = 150
 """Of a point on disk beside its neighbours and edges: coordinates, normals, results."""
@@ -85,7 +95,7 @@ def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> No
     bounds = [0, num_points]
     if isinstance(store, FolderStore):
         edge_bytes = 0 if config.growing.is_order_free else 5 * k
-        store.check_space(num_points * (_ROW_BYTES + 4 * k + edge_bytes))
+        check_space(store.folder, num_points * (_ROW_BYTES + 4 * k + edge_bytes), "the work")
     store.save("rows", rows)
     store.save("cloud", points[rows])
     if isinstance(store, FolderStore):

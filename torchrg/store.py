@@ -10,12 +10,10 @@ work has made is ever written over or removed, and a step of which the disk has 
 again. The arrays themselves are never flushed, which would take several times as long.
 """
 
-import errno
 import io
 import itertools
 import json
 import os
-import shutil
 import stat
 import weakref
 import zlib
@@ -32,7 +30,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.files import DAMAGES, refusing, sync_folder
+from torchrg.io.files import DAMAGES, is_disk_full, refusing, sync_folder
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, origin_of_box
 
 TILE_SIZE = 300_000
@@ -490,15 +488,6 @@ class FolderStore:
         # What the record no longer knows must not come back with the power.
         sync_folder(self.folder)
 
-    def check_space(self, needed: int) -> None:
-        """Raise FormatError if the disk has not so many bytes free."""
-        free = shutil.disk_usage(self.folder).free
-        if needed > free:
-            raise FormatError(
-                f"{self.folder}: expected {needed / 1e6:,.1f} MB of free disk for the work, got "
-                f"{free / 1e6:,.1f} MB; make room or choose another directory."
-            )
-
 
 def make_folder(folder: Path) -> None:
     """Make a folder for work; one that exists has to hold work, or nothing but hidden files.
@@ -537,8 +526,8 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        repair = "; make room and run the same again, it goes on from here" if full else ""
+        again = "; make room and run the same again, it goes on from here"
+        repair = again if is_disk_full(error) else ""
         raise FormatError(f"{path}: cannot be written: {error.strerror}{repair}.") from error
 
 

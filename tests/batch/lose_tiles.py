@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrg.batch.ray_tasks import run_ray
-from torchrg.batch.tiles import segmented_in_tiles, work_on_tile
+from torchrg.batch.tiles import segmented_in_tiles
 from torchrg.config import load_config
 from torchrg.structures import Cloud
 
@@ -35,7 +35,7 @@ def main(source, result):
         result.with_suffix(".work"),
         load_config("paper"),
         tile_size=1500,
-        start=partial(run_ray, memory_limit=10**10, address=cluster.address, work=work_on_tile),
+        start=partial(run_ray, memory_limit=10**10, address=cluster.address),
         on_stage=lose,
     ) as seg:
         np.savez(result, labels=seg.labels, normals=seg.normals)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from torchrg.batch.convert import ScanReport
-from torchrg.batch.report import BatchReport, format_report
-from torchrg.batch.run import DirectoryLock
+from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.report import BatchReport
+from torchrg.batch.task import TaskReport
 from torchrg.cli import main
-from torchrg.cli.convert import _Progress
+from torchrg.cli.convert import _Progress, format_report
 from torchrg.config import load_config
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
@@ -108,7 +108,7 @@ def test_a_dry_run_writes_nothing(rooms, tmp_path, capsys):
 
 
 def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("torchrg.batch.run.DirectoryLock.__init__.__kwdefaults__", {"patience": 0})
+    monkeypatch.setattr("torchrg.batch.lock.DirectoryLock.__init__.__kwdefaults__", {"patience": 0})
     with DirectoryLock(tmp_path):
         assert convert("folder", rooms, tmp_path) == 2
     assert "another torchrg command (process" in capsys.readouterr().err
@@ -159,7 +159,7 @@ def test_progress_is_scans_points_a_second_and_time_left():
     with tqdm(total=1000, unit="pt", file=shown, ncols=80) as bar:
         progress = _Progress(bar, {"900_a": 900, "100_b": 100}, unit="scan")
         progress(None)
-        progress(ScanReport("900_a", "failed"))
+        progress(TaskReport("900_a", "failed"))
         bar.refresh()
     last = shown.getvalue().splitlines()[-1]
     assert "1/2 scans, 1 failed:  90%" in last
@@ -178,11 +178,11 @@ def test_depth_frames_are_counted_by_the_second():
     shown = io.StringIO()
     with tqdm(total=2, unit="frame", file=shown, ncols=80) as bar:
         progress = _Progress(bar, {"a": 1, "b": 1}, unit="frame")
-        progress(ScanReport("a", "converted"))
+        progress(TaskReport("a", "converted"))
         bar.refresh()
     assert "1/2 frames:  50%" in shown.getvalue()
     assert "frame/s]" in shown.getvalue()
-    scans = (ScanReport("a", "converted", num_points=640), ScanReport("b", "failed"))
+    scans = (TaskReport("a", "converted", num_points=640), TaskReport("b", "failed"))
     report = BatchReport(scans, started=0.0, seconds=4.0, engine="local", workers=1)
     assert "640 points in 4.0 s: 160 points, 0.25 frames a second" in format_report(
         report, unit="frame"

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from torchrg.batch.run import DirectoryLock
+from torchrg.batch.lock import DirectoryLock
 from torchrg.errors import FormatError
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from torchrg.batch.run import DirectoryLock
+from torchrg.batch.lock import DirectoryLock
 with DirectoryLock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
@@ -70,7 +70,7 @@ sys.path.insert(0, {str(Path(faults.__file__).parent)!r})
 import faults
 from pathlib import Path
 from torchrg.batch.local import run_local
-from torchrg.batch.run import DirectoryLock
+from torchrg.batch.lock import DirectoryLock
 if __name__ == "__main__":
     place = Path(sys.argv[1])
     jobs = faults.make_jobs(place, {{"1_a": "slow writing"}})

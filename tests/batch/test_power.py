@@ -11,7 +11,8 @@ import pytest
 
 from tests.batch.power import Disk, PowerCutError
 from torchrg.batch.convert import convert_scan
-from torchrg.batch.run import DirectoryLock, list_jobs, make_plan
+from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.run import list_jobs, make_plan
 from torchrg.batch.sources import FolderSource
 from torchrg.batch.tiles import folder_of_work, segmented_in_tiles
 from torchrg.config import load_config

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.batch.run import DirectoryLock
+from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.tiles import (
     choose_tile_size,
     choose_workers,

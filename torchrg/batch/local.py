@@ -3,21 +3,17 @@
 import contextlib
 import os
 import signal
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
-from typing import Any
 
-from torchrg.batch.convert import ScanReport, convert_scan
-from torchrg.batch.memory import memory_of_scan
-from torchrg.batch.run import DirectoryLock
-from torchrg.batch.scans import Task
+from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.memory import spare_memory
+from torchrg.batch.task import Reports, Task, TaskReport
 
-Work = Callable[[Any], ScanReport]
-"""What is done with a task."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
 )
@@ -25,54 +21,65 @@ ONE_THREAD = dict.fromkeys(
 BEAT_SECONDS = 0.5
 
 
+def run_here(tasks: Sequence[Task]) -> Reports:
+    """Run tasks one after the other in this process, on its threads; yield a report of each.
+
+    While one runs, the system is asked to read the files of the next one.
+    """
+    for number, task in enumerate(tasks):
+        for following in tasks[number + 1 : number + 2]:
+            read_ahead(following.inputs)
+        yield task.run()
+
+
 def run_local(
-    jobs: Sequence[Task],
+    tasks: Sequence[Task],
     *,
     workers: int,
-    memory_limit: int,
+    memory_limit: int | None = None,
     lock: DirectoryLock | None = None,
-    work: Work = convert_scan,
-) -> Generator[ScanReport | None, None, None]:
-    """Convert scans in processes of this machine, the largest first.
+) -> Reports:
+    """Run tasks in processes of this machine, those that take most memory first.
 
-    A scan starts when a worker is free and the estimates of all that run stay within the limit; one
-    that is larger than the limit runs alone. When a worker dies, its scan waits until all others
-    are done and is tried once more, alone. Workers end with this process, however it ends. While
-    scans are converted, the system is asked to read the files of the next ones.
+    A task starts when a worker is free and all that run stay within the limit; one that takes more
+    than the limit runs alone. When a worker dies, its task waits until all others are done and is
+    tried once more, alone. Workers end with this process, however it ends. While tasks run, the
+    system is asked to read the files of the next ones.
 
     Args:
-        jobs: The scans.
+        tasks: The tasks.
         workers: Most processes at a time.
-        memory_limit: Bytes that the scans that run may take together, by
-            :func:`torchrg.batch.memory.memory_of_scan`.
+        memory_limit: Bytes that the tasks that run may take together. Default: a share of what is
+            free, see :func:`torchrg.batch.memory.spare_memory`.
         lock: A lock for the workers to hold as long as they live.
-        work: What to do with a job; importable by name.
 
     Yields:
-        A report of each scan when it ends, and None while there is none, so that progress can be
+        A report of each task when it ends, and None while there is none, so that progress can be
         shown. Closing the iterator stops the workers.
     """
-    waiting = sorted(jobs, key=lambda job: -job.scan.num_points)
+    limit = spare_memory() if memory_limit is None else memory_limit
+    waiting = sorted(tasks, key=lambda task: -task.memory)
     lost: list[Task] = []
     idle: list[_Worker] = []
     busy: dict[Connection, _Worker] = {}
 
-    def start(job: Task, *, attempt: int) -> None:
-        worker = idle.pop() if idle else _Worker(work, lock)
+    def start(task: Task, *, attempt: int) -> None:
+        worker = idle.pop() if idle else _Worker(lock)
         busy[worker.pipe] = worker
-        worker.begin(job, attempt=attempt)
+        worker.begin(task, attempt=attempt)
 
     try:
         while waiting or lost or busy:
             while len(busy) < workers:
-                running = [worker.job for worker in busy.values()]
-                job = _next_that_fits(waiting, running, memory_limit)
-                if job is None:
+                free = limit - sum(worker.task.memory for worker in busy.values())
+                fitting = (task for task in waiting if task.memory <= free or not busy)
+                task = next(fitting, None)
+                if task is None:
                     break
-                waiting.remove(job)
-                start(job, attempt=1)
+                waiting.remove(task)
+                start(task, attempt=1)
                 for following in waiting[workers - 1 : workers]:
-                    read_ahead(following.scan.inputs)
+                    read_ahead(following.inputs)
             if not busy:
                 start(lost.pop(0), attempt=2)
             ready = connection.wait(busy, timeout=BEAT_SECONDS)
@@ -85,20 +92,12 @@ def run_local(
                     idle.append(worker)
                     yield report
                 elif worker.attempt == 1:
-                    lost.append(worker.job)
+                    lost.append(worker.task)
                 else:
                     yield worker.death_report()
     finally:
         for worker in [*idle, *busy.values()]:
             worker.stop()
-
-
-def _next_that_fits(waiting: Sequence[Task], running: Sequence[Task], limit: int) -> Task | None:
-    """Return the first scan for which there is memory; any if nothing runs."""
-    if not running:
-        return next(iter(waiting), None)
-    free = limit - sum(memory_of_scan(job.scan.num_points) for job in running)
-    return next((job for job in waiting if memory_of_scan(job.scan.num_points) <= free), None)
 
 
 def read_ahead(files: Sequence[Path]) -> None:
@@ -112,41 +111,41 @@ def read_ahead(files: Sequence[Path]) -> None:
 
 
 class _Worker:
-    """A process that converts one scan after another, and the pipe to it."""
+    """A process that runs one task after another, and the pipe to it."""
 
-    job: Task
+    task: Task
     attempt: int
 
-    def __init__(self, work: Work, lock: DirectoryLock | None) -> None:
+    def __init__(self, lock: DirectoryLock | None) -> None:
         context = get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, work, lock))
+        self.process = context.Process(target=_serve, args=(theirs, lock))
         with _one_thread(), _no_interrupts():
             self.process.start()
         theirs.close()
 
-    def begin(self, job: Task, *, attempt: int) -> None:
-        """Hand over a scan."""
-        self.job, self.attempt = job, attempt
+    def begin(self, task: Task, *, attempt: int) -> None:
+        """Hand over a task."""
+        self.task, self.attempt = task, attempt
         # A worker that is dead already is noticed when its answer is collected.
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.pipe.send(job)
+            self.pipe.send(task)
 
-    def collect(self) -> ScanReport | None:
+    def collect(self) -> TaskReport | None:
         """Return the report that is ready, or None if the process died instead."""
         try:
-            report: ScanReport = self.pipe.recv()
+            report: TaskReport = self.pipe.recv()
         except (EOFError, OSError):
             self.stop()
             return None
         return replace(report, attempts=self.attempt)
 
-    def death_report(self) -> ScanReport:
-        """Return the report of a scan whose worker died."""
+    def death_report(self) -> TaskReport:
+        """Return the report of a task whose worker died."""
         code = self.process.exitcode or 0
         end = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-        return ScanReport(
-            self.job.scan.name,
+        return TaskReport(
+            self.task.name,
             "failed",
             reason=f"its process {end}, twice, the second time alone; is the memory enough?",
             attempts=self.attempt,
@@ -160,22 +159,22 @@ class _Worker:
             self.process.kill()
             self.process.join()
         self.pipe.close()
-        if hasattr(self, "job"):
-            self.job.remove_leftovers()
+        if hasattr(self, "task"):
+            self.task.clean()
 
 
-def _serve(pipe: Connection, work: Work, lock: DirectoryLock | None) -> None:
-    """Convert scans until the pipe closes; the lock is held by being here."""
+def _serve(pipe: Connection, lock: DirectoryLock | None) -> None:
+    """Run tasks until the pipe closes; the lock is held by being here."""
     import torch
 
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     while True:
         try:
-            job = pipe.recv()
+            task = pipe.recv()
         except EOFError:
             return
-        pipe.send(work(job))
+        pipe.send(task.run())
 
 
 def _end_with_parent() -> None:

@@ -1,30 +1,57 @@
-"""How much memory a scan takes, and how much there is."""
+"""How much memory a scan or a tile takes, and how much there is."""
 
 import os
 from pathlib import Path
 
-_BASE_BYTES = 500_000_000
-"""What a worker takes before the first point: Python, torch, scipy."""
-SCAN_BYTES_PER_POINT = 1_100
-"""What each point adds at the peak."""
+from torchrg import stages
+from torchrg.pipeline import BYTES_PER_POINT
+
+PROCESS_BYTES = 500_000_000
+"""What a process takes before the first point: Python, torch, scipy."""
 _CGROUP = Path("/sys/fs/cgroup")
 _CGROUP_FILES = (
     ("memory.max", "memory.current"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
 )
 """Limit and use of a control group, of versions 2 and 1."""
-SHARE = 0.8
-"""Part of the available memory that a batch may take when no limit is given."""
+_SHARE = 0.8
+"""The rest is for the process that starts the others, and for what else the machine does."""
 
 
 def memory_of_scan(num_points: int) -> int:
-    """Return the memory that a worker needs for a scan, in bytes.
+    """Return the memory that a process needs for a cloud or a depth image at once, in bytes.
 
     Example:
         >>> memory_of_scan(1_000_000)
         1600000000
     """
-    return _BASE_BYTES + SCAN_BYTES_PER_POINT * num_points
+    return PROCESS_BYTES + BYTES_PER_POINT * num_points
+
+
+def memory_of_tile(num_points: int) -> int:
+    """Return the memory that a process needs for a tile of so many points of its own, in bytes.
+
+    Example:
+        >>> memory_of_tile(300_000)
+        1100000000
+    """
+    return PROCESS_BYTES + stages.BYTES_PER_TILE_POINT * num_points
+
+
+def memory_between_tiles(num_points: int) -> int:
+    """Return the memory for the stages on a whole cloud whose other stages run in tiles, in bytes.
+
+    Example:
+        >>> memory_between_tiles(10_000_000)
+        1875000000
+    """
+    at_once = stages.BYTES_AT_ONCE * min(num_points, stages.POINTS_AT_ONCE)
+    return PROCESS_BYTES + stages.BYTES_PER_POINT * num_points + at_once
+
+
+def spare_memory() -> int:
+    """Return the bytes that a batch may take when no limit is given: a share of what is free."""
+    return int(_SHARE * available_memory())
 
 
 def available_memory() -> int:

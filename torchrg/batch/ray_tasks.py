@@ -1,43 +1,39 @@
-"""The Ray engine: each scan is a task, and what Ray knows about retries and nodes serves."""
+"""The Ray engine: what Ray knows about retries and nodes serves."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from torchrg._optional import require
-from torchrg.batch.convert import ScanReport, convert_scan
-from torchrg.batch.local import BEAT_SECONDS, ONE_THREAD, Work
-from torchrg.batch.memory import memory_of_scan
-from torchrg.batch.scans import Task
+from torchrg.batch.local import BEAT_SECONDS, ONE_THREAD
+from torchrg.batch.task import Reports, Task, TaskReport
 
 _RETRIES = 3
-"""How often Ray tries a scan again whose process or node was lost."""
+"""How often Ray tries a task again whose process or node was lost."""
 _OBJECT_STORE_BYTES = 100_000_000
-"""Only jobs and reports pass through Ray's object store, never points."""
+"""Only tasks and reports pass through Ray's object store, never points."""
 
 
 def run_ray(
-    jobs: Sequence[Task],
+    tasks: Sequence[Task],
     *,
     workers: int | None = None,
     memory_limit: int,
     address: str | None = None,
-    work: Work = convert_scan,
-) -> Generator[ScanReport | None, None, None]:
-    """Convert scans as Ray tasks, the largest first.
+) -> Reports:
+    """Run tasks on Ray, those that take most memory first.
 
-    Each task asks for one CPU and the memory that its scan is estimated to need, at most what the
-    largest node has, and Ray finds it a place. Inputs and outputs are files that every node sees
+    Each asks for one CPU and the memory that it takes, at most what the largest node has, and Ray
+    finds it a place. Inputs and outputs are files that every node sees
     under the same path, and torchrg is installed on each.
 
     Args:
-        jobs: The scans.
+        tasks: The tasks.
         workers: Most tasks at a time. Default: as many as Ray has places for.
         memory_limit: Memory of a cluster that is started here, in bytes.
         address: Cluster to use. Default: one is started here, and stopped at the end.
-        work: What to do with a job.
 
     Yields:
-        A report of each scan when it ends, and None while there is none. Closing the iterator
+        A report of each task when it ends, and None while there is none. Closing the iterator
         cancels the tasks.
 
     Raises:
@@ -62,13 +58,12 @@ def run_ray(
         largest = max(
             int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]
         )
-        convert = ray.remote(num_cpus=1, max_retries=_RETRIES)(_convert)
-        waiting = sorted(jobs, key=lambda job: job.scan.num_points)
+        run = ray.remote(num_cpus=1, max_retries=_RETRIES)(_run)
+        waiting = sorted(tasks, key=lambda task: task.memory)
         while waiting or pending:
             while waiting and (workers is None or len(pending) < workers):
-                job = waiting.pop()
-                memory = min(memory_of_scan(job.scan.num_points), largest)
-                pending[convert.options(memory=memory).remote(work, job)] = job
+                task = waiting.pop()
+                pending[run.options(memory=min(task.memory, largest)).remote(task)] = task
             ready, _ = ray.wait(list(pending), num_returns=1, timeout=BEAT_SECONDS)
             if not ready:
                 yield None
@@ -80,19 +75,19 @@ def run_ray(
         ray.shutdown()
 
 
-def _convert(work: Work, job: Task) -> ScanReport:
-    """Convert a scan in one thread."""
+def _run(task: Task) -> TaskReport:
+    """Run a task in one thread."""
     import torch
 
     torch.set_num_threads(1)
-    return work(job)
+    return task.run()
 
 
-def _collect(ray: Any, reference: Any, job: Task) -> ScanReport:  # noqa: ANN401
+def _collect(ray: Any, reference: Any, task: Task) -> TaskReport:  # noqa: ANN401
     """Return the report of a task, of its loss if Ray could not finish it."""
     try:
-        report: ScanReport = ray.get(reference)
+        report: TaskReport = ray.get(reference)
     except ray.exceptions.RayError as error:
         text = " ".join(str(error).split())
-        return ScanReport(job.scan.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
+        return TaskReport(task.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
     return report

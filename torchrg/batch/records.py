@@ -3,20 +3,35 @@
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import scipy
 import torch
 
-from torchrg.batch.scans import Converted, Job
+from torchrg.batch.task import Converted
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 
 RECORD = "provenance.json"
 """Written last beside the results of a scan, so that a scan without it is not done."""
+
+
+class Recorded(Protocol):
+    """What has a record: what decides its results, and where they are."""
+
+    @property
+    def record(self) -> Path:
+        """The file of the record."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return what decides the results; see :func:`describe_work`."""
+
+    def place_of(self, name: str) -> Path:
+        """Return the file of a result by its name in the record."""
 
 
 def describe_run(
@@ -52,28 +67,30 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def describe_job(job: Job) -> dict[str, Any]:
-    """Return what decides the results of a job, ready for JSON.
+def describe_work(
+    settings: Any,  # noqa: ANN401 - a dataclass of any kind
+    options: dict[str, Any],
+    inputs: Sequence[Path],
+    root: Path,
+) -> dict[str, Any]:
+    """Return what decides the results of some inputs below a folder, ready for JSON.
 
-    Versions, settings, source with its options, and name, size and SHA-256 of each input; raises
-    OSError if one cannot be read.
+    Versions, settings, options, and name, size and SHA-256 of each input; raises OSError if one
+    cannot be read.
     """
-    settings = dataclasses.asdict(job.source.settings)
+    config = dataclasses.asdict(settings)
     # It never changes a result, and lowering it after running out of memory must cost nothing.
-    settings.pop("chunk_size", None)
+    config.pop("chunk_size", None)
     return {
         "versions": describe_versions(),
-        "config": settings,
-        "source": job.source.describe(),
-        "inputs": [
-            {"name": _name_below(job.source.root, path), **_fingerprint(path)}
-            for path in job.scan.inputs
-        ],
+        "config": config,
+        "source": options,
+        "inputs": [{"name": _name_below(root, path), **_fingerprint(path)} for path in inputs],
         "device": "cpu",
     }
 
 
-def write_record(job: Job, description: dict[str, Any], converted: Converted) -> None:
+def write_record(job: Recorded, description: dict[str, Any], converted: Converted) -> None:
     """Write the record of a scan whose files are complete, with its description before the work."""
     record = {
         **description,
@@ -81,32 +98,31 @@ def write_record(job: Job, description: dict[str, Any], converted: Converted) ->
         "regions": converted.num_regions,
         "repairs": list(converted.repairs),
         "warnings": list(converted.warnings),
-        "outputs": {name: _fingerprint(job.folder / name) for name in converted.files},
+        "outputs": {name: _fingerprint(job.place_of(name)) for name in converted.files},
     }
-    with atomic_path(job.folder / RECORD) as beside:
+    with atomic_path(job.record) as beside:
         beside.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def read_record(job: Job) -> dict[str, Any] | None:
+def read_record(job: Recorded) -> dict[str, Any] | None:
     """Return the record of a scan, or None if there is none that can be read."""
     record = _read_json(job)
     return record if _is_record(record) else None
 
 
-def check_record(job: Job) -> None:
+def check_record(job: Recorded) -> None:
     """Raise FormatError if another program has a file in the place of the record."""
     other = _read_json(job)
     if other is not None and not _is_record(other):
         raise FormatError(
-            f"{job.folder / RECORD}: was not written by torchrg; move it away, or choose another "
-            "directory."
+            f"{job.record}: was not written by torchrg; move it away, or choose another directory."
         )
 
 
-def _read_json(job: Job) -> Any:  # noqa: ANN401
+def _read_json(job: Recorded) -> Any:  # noqa: ANN401
     """Return what is in the place of the record, None if it is not there or damaged."""
     try:
-        return json.loads((job.folder / RECORD).read_bytes())
+        return json.loads(job.record.read_bytes())
     except (OSError, ValueError):
         return None
 
@@ -117,14 +133,14 @@ def _is_record(found: Any) -> bool:  # noqa: ANN401
     return isinstance(found, dict) and all(isinstance(found.get(part), dict) for part in parts)
 
 
-def is_unchanged(job: Job, name: str, noted: Any) -> bool:  # noqa: ANN401
+def is_unchanged(job: Recorded, name: str, noted: Any) -> bool:  # noqa: ANN401
     """Return whether a file beside a record is still the one that the record notes."""
-    path = job.folder / name
-    is_result = path.parent == job.folder and path.is_file() and not path.is_symlink()
+    path = job.place_of(name)
+    is_result = path.parent == job.record.parent and path.is_file() and not path.is_symlink()
     return is_result and bool(_fingerprint(path) == noted)
 
 
-def reason_to_convert(job: Job) -> str:
+def reason_to_convert(job: Recorded) -> str:
     """Return why a scan is not done, or nothing if it is.
 
     ``"new"`` without a record; else which of input, settings, version or results is another than
@@ -134,7 +150,7 @@ def reason_to_convert(job: Job) -> str:
     if record is None:
         return "new"
     try:
-        description = json.loads(json.dumps(describe_job(job)))
+        description = json.loads(json.dumps(job.describe()))
     except OSError:
         return "input cannot be read"
     changes = {"versions": "version", "config": "settings", "source": "options", "inputs": "input"}
@@ -143,7 +159,7 @@ def reason_to_convert(job: Job) -> str:
             return f"{name} changed"
     for name, noted in record["outputs"].items():
         try:
-            if _fingerprint(job.folder / name) != noted:
+            if _fingerprint(job.place_of(name)) != noted:
                 return f"{name} changed"
         except OSError:
             return f"{name} missing"

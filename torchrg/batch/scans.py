@@ -1,17 +1,17 @@
-"""What a batch is made of: scans, where they come from, and the job that converts one."""
+"""What a batch is made of: scans, where they come from, and how their results are written."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg.batch.task import Converted
 from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_arrays
 from torchrg.errors import FormatError
 from torchrg.io import CloudStream
-from torchrg.io.files import make_mark, remove_leftovers
 from torchrg.io.stream import Extent
 from torchrg.structures import FARTHEST, Cloud, Segmentation
 
@@ -49,24 +49,6 @@ class Scan:
     item: Any = None
 
 
-class Converted(NamedTuple):
-    """What is known of a scan once its results are written; equal runs give equal values.
-
-    Attributes:
-        num_points: Number of points, those that are not finite included.
-        num_regions: Number of planes.
-        files: Names of the files written, in the scan's folder.
-        repairs: What was put right in the input, a line each.
-        warnings: What a user should know, a line each.
-    """
-
-    num_points: int
-    num_regions: int
-    files: tuple[str, ...]
-    repairs: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-
-
 class Source(Protocol):
     """A data set that can be converted: it lists its scans, and reads and writes one of them.
 
@@ -100,46 +82,6 @@ class Source(Protocol):
 
         The folder exists; ``begin`` is to be called with the name of each stage when it starts.
         """
-
-
-@dataclass(frozen=True)
-class Job:
-    """One scan to convert, with everything that a process on any machine needs for it.
-
-    Attributes:
-        source: The data set.
-        scan: One of its scans.
-        out: Where results go.
-        mark: Of the names that results are written under before they have their own; see
-            :func:`torchrg.io.files.marked_parts`. What a killed process leaves is removed by those
-            who know it.
-    """
-
-    source: Source
-    scan: Scan
-    out: Path
-    mark: str = field(default_factory=make_mark, compare=False)
-
-    @property
-    def folder(self) -> Path:
-        """Where the results of the scan go."""
-        return self.out / self.scan.name
-
-    def remove_leftovers(self) -> None:
-        """Remove what a process that was killed left half-written."""
-        if self.folder.is_dir():
-            remove_leftovers(self.folder, self.mark)
-
-
-class Task(Protocol):
-    """What an engine hands to a process: a scan, and what to remove if that process is killed."""
-
-    @property
-    def scan(self) -> Scan:
-        """The scan."""
-
-    def remove_leftovers(self) -> None:
-        """Remove what a process that was killed left half-written."""
 
 
 def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._optional import require
-from torchrg.batch.scans import Converted, Scan, check_finite, write_results
+from torchrg.batch.scans import Scan, check_finite, write_results
+from torchrg.batch.task import Converted
 from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,

@@ -3,38 +3,27 @@
 import contextlib
 import hashlib
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
-from torchrg.batch.convert import ScanReport, report_on
 from torchrg.batch.local import run_local
-from torchrg.batch.memory import SCAN_BYTES_PER_POINT
+from torchrg.batch.lock import LOCK, DirectoryLock
+from torchrg.batch.memory import PROCESS_BYTES, memory_between_tiles, memory_of_tile
 from torchrg.batch.records import describe_versions, hash_file
-from torchrg.batch.run import LOCK, DirectoryLock, Reports
-from torchrg.batch.scans import Converted, Scan
+from torchrg.batch.task import Converted, Reports, Task, TaskReport, report_on
 from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import marked_parts, remove_leftovers
 from torchrg.pipeline import segment_planes
-from torchrg.stages import TileTask
+from torchrg.stages import BYTES_PER_TILE_POINT, TileTask
 from torchrg.store import TILE_SIZE, FolderStore, Written, make_folder, run_in_turn
 from torchrg.structures import Cloud, Segmentation
 
-_BASE_BYTES = 500_000_000
-"""Of a process before the first point: Python, torch, scipy."""
-_BYTES_PER_POINT = 100
-"""What the steps on the whole cloud take for each of its points: the regions of ``consensus``, or
-the table of planes, 55, with 150 for each point of the largest region, up to a third of all."""
-_BYTES_AT_ONCE, _POINTS_AT_ONCE = 250, 1_500_000
-"""And for each point up to so many: regions that are measured together, and those pages of the
-neighbours' file that were just read."""
-_BYTES_PER_TILE_POINT = 2_000
-"""What a tile takes for each of its own, with those around it."""
 _SMALLEST_TILE = 20_000
 """Points. Smaller ones are mostly what is around them."""
 _LEAST_POINTS_A_WORKER = 2_000_000
@@ -52,15 +41,13 @@ def choose_tile_size(num_points: int, memory_limit: int) -> int:
         >>> choose_tile_size(100_000, 800_000_000)
         150000
     """
-    most = (memory_limit - _BASE_BYTES) // _BYTES_PER_TILE_POINT
-    whole = _BYTES_PER_POINT * num_points + _BYTES_AT_ONCE * min(num_points, _POINTS_AT_ONCE)
-    needed = _BASE_BYTES + max(whole, _BYTES_PER_TILE_POINT * _SMALLEST_TILE)
+    needed = max(memory_between_tiles(num_points), memory_of_tile(_SMALLEST_TILE))
     if needed > memory_limit:
         raise ConfigError(
             f"expected --limit-memory of at least {needed / 1e9:.2f} GB for about {num_points:,} "
             f"points, got {memory_limit / 1e9:.2f} GB; raise it, or split the cloud."
         )
-    return min(most, TILE_SIZE)
+    return min((memory_limit - PROCESS_BYTES) // BYTES_PER_TILE_POINT, TILE_SIZE)
 
 
 def choose_workers(num_points: int, tile_size: int, memory_limit: int) -> int:
@@ -72,7 +59,7 @@ def choose_workers(num_points: int, tile_size: int, memory_limit: int) -> int:
         >>> choose_workers(50_000, 20_000, 2**40)
         1
     """
-    room = (memory_limit - _BASE_BYTES) // (_BASE_BYTES + _BYTES_PER_TILE_POINT * tile_size)
+    room = (memory_limit - PROCESS_BYTES) // memory_of_tile(tile_size)
     return max(min(torch.get_num_threads(), room, num_points // _LEAST_POINTS_A_WORKER), 1)
 
 
@@ -103,7 +90,7 @@ def segmented_in_tiles(
     tile_size: int,
     target: Path | None = None,
     workers: int = 1,
-    start: Callable[[Sequence["TileJob"]], Reports] | None = None,
+    start: Callable[[Sequence[Task]], Reports] | None = None,
     on_stage: Callable[[str, int, int], None] | None = None,
     columns: str | None = None,
     voxel: float | None = None,
@@ -124,7 +111,7 @@ def segmented_in_tiles(
             it was killed is removed.
         workers: Processes of one thread that work on tiles side by side, as many as there is memory
             for; with one, this process works on tile after tile, on its threads.
-        start: Starts another engine on the jobs of a stage.
+        start: Starts another engine on the tasks of a stage.
         on_stage: See :class:`torchrg.store.FolderStore`.
         columns: Names that were given for the columns of the files.
         voxel: See :func:`torchrg.segment_planes`.
@@ -145,15 +132,13 @@ def segmented_in_tiles(
         if target is not None:
             remove_leftovers(target.resolve().parent, lock.mark)
         if start is None and workers > 1:
-            start = partial(
-                run_local, workers=workers, memory_limit=sys.maxsize, lock=lock, work=work_on_tile
-            )
+            start = partial(run_local, workers=workers, lock=lock)
         try:
             store = FolderStore(
                 folder,
                 {"inputs": inputs, "versions": describe_versions(), **named},
                 tile_size=tile_size,
-                run=run_in_turn if start is None else partial(_run_jobs, start=start),
+                run=run_in_turn if start is None else partial(_run_tiles, start=start),
                 on_progress=on_stage,
             )
             yield segment_planes(chunks, settings, voxel=voxel, store=store)
@@ -181,49 +166,52 @@ def _remove_work(folder: Path) -> None:
 
 
 @dataclass(frozen=True)
-class TileJob:
-    """The work on a tile, as engines take it."""
-
-    task: TileTask
-
-    @property
-    def scan(self) -> Scan:
-        """The tile under the name of its stage; its size is one of memory."""
-        num_bytes = self.task.num_points * _BYTES_PER_TILE_POINT
-        return Scan(self.task.name, (), num_bytes // SCAN_BYTES_PER_POINT)
-
-    def remove_leftovers(self) -> None:
-        """Do nothing: a tile is written where it belongs."""
-
-
-@dataclass(frozen=True)
-class TileReport(ScanReport):
+class TileReport(TaskReport):
     """What became of a tile, and what has been written for it."""
 
     written: tuple[Written, ...] = ()
 
 
-def work_on_tile(job: TileJob) -> TileReport:
-    """Work on a tile; what goes wrong is in the report."""
-    written: list[Written] = []
+@dataclass(frozen=True)
+class TileWork:
+    """One stage of one tile, as engines take it."""
 
-    def work(begin: Callable[[str], None]) -> Converted:
-        begin(job.task.stage)
-        written.extend(job.task.run())
-        return Converted(job.task.num_points, 0, ())
+    tile: TileTask
+    inputs: ClassVar[tuple[Path, ...]] = ()
 
-    report = report_on(job.task.name, work)
-    return TileReport(**vars(report), written=tuple(written))
+    @property
+    def name(self) -> str:
+        """Stage and tile."""
+        return self.tile.name
+
+    @property
+    def memory(self) -> int:
+        """What the tile takes with the points around it."""
+        return memory_of_tile(self.tile.num_points)
+
+    def run(self) -> TileReport:
+        """Work on the tile; what goes wrong is in the report."""
+        written: list[Written] = []
+
+        def work(begin: Callable[[str], None]) -> Converted:
+            begin(self.tile.stage)
+            written.extend(self.tile.run())
+            return Converted(self.tile.num_points, 0, ())
+
+        return TileReport(**vars(report_on(self.name, work)), written=tuple(written))
+
+    def clean(self) -> None:
+        """Do nothing: a tile is written where it belongs."""
 
 
-def _run_jobs(
-    tasks: Sequence[TileTask], start: Callable[[Sequence[TileJob]], Reports]
+def _run_tiles(
+    tiles: Sequence[TileTask], start: Callable[[Sequence[Task]], Reports]
 ) -> Iterator[tuple[TileTask, Sequence[Written]]]:
-    """Run tasks on an engine, and yield each that is done; raise FormatError for one that fails."""
-    by_name = {task.name: task for task in tasks}
-    if not tasks:
+    """Run tiles on an engine, and yield each that is done; raise FormatError for one that fails."""
+    by_name = {tile.name: tile for tile in tiles}
+    if not tiles:
         return
-    with contextlib.closing(start([TileJob(task) for task in tasks])) as reports:
+    with contextlib.closing(start([TileWork(tile) for tile in tiles])) as reports:
         for report in reports:
             if report is None:
                 continue

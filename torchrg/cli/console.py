@@ -237,6 +237,30 @@ def run_each(
     return 0
 
 
+def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return rows of text as aligned columns, numbers to the right.
+
+    Example:
+        >>> print(format_table(["scan", "points"], [["hall", "1,000"], ["office", "20"]]))
+        scan    points
+        hall     1,000
+        office      20
+    """
+    table = [list(head), *map(list, rows)]
+    widths = [max(len(row[column]) for row in table) for column in range(len(head))]
+    numeric = [
+        all(row[column][:1].isdigit() or row[column] == "" for row in table[1:])
+        for column in range(len(head))
+    ]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
+        ).rstrip()
+        for row in table
+    )
+
+
 def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -> list[Path]:
     """Return where the result of each input goes.
 

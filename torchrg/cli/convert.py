@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NoReturn
@@ -10,24 +10,23 @@ from typing import Annotated, ClassVar, Literal, NoReturn
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.convert import ScanReport
+from torchrg.batch.convert import Job
 from torchrg.batch.local import run_local
-from torchrg.batch.memory import SHARE, available_memory, memory_of_scan
-from torchrg.batch.report import BatchReport, format_report
+from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.memory import spare_memory
+from torchrg.batch.report import BatchReport
 from torchrg.batch.run import (
     REPORT,
-    DirectoryLock,
     Plan,
-    Reports,
-    check_space,
-    format_plan,
+    check_room,
     list_jobs,
     make_plan,
     run_plan,
     write_report,
 )
-from torchrg.batch.scans import Job, Source, read_results
+from torchrg.batch.scans import Source, read_results
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
+from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
 from torchrg.config import DepthConfig
 from torchrg.datasets.folder import files_below
@@ -36,6 +35,9 @@ from torchrg.io import FORMATS
 from torchrg.io.files import check_place, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
+
+MOST_ROWS = 300
+"""A longer batch is not printed scan by scan."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,7 @@ def run(argv: list[str]) -> int:
     pages = _pages_of(arguments)
     if pages is not None:
         make_folder(pages)
-        check_gallery(pages, [job.scan.name for job in jobs])
+        check_gallery(pages, [job.name for job in jobs])
     with DirectoryLock(out) as lock:
         jobs = [dataclasses.replace(job, mark=lock.mark) for job in jobs]
         return _convert(_look_at(jobs, arguments), out, arguments, lock)
@@ -225,14 +227,14 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
 
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
-    check_space(plan)
+    check_room(plan)
     given = arguments.limit_memory
-    limit = int(SHARE * available_memory() if given is None else given * 1e9)
+    limit = spare_memory() if given is None else int(given * 1e9)
     jobs, workers = plan.to_convert, arguments.workers
-    for scan in (job.scan for job in jobs):
-        if memory_of_scan(scan.num_points) > limit:
+    for job in jobs:
+        if job.memory > limit:
             console.warn(
-                f"{scan.name}: about {scan.num_points:,} points may need more memory than "
+                f"{job.name}: about {job.scan.num_points:,} points may need more memory than "
                 f"{limit / 1e9:.1f} GB; it runs alone."
             )
     if arguments.engine == "local":
@@ -243,7 +245,7 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
     by_frames = arguments.unit == "frame"
-    sizes = {job.scan.name: 1 if by_frames else job.scan.num_points for job in jobs}
+    sizes = {job.name: 1 if by_frames else job.scan.num_points for job in jobs}
     unit, total = "frame" if by_frames else "pt", sum(sizes.values())
     # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
     with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
@@ -259,10 +261,10 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     """Write picture and page of each scan that is done, and the index of all of them."""
     done = {scan.name: scan for scan in report.scans if scan.status in ("converted", "kept")}
-    jobs = [job for job in plan.jobs if job.scan.name in done]
+    jobs = [job for job in plan.jobs if job.name in done]
     entries = []
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
-        name = job.scan.name
+        name = job.name
         words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
         try:
             cloud = read_results(job.folder)
@@ -279,7 +281,7 @@ class _Progress:
         self.bar, self.sizes, self.unit = bar, sizes, unit
         self.num_done = self.num_failed = 0
 
-    def __call__(self, report: ScanReport | None) -> None:
+    def __call__(self, report: TaskReport | None) -> None:
         """Take a report, or only show that time passes."""
         if report is not None:
             self.num_done += 1
@@ -314,3 +316,67 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
         return console.fail(message, code=console.SOME_FAILED)
     print(f"{state} -> {out}")
     return 0
+
+
+def format_plan(plan: Plan) -> str:
+    """Return what a plan would do: a row for each scan that is to be converted."""
+    rows = [
+        [job.name, plan.reasons[job.name], f"{job.scan.num_points:,}"] for job in plan.to_convert
+    ]
+    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
+    return "\n".join([console.format_table(["scan", "why", "points (about)"], rows), sums])
+
+
+def format_report(report: BatchReport, *, unit: str = "scan") -> str:
+    """Return a report as text: a row for each scan, notes below, then the sums.
+
+    With more than :data:`MOST_ROWS` scans, only failures have a row. ``unit`` is what a scan is
+    called where its number in a second counts.
+    """
+    stages = list(report.stage_seconds)
+    shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
+    head = ["scan", "status", "points", "planes", *stages, "GB"]
+    rows = [_row(scan, stages) for scan in shown]
+    totals = report.with_status("converted")
+    rows.append(
+        [
+            "all",
+            f"{len(totals)} converted",
+            f"{report.num_points:,}",
+            f"{sum(scan.num_regions for scan in totals):,}",
+            *(f"{seconds:.1f}" for seconds in report.stage_seconds.values()),
+            f"{max((scan.peak_memory for scan in totals), default=0) / 1e9:.2f}",
+        ]
+    )
+    notes = [
+        f"{scan.name}: {note}"
+        for scan in shown
+        for note in (
+            *(f"repaired: {text}" for text in scan.repairs),
+            *scan.warnings,
+            *([f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []),
+        )
+        if scan.status != "failed"
+    ]
+    points, scans = (
+        number / report.seconds if report.seconds else 0.0
+        for number in (report.num_points, len(totals))
+    )
+    speed = (
+        f"{report.num_points:,} points in {report.seconds:,.1f} s: {points:,.0f} points, "
+        f"{scans:,.2f} {unit}s a second"
+    )
+    return "\n".join([console.format_table(head, rows), *notes, speed])
+
+
+def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:
+    """Return the cells of a scan."""
+    points = f"{scan.num_points:,}" if scan.num_points else ""
+    return [
+        scan.name,
+        scan.status,
+        points,
+        f"{scan.num_regions:,}" if points else "",
+        *(f"{scan.seconds[stage]:.1f}" if stage in scan.seconds else "" for stage in stages),
+        f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else "",
+    ]

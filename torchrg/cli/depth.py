@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -13,12 +13,12 @@ import tyro
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrg.batch.convert import ScanReport, report_on
-from torchrg.batch.local import read_ahead, run_local
-from torchrg.batch.memory import SHARE, available_memory
+from torchrg.batch.local import run_here, run_local
+from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.records import describe_run
-from torchrg.batch.scans import Converted, Scan
+from torchrg.batch.scans import Scan
 from torchrg.batch.sources import num_pixels
+from torchrg.batch.task import Converted, Reports, TaskReport, report_on
 from torchrg.cli import console
 from torchrg.datasets.folder import listed
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
@@ -110,7 +110,26 @@ class Frame:
         """The file of the image."""
         return self.scan.inputs[0]
 
-    def remove_leftovers(self) -> None:
+    @property
+    def name(self) -> str:
+        """The file of the image."""
+        return self.scan.name
+
+    @property
+    def memory(self) -> int:
+        """What the image takes."""
+        return memory_of_scan(self.scan.num_points)
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The file of the image."""
+        return self.scan.inputs
+
+    def run(self) -> TaskReport:
+        """Label the image; what goes wrong with it is in the report."""
+        return report_frame(self)
+
+    def clean(self) -> None:
         """Remove what a process that was killed left half-written."""
         for path in (self.target, self.picture):
             if path is not None:
@@ -218,7 +237,7 @@ def _label_one(frame: Frame) -> int:
 
 def _label_sequence(frames: Sequence[Frame]) -> int:
     """Label images side by side, say which failed, and how many a second there were."""
-    begin, reports = time.perf_counter(), dict[str, ScanReport]()
+    begin, reports = time.perf_counter(), dict[str, TaskReport]()
     bar = tqdm(total=len(frames), unit="frame", disable=None)
     with bar, contextlib.closing(_reports(frames)) as arriving:
         for report in arriving:
@@ -242,24 +261,14 @@ def _label_sequence(frames: Sequence[Frame]) -> int:
     return console.fail(message, code=console.SOME_FAILED)
 
 
-def _reports(frames: Sequence[Frame]) -> Generator[ScanReport | None, None, None]:
-    """Yield a report of each frame when it is done, from processes if they are worth their start.
-
-    None is yielded while nothing is done, so that progress can be shown.
-    """
+def _reports(frames: Sequence[Frame]) -> Reports:
+    """Run the frames, in processes if they are worth their start."""
     worthwhile = min(console.num_cores(), max(len(frames) // _FRAMES_OF_WORKER, 1))
     workers = min(frames[0].arguments.workers or worthwhile, len(frames))
-    if workers > 1:
-        limit = int(SHARE * available_memory())
-        yield from run_local(frames, workers=workers, memory_limit=limit, work=report_frame)
-        return
-    for number, frame in enumerate(frames):
-        for following in frames[number + 1 : number + 2]:
-            read_ahead(following.scan.inputs)
-        yield report_frame(frame)
+    return run_local(frames, workers=workers) if workers > 1 else run_here(frames)
 
 
-def report_frame(frame: Frame) -> ScanReport:
+def report_frame(frame: Frame) -> TaskReport:
     """Label one image; what goes wrong with it is in the report and never raised."""
 
     def convert(begin: Callable[[str], None]) -> Converted:

@@ -13,12 +13,12 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.report import format_table
 from torchrg.batch.scans import read_results
 from torchrg.cli.console import (
     ColumnNames,
     ColumnsFlag,
     check_apart,
+    format_table,
     parse,
     warn,
     warnings_as_lines,

@@ -14,15 +14,13 @@ from tqdm import tqdm
 
 from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
-from torchrg.batch.run import Reports
 from torchrg.batch.scans import check_finite
+from torchrg.batch.task import Reports, Task
 from torchrg.batch.tiles import (
-    TileJob,
     choose_tile_size,
     choose_workers,
     folder_of_work,
     segmented_in_tiles,
-    work_on_tile,
 )
 from torchrg.cli import console
 from torchrg.config import SuperpointsConfig
@@ -270,13 +268,13 @@ def _check_points(
     return tuple(first.fields)
 
 
-def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[TileJob]], Reports] | None:
+def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[Task]], Reports] | None:
     """Return what runs the tiles elsewhere, None where this machine does."""
     if arguments.engine == "local":
         return None
     from torchrg.batch.ray_tasks import run_ray
 
-    return partial(run_ray, memory_limit=limit, address=arguments.ray_address, work=work_on_tile)
+    return partial(run_ray, memory_limit=limit, address=arguments.ray_address)
 
 
 def _is_depth_image(cloud: Cloud) -> bool:

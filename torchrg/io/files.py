@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import secrets
+import shutil
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,6 +26,7 @@ DAMAGES = (
     struct.error,
 )
 """What libraries raise on damaged files beside their own errors, found by flipping bytes."""
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _MORE_BYTES = 1 << 20
 """More than a library writes at a time, so that they do not fit where its last did not."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
@@ -112,9 +114,10 @@ def remove_leftovers(folder: Path, mark: str) -> None:
         ['.a.other.txt', 'a.txt']
     """
     name = re.compile(rf"\..*\.{mark}[0-9a-f]{{8}}(\.[^.]*)?")
-    for path in folder.iterdir():
-        if name.fullmatch(path.name) and path.is_file() and not path.is_symlink():
-            path.unlink(missing_ok=True)
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                Path(entry.path).unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
@@ -154,6 +157,30 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FormatError(f"{path}: cannot be made: {error.strerror or error}.") from error
+
+
+def is_disk_full(error: BaseException | None) -> bool:
+    """Return whether an error, or what caused it, is a full disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+            return True
+        error = error.__cause__
+    return False
+
+
+def check_space(folder: Path, needed: int, what: str, *, repair: str = "") -> None:
+    """Raise FormatError if the disk of a folder, which need not exist, has not so many bytes free.
+
+    ``what`` takes the bytes; ``repair`` is a way out beside more room and another directory.
+    """
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(existing).free
+    if needed > free:
+        ways = ["make room", "choose another directory", *([repair] if repair else [])]
+        raise FormatError(
+            f"{folder}: expected {needed / 1e6:,.1f} MB of free disk for {what}, got "
+            f"{free / 1e6:,.1f} MB; {', '.join(ways[:-1])}, or {ways[-1]}."
+        )
 
 
 def check_file(path: Path) -> int:
