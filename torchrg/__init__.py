@@ -9,11 +9,12 @@ if TYPE_CHECKING:
     from torchrg.neighbors import search_knn
     from torchrg.normals import estimate_normals
     from torchrg.pipeline import make_superpoints, segment_planes
-    from torchrg.regions import grow_regions
+    from torchrg.regions import align_axes, grow_regions
     from torchrg.structures import UNLABELED, Cloud
 else:
     _MODULES = {
         "UNLABELED": "structures",
+        "align_axes": "regions",
         "Cloud": "structures",
         "TorchrgError": "errors",
         "estimate_normals": "normals",
@@ -53,6 +54,7 @@ __all__ = [
     "UNLABELED",
     "Cloud",
     "TorchrgError",
+    "align_axes",
     "datasets",
     "depth",
     "estimate_normals",

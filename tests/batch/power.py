@@ -50,8 +50,7 @@ class Disk:
         self._put(self.kept / "content" / inode, path.read_bytes())
 
     def _keep_names(self, folder):
-        names = {path.name: path.lstat().st_ino for path in folder.iterdir()}
-        self._put(self._place_of(folder), json.dumps(names).encode())
+        self._put(self._place_of(folder), json.dumps(_entries(folder)).encode())
 
     def _place_of(self, folder):
         parts = folder.relative_to(self.root).parts
@@ -82,17 +81,19 @@ class Disk:
     def _cut(self, folder, after, rng, share):
         after.mkdir()
         flushed = self._names(folder)
-        written = {path.name: path.lstat().st_ino for path in folder.iterdir()}
+        # A folder that was removed holds nothing now, but may have come back with what it held.
+        written = _entries(folder) if folder.is_dir() else {}
         for name in sorted({*flushed, *written}):
             is_written = rng.random() < share
-            inode = (written if is_written else flushed).get(name)
+            entry = (written if is_written else flushed).get(name)
             path = folder / name
-            if inode is None:
+            if entry is None:
                 continue
-            if inode != written.get(name):
-                (after / name).write_bytes(self._content(inode))
-            elif path.is_dir():
+            inode, is_folder = entry
+            if is_folder:
                 self._cut(path, after / name, rng, share)
+            elif entry != written.get(name):
+                (after / name).write_bytes(self._content(inode))
             else:
                 content = _lose(self._content(inode), path.read_bytes(), rng, share)
                 (after / name).write_bytes(content)
@@ -102,6 +103,11 @@ class Disk:
         shutil.rmtree(self.root)
         after.rename(self.root)
         self.settle()
+
+
+def _entries(folder):
+    """Return for each name in a folder the number of its file, and whether it is a folder."""
+    return {path.name: [path.lstat().st_ino, path.is_dir()] for path in folder.iterdir()}
 
 
 def _lose(flushed, written, rng, share):

@@ -1,0 +1,128 @@
+"""Axes of rooms: those that a room was built along come back, whatever way it was turned."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from torchrg import align_axes, segment_planes
+from torchrg.errors import ConfigError
+from torchrg.scenes import make_room
+from torchrg.structures import Planes
+
+
+def tilted(rng, most_tilt=5.0):
+    """A turn about z, and then a tilt about a horizontal axis."""
+    way = rng.uniform(0, 2 * math.pi)
+    tilt = math.radians(rng.uniform(0, most_tilt)) * np.array([math.cos(way), math.sin(way), 0])
+    turn = Rotation.from_rotvec(tilt) * Rotation.from_euler("z", rng.uniform(-180, 180), True)
+    return torch.from_numpy(turn.as_matrix())
+
+
+def degrees_off(rotation):
+    """How far a rotation is from a quarter turn about z: tilt, and what is left of the turn."""
+    tilt = math.degrees(math.acos(min(1.0, float(rotation[2, 2]))))
+    angle = math.degrees(math.atan2(rotation[1, 0], rotation[0, 0]))
+    return tilt, abs(angle - 90 * round(angle / 90))
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 1, *[pytest.param(n, marks=pytest.mark.slow) for n in range(2, 100)]]
+)
+def test_made_rooms_are_set_upright_along_their_walls(seed):
+    rng = np.random.default_rng(seed)
+    room = make_room(num_points=12_000, noise=0.005, seed=seed)
+    turn = tilted(rng)
+    points = room.points.double() @ turn.T + torch.tensor([1e5, -20, 3.0])
+    motion = align_axes(segment_planes(points))
+    tilt, off = degrees_off(motion[:3, :3] @ turn)
+    assert tilt < 0.2
+    assert off < 0.2
+    moved = points @ motion[:3, :3].T + motion[:3, 3]
+    expected = room.points[:, 2] - room.points[:, 2].median()
+    assert torch.allclose(moved[:, 2] - moved[:, 2].median(), expected.double(), atol=0.05)
+    # Boxes on the floor and the doors' frames are above it, and its noise on both sides.
+    assert abs(float(moved[:, 2].quantile(0.02))) < 0.02
+    middle = (moved[:, :2].amin(dim=0) + moved[:, :2].amax(dim=0)) / 2
+    assert float(middle.abs().max()) < 0.1
+
+
+def table(normals, areas, centers=None, sides=1.0):
+    """A plane table of squares."""
+    normals = torch.nn.functional.normalize(torch.tensor(normals, dtype=torch.float64), dim=1)
+    count = len(normals)
+    helper = torch.eye(3, dtype=torch.float64)[normals.abs().argmin(dim=1)]
+    first = torch.nn.functional.normalize(torch.linalg.cross(normals, helper), dim=1)
+    axes = torch.stack([first, torch.linalg.cross(normals, first)], dim=1)
+    center = torch.zeros(count, 3) if centers is None else torch.tensor(centers)
+    return Planes(
+        normal=normals,
+        offset=(normals * center.double()).sum(dim=1),
+        centroid=center.double(),
+        area=torch.tensor(areas, dtype=torch.float64),
+        count=torch.full((count,), 100),
+        rms=torch.zeros(count),
+        extent=torch.full((count, 2), sides),
+        axes=axes,
+        center=center.double(),
+        curved=torch.zeros(count, dtype=torch.bool),
+    )
+
+
+def test_motions_are_rigid_and_turn_least():
+    for degrees in (-44, -10, 0, 30, 44):
+        turn = Rotation.from_euler("z", degrees, True).as_matrix()
+        planes = table((np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0.0]]) @ turn.T).tolist(), [9, 5, 4])
+        motion = align_axes(planes)
+        assert torch.allclose(motion[:3, :3], torch.from_numpy(turn).T, atol=1e-12)
+        assert torch.equal(motion[3], torch.tensor([0.0, 0, 0, 1]).double())
+
+
+def test_most_area_decides_and_what_leans_does_not_count():
+    roof = [0, math.sin(math.radians(20)), math.cos(math.radians(20))]
+    skew = [math.cos(0.4), math.sin(0.4), 0]
+    planes = table([[0, 0, 1], roof, [1, 0, 0], [0, 1, 0], skew], [20.0, 18, 10, 10, 12])
+    assert torch.allclose(align_axes(planes)[:3, :3], torch.eye(3).double(), atol=1e-12)
+
+
+def test_the_lowest_floor_is_at_zero_and_the_room_in_the_middle():
+    centers = [[1.0, 2, 5.0], [1, 2, 7.5], [3, 2, 6], [1, 2, 5.7]]
+    planes = table([[0, 0, 1], [0, 0, 1], [1, 0, 0], [0, 0, 1]], [9.0, 9, 5, 1], centers, sides=4.0)
+    moved = torch.tensor(centers).double() + align_axes(planes)[:3, 3]
+    assert moved[0].tolist() == pytest.approx([0, 0, 0])
+    assert moved[1, 2] == pytest.approx(2.5)
+
+
+def test_up_may_be_any_axis():
+    planes = table([[0, 1, 0], [1, 0, 0], [0, 0, 1]], [9.0, 5, 4])
+    rotation = align_axes(planes, up=(0, -2.0, 0))[:3, :3]
+    assert torch.allclose(rotation @ torch.tensor([0, -1.0, 0]).double(), torch.eye(3).double()[2])
+    assert float(torch.linalg.det(rotation)) == pytest.approx(1)
+
+
+def test_a_cloud_without_walls_is_told():
+    planes = table([[0, 0.05, 1], [0, 0.05, 1]], [9.0, 3])
+    with pytest.warns(UserWarning, match="turned upright only"):
+        rotation = align_axes(planes)[:3, :3]
+    assert torch.allclose(rotation @ planes.normal[0], torch.eye(3).double()[2], atol=1e-9)
+    assert float(rotation[0, 0]) > 0.99
+
+
+def test_walls_alone_say_where_up_is():
+    tilt = Rotation.from_euler("x", 4, True).as_matrix()
+    planes = table((np.array([[1, 0, 0], [0, 1, 0.0]]) @ tilt.T).tolist(), [9.0, 5])
+    assert torch.allclose(align_axes(planes)[:3, :3], torch.from_numpy(tilt).T, atol=1e-9)
+
+
+def test_what_has_no_axes_is_refused():
+    for planes in (
+        table([[0.0, 1, 0]], [9.0]),
+        table([[0.0, 1, 0]], [9.0])._replace(curved=torch.ones(1, dtype=torch.bool)),
+        segment_planes(torch.rand(30, 3)),
+    ):
+        with pytest.raises(ConfigError, match="expected a floor, a ceiling, or walls"):
+            align_axes(planes)
+    with pytest.raises(ConfigError, match="expected up to be three numbers"):
+        align_axes(table([[0, 0, 1]], [9.0]), up=(0, 0, 0))

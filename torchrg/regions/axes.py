@@ -1,0 +1,172 @@
+"""The axes of a room from its planes: up by floors and ceilings, x and y along the walls."""
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrg.errors import ConfigError
+from torchrg.linalg.eigen import eigh3_of_few
+from torchrg.structures import Planes, Segmentation
+
+_MOST_TILT_DEG = 30.0
+"""A room is tilted by less, so that no wall is taken for its floor."""
+_NEAR_DEG = 3.0
+"""Planes of one direction differ by less: walls are built within a degree, scanned within two."""
+_NUM_FITS = 5
+"""Reweighted fits; a sixth moves made rooms by less than 0.001 degrees."""
+_LEAST_SHARE = 0.02
+"""Share of the area of all planes below which those of a direction are furniture, not a room."""
+
+
+def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> Tensor:
+    r"""Return the motion that sets a room upright, with walls along x and y and the floor at 0.
+
+    Up is the unit vector :math:`u` that minimises, over planes of area :math:`a` and unit normal
+    :math:`n`,
+
+    .. math:: \sum_{\mathrm{level}} a w \|n \times u\|^2 +
+        \sum_{\mathrm{upright}} a w (n \cdot u)^2,
+
+    where the weights fall to 0 at 3 degrees (Tukey's bisquare), so that sloped ceilings and shelves
+    that lean do not count. It starts from the plane, level to within 30 degrees, that most area
+    agrees with. The x axis is, of the directions of upright planes modulo a right angle, that of
+    most area, fitted in the same way; of the four turns that this leaves, the one that turns least
+    about up is taken. Then the lowest plane that is level is at z = 0, and the middle of what all
+    planes take up is at x = y = 0. Where the origin is far, points should be moved in float64.
+
+    Args:
+        seg: A segmentation, or its plane table.
+        up: Where up is, to within 30 degrees, in the coordinates of the points.
+
+    Returns:
+        A rigid motion, shape ``(4, 4)``, float64: ``points @ motion[:3, :3].T + motion[:3, 3]``.
+
+    Raises:
+        ConfigError: If ``up`` is no direction, or no plane is level or upright.
+
+    Warns:
+        UserWarning: If there are no walls, so that nothing is known of x and y, or no level plane.
+
+    Example:
+        >>> from torchrg import segment_planes
+        >>> from torchrg.scenes import make_room
+        >>> room = make_room(num_points=5_000, seed=0)
+        >>> turn = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+        >>> motion = align_axes(segment_planes(room.points @ turn.T))
+        >>> torch.allclose(motion[:3, :3].float() @ turn, torch.eye(3), atol=0.01)
+        True
+    """
+    planes = seg.planes if isinstance(seg, Segmentation) else seg
+    given = torch.tensor([float(part) for part in up], dtype=torch.float64)
+    if given.shape != (3,) or not bool(given.isfinite().all() and given.any()):
+        raise ConfigError(
+            f"align_axes: expected up to be three numbers, not all zero, got {tuple(up)!r}."
+        )
+    given = given / given.norm()
+    normals = planes.normal.cpu().double()
+    areas = torch.where(planes.curved.cpu(), 0.0, planes.area.cpu().double())
+    axis = _find_up(normals, areas, given)
+    heading = _find_heading(normals, areas, axis)
+    if heading is None:
+        warnings.warn(
+            "align_axes: expected upright planes for the directions of x and y, got none of some "
+            "size; it is turned upright only.",
+            stacklevel=2,
+        )
+        heading = _horizontal(torch.eye(3, dtype=torch.float64)[given.abs().argmin()], axis)
+    rotation = torch.stack([heading, torch.linalg.cross(axis, heading), axis])
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = rotation
+    motion[:3, 3] = -_origin(planes, rotation)
+    return motion
+
+
+def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:
+    """Return the direction that most area is level or upright to; see :func:`align_axes`."""
+    level = (normals @ given).abs() >= math.cos(math.radians(_MOST_TILT_DEG))
+    signed = torch.where(normals @ given < 0, -1.0, 1.0)[:, None] * normals
+    candidates = signed[level & (areas > 0)]
+    if not len(candidates):
+        # Walls alone say where up is, too: across their normals.
+        upright = (normals @ given).abs() <= math.sin(math.radians(_MOST_TILT_DEG))
+        spread = (areas * upright)[:, None, None] * normals[:, :, None] * normals[:, None, :]
+        values, vectors = eigh3_of_few(spread.sum(dim=0))
+        if not bool(values[1] > _LEAST_SHARE * values[2]) or values[2] == 0:
+            raise ConfigError(
+                "align_axes: expected a floor, a ceiling, or walls in two directions, got none "
+                f"within {_MOST_TILT_DEG:g} degrees of that; segment the cloud first, or say where "
+                "up is."
+            )
+        candidates = vectors[:, 0][None] * torch.sign(vectors[:, 0] @ given)
+    agreeing = [_agreement(normals, areas, axis) for axis in candidates]
+    axis = candidates[int(torch.stack(agreeing).argmax())]
+    for _ in range(_NUM_FITS):
+        lengths = (normals @ axis).abs().clamp(max=1)
+        flat, across = areas * _bisquare(lengths.acos()), areas * _bisquare(lengths.asin())
+        spread = normals[:, :, None] * normals[:, None, :]
+        matrix = ((across - flat)[:, None, None] * spread).sum(dim=0)
+        axis = eigh3_of_few(matrix)[1][:, 0]
+        axis = axis * torch.sign(axis @ given)
+    return axis
+
+
+def _agreement(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
+    """Return the area of planes that are level or upright if this direction is up."""
+    lengths = (normals @ axis).abs().clamp(max=1)
+    return (areas * (_bisquare(lengths.acos()) + _bisquare(lengths.asin()))).sum()
+
+
+def _bisquare(angles: Tensor) -> Tensor:
+    """Return Tukey's weights of angles in radians, 0 beyond those of one direction."""
+    return (1 - (angles / math.radians(_NEAR_DEG)) ** 2).clamp(min=0) ** 2
+
+
+def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None:
+    """Return the horizontal direction next to x that most walls are along, None without walls."""
+    across = areas * _bisquare((normals @ axis).abs().clamp(max=1).asin())
+    if not bool(across.sum() > _LEAST_SHARE * areas.sum()):
+        return None
+    first = _horizontal(torch.eye(3, dtype=torch.float64)[0], axis)
+    second = torch.linalg.cross(axis, first)
+    angles = torch.atan2(normals @ second, normals @ first)
+    candidates = angles[across > 0]
+    agreeing = [(across * _bisquare(_off_square(angles - angle))).sum() for angle in candidates]
+    angle = candidates[int(torch.stack(agreeing).argmax())]
+    for _ in range(_NUM_FITS):
+        off = _off_square(angles - angle)
+        weights = across * _bisquare(off)
+        angle = angle + (weights * off).sum() / weights.sum()
+    angle = _off_square(angle)
+    heading: Tensor = angle.cos() * first + angle.sin() * second
+    return heading
+
+
+def _off_square(angles: Tensor) -> Tensor:
+    """Return angles in radians modulo a right angle, within 45 degrees of 0."""
+    return angles - (angles / (math.pi / 2)).round() * (math.pi / 2)
+
+
+def _horizontal(direction: Tensor, axis: Tensor) -> Tensor:
+    """Return the unit vector across an axis that is next to a direction."""
+    across = direction - (direction @ axis) * axis
+    if bool(across.norm() < math.sin(math.radians(_NEAR_DEG))):
+        across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[axis.abs().argmin()])
+    unit: Tensor = across / across.norm()
+    return unit
+
+
+def _origin(planes: Planes, rotation: Tensor) -> Tensor:
+    """Return what becomes the origin, in turned coordinates: middle in x and y, lowest in z."""
+    sides = planes.extent.cpu().double()[:, :, None] * planes.axes.cpu().double() / 2
+    reach = (sides @ rotation.T).abs().sum(dim=1)
+    center = planes.center.cpu().double() @ rotation.T
+    low, high = (center - reach).amin(dim=0), (center + reach).amax(dim=0)
+    upright = (planes.normal.cpu().double() @ rotation[2]).abs().clamp(max=1)
+    area = planes.area.cpu().double()
+    level = (upright.acos() < math.radians(_NEAR_DEG)) & (area > _LEAST_SHARE * area.sum())
+    if bool(level.any()):
+        low[2] = center[level, 2].amin()
+    return torch.stack([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
