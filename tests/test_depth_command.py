@@ -1,9 +1,15 @@
 """``torchrg depth``: planes of depth images and of organised clouds."""
 
+import contextlib
+import hashlib
 import json
+import os
+import random
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import kornia_rs
 import numpy as np
@@ -12,7 +18,7 @@ import torch
 
 from torchrg.batch.scans import Scan
 from torchrg.cli import main
-from torchrg.cli.depth import Frame
+from torchrg.cli.depth import FrameJob
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
@@ -163,6 +169,76 @@ def test_processes_side_by_side_write_the_same_bytes(tmp_path, sequence):
     assert results[0] == results[1] == results[2]
 
 
+def written(folder):
+    """Return when each file was written."""
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+
+def test_frames_that_are_done_are_not_done_again(tmp_path, sequence, frame, capsys):
+    out = tmp_path / "out"
+    command = ["depth", str(sequence), *CAMERA, "--out", str(out)]
+    assert main(command) == 3
+    before = written(out)
+    (sequence / "3.png").write_bytes(frame.read_bytes())
+    assert main(command) == 0
+    assert "4 of 4 frames, 8 planes" in capsys.readouterr().out
+    after = written(out)
+    assert after.keys() - before.keys() == {"3.png", "3_planes.png"}
+    assert before.items() <= after.items()
+    # An input, a result, a picture and a setting that are others than the labels say.
+    first = contents(out)
+    (sequence / "1.png").write_bytes(frame.read_bytes())
+    pixels = kornia_rs.io.read_image_png_u16(str(out / "2.png"), "mono")
+    kornia_rs.io.write_image_png_u16(str(out / "2.png"), pixels, "mono")
+    (out / "10_planes.png").unlink()
+    before = written(out)
+    assert main(command) == 0
+    changed = dict(written(out).items() - before.items())
+    assert {name.partition(".")[0].removesuffix("_planes") for name in changed} == {"1", "2", "10"}
+    assert contents(out).items() - first.items() == {("1.png", contents(out)["1.png"])}
+    assert main([*command, "--depth.min-size", "99"]) == 0
+    assert not written(out).items() & before.items()
+
+
+def test_labels_hold_what_they_were_made_from_and_stay_an_image(tmp_path, frame, depth):
+    images = pytest.importorskip("PIL.Image")
+    out = tmp_path / "labels.png"
+    assert main(["depth", str(frame), *CAMERA, "--out", str(out)]) == 0
+    with images.open(out) as image:
+        image.load()
+        record = json.loads(image.text["torchrg"])
+        labels = np.asarray(image).astype(int) - 1
+    np.testing.assert_array_equal(labels, segment_depth(depth, INTRINSICS).labels)
+    assert record["inputs"][0]["name"] == "frame.png"
+    assert record["inputs"][0]["sha256"] == hashlib.sha256(frame.read_bytes()).hexdigest()
+    assert record["config"]["min_size"] == 100
+    assert record["source"]["intrinsics"] == [50, 50, 39.5, 29.5]
+    assert str(tmp_path) not in json.dumps(record)
+
+
+@pytest.mark.slow
+def test_a_killed_sequence_goes_on_and_leaves_nothing_unfinished(tmp_path, depth):
+    folder, out, chance = tmp_path / "in", tmp_path / "out", random.Random(0)
+    folder.mkdir()
+    for number in range(40):
+        write_png(folder / f"{number}.png", (depth * (1000 + number)).round().int())
+    command = [sys.executable, "-m", "torchrg", "depth", str(folder), *CAMERA, "--workers", "2"]
+    begin = time.monotonic()
+    subprocess.run([*command, "--out", str(tmp_path / "whole")], check=True)
+    seconds, expected = time.monotonic() - begin, contents(tmp_path / "whole")
+    for _ in range(8):
+        process = subprocess.Popen([*command, "--out", str(out)], start_new_session=True)
+        time.sleep(chance.uniform(0.3, 1) * seconds)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if out.is_dir():
+            found = {name: what for name, what in contents(out).items() if name[0] != "."}
+            assert {name: expected[name] for name in found}.keys() == found.keys()
+    subprocess.run([*command, "--out", str(out)], check=True)
+    assert contents(out) == expected
+
+
 def test_results_that_would_replace_an_image_are_refused(tmp_path, sequence, frame, capsys):
     write_png(sequence / "1_planes.png", torch.ones(4, 4).int())
     before = contents(sequence)
@@ -183,7 +259,8 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, sequence, fra
 
 def test_what_a_killed_process_was_writing_goes_and_nothing_else(tmp_path):
     scan = Scan("1", (tmp_path / "1.npy",), 0)
-    frame = Frame(scan, tmp_path / "1.png", tmp_path / "1_planes.png", None)
+    place = {"target": tmp_path / "1.png", "picture": tmp_path / "1_planes.png"}
+    frame = FrameJob(None, scan, tmp_path, **place)
     theirs = (".1.0123abcd.png", ".1.0123456789abcdef01234567.png", "1.png", "1_planes.png")
     for name in (*theirs, f".1.{frame.mark}01234567.png", f".1_planes.{frame.mark}01234567.png"):
         (tmp_path / name).touch()

@@ -13,7 +13,8 @@ from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.report import BatchReport
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
-from torchrg.cli.convert import _Progress, format_report
+from torchrg.cli.convert import format_report
+from torchrg.cli.loop import Progress
 from torchrg.config import load_config
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
@@ -157,7 +158,7 @@ def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, capsys, mo
 def test_progress_is_scans_points_a_second_and_time_left():
     shown = io.StringIO()
     with tqdm(total=1000, unit="pt", file=shown, ncols=80) as bar:
-        progress = _Progress(bar, {"900_a": 900, "100_b": 100}, unit="scan")
+        progress = Progress(bar, {"900_a": 900, "100_b": 100}, unit="scan")
         progress(None)
         progress(TaskReport("900_a", "failed"))
         bar.refresh()
@@ -177,7 +178,7 @@ def test_help_lists_the_kinds(capsys):
 def test_depth_frames_are_counted_by_the_second():
     shown = io.StringIO()
     with tqdm(total=2, unit="frame", file=shown, ncols=80) as bar:
-        progress = _Progress(bar, {"a": 1, "b": 1}, unit="frame")
+        progress = Progress(bar, {"a": 1, "b": 1}, unit="frame")
         progress(TaskReport("a", "converted"))
         bar.refresh()
     assert "1/2 frames:  50%" in shown.getvalue()

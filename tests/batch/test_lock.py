@@ -52,6 +52,27 @@ def test_a_mark_stays_and_a_file_of_others_does_too(tmp_path):
     assert (tmp_path / ".torchrg.lock").read_text() == "theirs"
 
 
+def test_who_waited_for_a_lock_that_was_removed_has_one_that_others_see(tmp_path):
+    with DirectoryLock(tmp_path) as first:
+        waiting = subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        )
+        while str(tmp_path) not in opened_by(waiting.pid):
+            time.sleep(0.01)
+        first.remove()
+    with waiting:
+        assert waiting.stdout.readline() == "held\n"
+        with pytest.raises(FormatError, match=f"process {waiting.pid} "):
+            DirectoryLock(tmp_path, patience=0)
+        waiting.kill()
+
+
+def opened_by(process):
+    """Return the paths of the files that a process has open, a line each."""
+    links = Path(f"/proc/{process}/fd").iterdir()
+    return "\n".join(str(link.readlink()) for link in links if link.is_symlink())
+
+
 def test_a_holder_that_is_killed_leaves_no_lock(tmp_path):
     command = [sys.executable, "-c", HOLD, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:

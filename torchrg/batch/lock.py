@@ -4,6 +4,7 @@ import os
 import platform
 import re
 import time
+import zlib
 from collections.abc import Callable
 from multiprocessing import reduction
 from pathlib import Path
@@ -13,11 +14,13 @@ from torchrg.errors import FormatError
 from torchrg.io.files import make_mark, sync_folder
 
 LOCK = ".torchrg.lock"
-"""Name of the file that is locked. It stays when the lock goes."""
+"""Name of the file that is locked."""
 _HELD = re.compile(r"(?:([0-9a-f]{16}) )?(process \d+ on .*)?", re.DOTALL)
 """What is in it: a mark, which older versions did not write, and who holds it or did last."""
 _PATIENCE_SECONDS = 5.0
 """How long a lock that is held is waited for: workers of a command that was killed end by then."""
+_BEAT_SECONDS = 0.05
+"""How often it is tried."""
 
 
 class DirectoryLock:
@@ -47,26 +50,22 @@ class DirectoryLock:
     """
 
     def __init__(self, folder: Path, *, patience: float = _PATIENCE_SECONDS) -> None:
-        path = folder / LOCK
-        try:
-            self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        except OSError as error:
-            raise FormatError(f"{path}: cannot be written: {error.strerror}.") from error
+        self.path = folder / LOCK
         end = time.monotonic() + patience
+        self._open()
         try:
-            self._read(path)
             while not self._take():
                 if time.monotonic() >= end:
-                    _, holder = self._read(path)
+                    _, holder = self._read()
                     raise FormatError(
                         f"{folder}: another torchrg command ({holder or 'unknown'}) writes here; "
                         "wait for it, stop it, or choose another directory."
                     )
-                time.sleep(0.05)
+                time.sleep(_BEAT_SECONDS)
+            mark, _ = self._read()
         except FormatError:
             os.close(self.descriptor)
             raise
-        mark, _ = self._read(path)
         self.mark = mark or make_mark()
         text = f"{self.mark} process {os.getpid()} on {platform.node()}".encode()
         os.pwrite(self.descriptor, text, 0)
@@ -74,14 +73,29 @@ class DirectoryLock:
         os.fsync(self.descriptor)
         sync_folder(folder)
 
-    def _read(self, path: Path) -> tuple[str | None, str | None]:
+    def mark_of(self, name: str) -> str:
+        """Return the mark for one of several tasks that write into the directory side by side."""
+        return f"{self.mark}{zlib.crc32(os.fsencode(name)):08x}"
+
+    def remove(self) -> None:
+        """Remove the file of the lock, which stays otherwise; nobody has the lock from here on."""
+        self.path.unlink(missing_ok=True)
+
+    def _open(self) -> None:
+        """Open the file of the lock; one that is not there is made."""
+        try:
+            self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        except OSError as error:
+            raise FormatError(f"{self.path}: cannot be written: {error.strerror}.") from error
+
+    def _read(self) -> tuple[str | None, str | None]:
         """Return the mark in the file of the lock, and who holds the lock or did last."""
         text = os.pread(self.descriptor, 400, 0).decode(errors="replace").rstrip("\0")
         held = _HELD.fullmatch(text)
         if held is None:
             raise FormatError(
-                f"{path}: is in the way, it is no lock of torchrg; move it away, or choose another "
-                "directory."
+                f"{self.path}: is in the way, it is no lock of torchrg; move it away, or choose "
+                "another directory."
             )
         return held[1], held[2]
 
@@ -89,11 +103,18 @@ class DirectoryLock:
         """Return whether the lock could be had."""
         import fcntl
 
+        self._read()
         try:
             fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
-        return True
+        if os.fstat(self.descriptor).st_nlink:
+            return True
+        # The last holder has removed it, and others will lock another one.
+        removed = self.descriptor
+        self._open()
+        os.close(removed)
+        return False
 
     def __enter__(self) -> "DirectoryLock":
         return self

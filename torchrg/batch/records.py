@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,6 +20,10 @@ from torchrg.io import atomic_path
 
 RECORD = "provenance.json"
 """Written last beside the results of a scan, so that a scan without it is not done."""
+_TEXT = b"tEXttorchrg\0"
+"""How the part of a PNG begins that holds a record: a text of the name torchrg."""
+_END_BYTES = 12
+"""Length of the part that every PNG ends with."""
 
 
 class Recorded(Protocol):
@@ -100,8 +106,10 @@ def write_record(job: Recorded, description: dict[str, Any], converted: Converte
         "warnings": list(converted.warnings),
         "outputs": {name: _fingerprint(job.place_of(name)) for name in converted.files},
     }
+    text = json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
+    content = _with_text(job.record.read_bytes(), text) if _is_image(job.record) else text
     with atomic_path(job.record) as beside:
-        beside.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        beside.write_bytes(content)
 
 
 def read_record(job: Recorded) -> dict[str, Any] | None:
@@ -122,7 +130,8 @@ def check_record(job: Recorded) -> None:
 def _read_json(job: Recorded) -> Any:  # noqa: ANN401
     """Return what is in the place of the record, None if it is not there or damaged."""
     try:
-        return json.loads(job.record.read_bytes())
+        content = job.record.read_bytes()
+        return json.loads(_split_text(content)[1] if _is_image(job.record) else content)
     except (OSError, ValueError):
         return None
 
@@ -167,8 +176,31 @@ def reason_to_convert(job: Recorded) -> str:
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
-    """Return the size and the hash of a file."""
+    """Return the size and the hash of a file, of an image without the record in it."""
+    if _is_image(path):
+        image, _ = _split_text(path.read_bytes())
+        return {"bytes": len(image), "sha256": hashlib.sha256(image).hexdigest()}
     return {"bytes": path.stat().st_size, "sha256": hash_file(path)}
+
+
+def _is_image(path: Path) -> bool:
+    """Return whether a file is a PNG, which can hold a record beside its pixels."""
+    return path.suffix.lower() == ".png"
+
+
+def _with_text(image: bytes, text: bytes) -> bytes:
+    """Return a PNG with a text before its end, which programs that show images pass over."""
+    body = _TEXT + text
+    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return image[:-_END_BYTES] + chunk + image[-_END_BYTES:]
+
+
+def _split_text(content: bytes) -> tuple[bytes, bytes]:
+    """Return a PNG without the text that :func:`_with_text` has put into it, and that text."""
+    start = content.rfind(_TEXT)
+    text = content[start + len(_TEXT) : -4 - _END_BYTES]
+    image = content[: start - 4] + content[-_END_BYTES:]
+    return (image, text) if start > 0 and _with_text(image, text) == content else (content, b"")
 
 
 def _name_below(root: Path, path: Path) -> str:

@@ -41,6 +41,11 @@ class BatchReport:
         return [scan for scan in self.scans if scan.status == status]
 
     @property
+    def complete(self) -> list[TaskReport]:
+        """The scans whose results are there."""
+        return [*self.with_status("converted"), *self.with_status("kept")]
+
+    @property
     def stage_seconds(self) -> dict[str, float]:
         """Time of each stage, of all scans converted now."""
         total: dict[str, float] = {}

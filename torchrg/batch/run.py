@@ -108,7 +108,7 @@ def _check_names(root: Path, scans: Sequence[Scan]) -> None:
 
 
 def make_plan(
-    jobs: list[Job],
+    jobs: Sequence[Job],
     *,
     force: bool = False,
     threads: int = 1,
@@ -143,24 +143,29 @@ def check_room(plan: Plan) -> None:
         check_space(plan.jobs[0].out, needed, f"{len(jobs):,} scans", repair=repair)
 
 
-def run_plan(
-    plan: Plan,
+def run_tasks(
+    names: Sequence[str],
     reports: Reports,
     *,
-    engine: str,
-    workers: int | None,
+    engine: str = "local",
+    workers: int | None = 1,
+    kept: Sequence[TaskReport] = (),
     on_report: Callable[[TaskReport | None], None] = lambda report: None,
 ) -> BatchReport:
-    """Convert the scans of a plan that are not done.
+    """Run tasks on an engine until all have ended: the loop of every command with several inputs.
 
-    A full disk ends the batch, as every further scan would fail after its work; so does an
-    interrupt. What is complete stays, and the next run goes on from there.
+    A full disk ends it, as every further task would fail after its work; so does an interrupt.
 
-    ``reports`` are those of the engine at work, as scans end, None in between; ``on_report`` is
-    called with each. ``engine`` and ``workers`` are noted in the report.
+    Args:
+        names: Those of all tasks, in the order of the report.
+        reports: Those of the engine at work, as tasks end, None in between.
+        engine: Which one, to be noted in the report.
+        workers: And how many tasks it runs at a time.
+        kept: Reports of the tasks that need not run.
+        on_report: Called with each report.
     """
     started, begin = time.time(), time.perf_counter()
-    found = {job.name: kept_report(job.name, job) for job in plan.done}
+    found = {report.name: report for report in kept}
     interrupted = False
     try:
         with contextlib.closing(reports):
@@ -172,11 +177,26 @@ def run_plan(
                         break
     except KeyboardInterrupt:
         interrupted = True
-    scans = [
-        found.get(job.name, TaskReport(job.name, "not started", attempts=0)) for job in plan.jobs
-    ]
+    scans = [found.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
     seconds = time.perf_counter() - begin
     return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
+
+
+def run_plan(
+    plan: Plan,
+    reports: Reports,
+    *,
+    engine: str,
+    workers: int | None,
+    on_report: Callable[[TaskReport | None], None] = lambda report: None,
+) -> BatchReport:
+    """Convert the scans of a plan that are not done; see :func:`run_tasks`.
+
+    What is complete when it ends early stays, and the next run goes on from there.
+    """
+    kept = [kept_report(job.name, job) for job in plan.done]
+    names = [job.name for job in plan.jobs]
+    return run_tasks(names, reports, engine=engine, workers=workers, kept=kept, on_report=on_report)
 
 
 def write_report(out: Path, report: BatchReport) -> None:

@@ -28,6 +28,7 @@ from torchrg.datasets import (
     write_pointcept_scene,
 )
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
+from torchrg.datasets.rgbd_files import read_depth
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
@@ -256,16 +257,13 @@ class RGBDSource:
         """Read, segment and write one frame."""
         begin("read")
         frame = _frame(scan.item)
-        sample = RGBDFrames([frame])[0]
-        depth, intrinsics = sample["depth"][0], sample["intrinsics"]
+        depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         if not bool((depth > 0).any()):
             raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
         begin("planes")
-        found = segment_depth(depth, intrinsics, self.settings, pose=frame.pose)
-        points = depth_to_points(depth[None].double(), intrinsics[None])[0]
-        if frame.pose is not None:
-            pose = frame.pose.to(points)
-            points = points @ pose[:3, :3].T + pose[:3, 3]
+        found = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
+        poses = None if frame.pose is None else frame.pose[None]
+        points = depth_to_points(depth[None].double(), frame.intrinsics[None], poses)[0]
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = write_results(folder, coord, found)

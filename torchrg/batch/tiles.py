@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 
 from torchrg.batch.local import run_local
-from torchrg.batch.lock import LOCK, DirectoryLock
+from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import PROCESS_BYTES, memory_between_tiles, memory_of_tile
 from torchrg.batch.records import describe_versions, hash_file
 from torchrg.batch.task import Converted, Reports, Task, TaskReport, report_on
@@ -144,9 +144,9 @@ def segmented_in_tiles(
             yield segment_planes(chunks, settings, voxel=voxel, store=store)
         except BaseException:
             if not FolderStore(folder).is_begun:
-                _remove_work(folder)
+                _remove_work(folder, lock)
             raise
-        _remove_work(folder)
+        _remove_work(folder, lock)
 
 
 def _check_outside(folder: Path, files: Sequence[Path]) -> None:
@@ -159,9 +159,9 @@ def _check_outside(folder: Path, files: Sequence[Path]) -> None:
             )
 
 
-def _remove_work(folder: Path) -> None:
+def _remove_work(folder: Path, lock: DirectoryLock) -> None:
     """Remove what the work has made, and its folder unless something else is in it."""
-    (folder / LOCK).unlink(missing_ok=True)
+    lock.remove()
     FolderStore(folder).remove_all()
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: parsing through tyro, the loop over inputs, errors of one line."""
+"""What the commands share: parsing through tyro, places of results, errors of one line."""
 
 import contextlib
 import dataclasses
@@ -23,7 +23,7 @@ from torchrg.cli.ending import fail as fail
 from torchrg.cli.ending import warn as warn
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
 from torchrg.datasets.folder import folded_name
-from torchrg.errors import ConfigError, FormatError, TorchrgError
+from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
 from torchrg.io.fields import COLUMNS_RULE, notes_on_results
 from torchrg.io.files import check_place, make_folder
@@ -194,6 +194,14 @@ def use_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
+def check_engine(limit_memory: float | None, engine: str, ray_address: str | None) -> None:
+    """Refuse what is said about memory and the engine where it makes no sense."""
+    if limit_memory is not None and not limit_memory > 0:
+        raise ConfigError(f"expected --limit-memory > 0, in GB, got {limit_memory}.")
+    if ray_address is not None and engine != "ray":
+        raise ConfigError("expected --ray-address together with --engine ray.")
+
+
 @contextlib.contextmanager
 def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
     """Show a progress bar on a terminal; what is yielded is called as each stage begins."""
@@ -209,32 +217,6 @@ def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None
 def num_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def run_each(
-    write: Callable[..., None],
-    arguments: Any,  # noqa: ANN401
-    *columns: Sequence[Any],
-) -> int:
-    """Call ``write`` with the arguments and the values of each input; return the exit code.
-
-    One that fails stops no other and is told in one line; where it is the only one, its error is
-    that of the command.
-    """
-    rows = list(zip(*columns, strict=True))
-    num_failed = 0
-    for row in rows:
-        try:
-            write(arguments, *row)
-        except TorchrgError as error:
-            if len(rows) == 1:
-                raise
-            num_failed += 1
-            fail(str(error))
-    if num_failed:
-        message = f"{num_failed} of {len(rows)} inputs failed, the others are written."
-        return fail(message, code=SOME_FAILED)
-    return 0
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

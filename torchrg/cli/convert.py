@@ -2,10 +2,10 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NoReturn
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 from tqdm import tqdm
@@ -21,13 +21,13 @@ from torchrg.batch.run import (
     check_room,
     list_jobs,
     make_plan,
-    run_plan,
     write_report,
 )
 from torchrg.batch.scans import Source, read_results
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
+from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.config import DepthConfig
 from torchrg.datasets.folder import files_below
 from torchrg.errors import ConfigError, FormatError, TorchrgError
@@ -204,10 +204,7 @@ def _check(arguments: Arguments) -> None:
     """Refuse values that are out of range, or do not go together."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
-    if arguments.limit_memory is not None and not arguments.limit_memory > 0:
-        raise ConfigError(f"expected --limit-memory > 0, in GB, got {arguments.limit_memory}.")
-    if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
+    console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
     if _pages_of(arguments) is not None:
         check_library()
 
@@ -244,13 +241,9 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
         from torchrg.batch.ray_tasks import run_ray
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
-    by_frames = arguments.unit == "frame"
-    sizes = {job.name: 1 if by_frames else job.scan.num_points for job in jobs}
-    unit, total = "frame" if by_frames else "pt", sum(sizes.values())
-    # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
-    with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
-        shown, engine = _Progress(bar, sizes, unit=arguments.unit), arguments.engine
-        report = run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
+    report = run_with_bar(
+        plan, reports, engine=arguments.engine, workers=workers, unit=arguments.unit
+    )
     code = _finish(report, out, unit=arguments.unit)
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
@@ -274,48 +267,23 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
 
 
-class _Progress:
-    """A progress bar that counts scans and moves by points, or by frames where those are scans."""
-
-    def __init__(self, bar: "tqdm[NoReturn]", sizes: Mapping[str, int], *, unit: str) -> None:
-        self.bar, self.sizes, self.unit = bar, sizes, unit
-        self.num_done = self.num_failed = 0
-
-    def __call__(self, report: TaskReport | None) -> None:
-        """Take a report, or only show that time passes."""
-        if report is not None:
-            self.num_done += 1
-            self.num_failed += report.status == "failed"
-            self.bar.update(self.sizes[report.name])
-        failed = f", {self.num_failed} failed" if self.num_failed else ""
-        self.bar.set_description_str(f"{self.num_done}/{len(self.sizes)} {self.unit}s{failed}")
-
-
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     """Write and print the report, and return the exit code."""
     print(format_report(report, unit=unit))
-    for scan in report.with_status("failed"):
-        console.fail(f"{scan.name}: {scan.reason}")
-    num_done = len(report.with_status("converted")) + len(report.with_status("kept"))
-    state = f"{num_done:,} of {len(report.scans):,} scans are complete"
+    for scan in report.scans:
+        tell_failure(scan)
     try:
         write_report(out, report)
     except FormatError as error:
         if not report.disk_full:
             raise
         console.warn(str(error))
-    again = "same command goes on from here."
-    if report.disk_full:
-        message = f"{out}: the disk is full; {state}. Make room, and the {again}"
-        return console.fail(message, code=console.SOME_FAILED)
-    if report.interrupted:
-        message = f"interrupted; {state}. The {again}"
-        return console.fail(message, code=console.INTERRUPTED)
-    if num_done < len(report.scans):
-        message = f"{state}, {out / REPORT} says more."
-        return console.fail(message, code=console.SOME_FAILED)
-    print(f"{state} -> {out}")
-    return 0
+    state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
+    more = f"{state}, {out / REPORT} says more."
+    code = finish(report, out, unit="scan", failed=more)
+    if code == 0:
+        print(f"{state} -> {out}")
+    return code
 
 
 def format_plan(plan: Plan) -> str:

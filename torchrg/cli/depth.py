@@ -1,25 +1,26 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 import tyro
 from torch import Tensor
-from tqdm import tqdm
 
+from torchrg.batch.convert import Job
 from torchrg.batch.local import run_here, run_local
-from torchrg.batch.memory import memory_of_scan
-from torchrg.batch.records import describe_run
+from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.records import describe_run, write_record
+from torchrg.batch.run import make_plan
 from torchrg.batch.scans import Scan
-from torchrg.batch.sources import num_pixels
-from torchrg.batch.task import Converted, Reports, TaskReport, report_on
+from torchrg.batch.sources import RGBDSource, num_pixels
+from torchrg.batch.task import Converted, TaskReport, report_on
 from torchrg.cli import console
+from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.datasets.folder import listed
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
 from torchrg.depth import (
@@ -32,15 +33,17 @@ from torchrg.depth import (
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
-from torchrg.io.files import check_place, make_mark, marked_parts, remove_leftovers
+from torchrg.io.files import check_place, marked_parts, remove_leftovers
 from torchrg.render import color_planes, write_png
-from torchrg.structures import Cloud
+from torchrg.structures import Cloud, Segmentation
 
 _ORGANISED = ".pcd"
 """Suffix of organised clouds."""
 _COLORED_FROM = 200
 """So many pixels along the longer side tell which planes are next to each other and must differ in
 colour: choosing colours from all would take as long as finding the planes."""
+_NO_IMAGES = ("planes", "points")
+"""Parts of a segmentation that are none."""
 _FRAMES_OF_WORKER = 8
 """Where no number of workers is given, each has so many frames at least: one takes as long to start
 as it takes for some frames of 640 x 480 pixels."""
@@ -51,7 +54,8 @@ class Arguments:
     """Label the planes of depth images, or of organised clouds taken as such.
 
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
-    beside it, or as a cloud in camera coordinates. Frames of a sequence are labelled side by side.
+    beside it, or as a cloud in camera coordinates. Frames of a sequence are labelled side by side,
+    and those that are done already are not done again.
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -76,64 +80,80 @@ class Arguments:
     core."""
 
 
-class Labelled(NamedTuple):
-    """What was found in an image."""
-
-    shape: tuple[int, int]
-    num_seen: int
-    num_labelled: int
-    num_planes: int
-    notes: tuple[str, ...] = ()
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a user should know."""
-        none = () if self.num_planes else ("no plane found: no region is large enough",)
-        return tuple(f"{note}." for note in (*self.notes, *none))
-
-
 @dataclass(frozen=True)
-class Frame:
-    """One image to label, with everything that another process needs for it.
+class FrameJob(Job):
+    """The task of labelling one image: a frame of an RGB-D source with images as its results.
 
-    Results are written under names that bear the ``mark`` before they have their own.
+    The labels hold the record. One that is alone may become a cloud instead.
     """
 
-    scan: Scan
-    target: Path
-    picture: Path | None
-    arguments: Arguments
-    mark: str = dataclasses.field(default_factory=make_mark, compare=False)
+    source: RGBDSource
+    target: Path = Path()
+    picture: Path | None = None
 
     @property
-    def source(self) -> Path:
-        """The file of the image."""
-        return self.scan.inputs[0]
+    def record(self) -> Path:
+        """The labels."""
+        return self.target
 
-    @property
-    def name(self) -> str:
-        """The file of the image."""
-        return self.scan.name
-
-    @property
-    def memory(self) -> int:
-        """What the image takes."""
-        return memory_of_scan(self.scan.num_points)
-
-    @property
-    def inputs(self) -> tuple[Path, ...]:
-        """The file of the image."""
-        return self.scan.inputs
+    def place_of(self, name: str) -> Path:
+        """Return where the labels or the picture of them are."""
+        place = self.picture if name == "picture" else self.target
+        return place or self.target / name
 
     def run(self) -> TaskReport:
         """Label the image; what goes wrong with it is in the report."""
-        return report_frame(self)
+
+        def convert(begin: Callable[[str], None]) -> Converted:
+            begin("planes")
+            self.clean()
+            return self.label()[0]
+
+        return report_on(self.name, convert)
 
     def clean(self) -> None:
         """Remove what a process that was killed left half-written."""
         for path in (self.target, self.picture):
             if path is not None:
                 remove_leftovers(path.resolve().parent, self.mark)
+
+    def label(self) -> tuple[Converted, str]:
+        """Segment the image and write its result; return what was found, also in words.
+
+        Raises:
+            TorchrgError: If the image cannot be read, or a result not be written.
+        """
+        target, is_labels = self.target, _is_png(self.target)
+        description = self.describe() if is_labels else {}
+        cloud, depth, intrinsics = _read_frame(self.inputs[0], self.source)
+        check_place(target) if is_labels else check_output(target, cloud)
+        # Results are about the cloud's origin.
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = -torch.from_numpy(cloud.origin)
+        seg = segment_depth(depth, intrinsics, self.source.settings, pose=pose)
+        notes, num_planes = [*cloud.notes], len(seg.planes.count)
+        if not is_labels and target.suffix.lower() != ".npz":
+            notes += notes_on_results(cloud.fields, RESULT_FIELDS)
+        if num_planes == 0:
+            notes.append("no plane found: no region is large enough")
+        files = ("labels",) if self.picture is None else ("labels", "picture")
+        warnings = tuple(f"{note}." for note in notes)
+        found = Converted(depth.numel(), num_planes, files, warnings=warnings)
+        with marked_parts(self.mark):
+            if self.picture is not None:
+                colors = color_planes(seg.labels, _thinned(cloud.points.view(*depth.shape, 3)))
+                write_png(self.picture, colors * (depth > 0)[..., None])
+            if is_labels:
+                write_png(target, seg.labels + 1)
+                write_record(self, description, found)
+            else:
+                _write_cloud(self, cloud, seg)
+        num_seen, (height, width) = int((depth > 0).sum()), depth.shape
+        share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
+        return found, (
+            f"{width} x {height} pixels, {num_seen:,} with depth, {num_planes:,} planes, "
+            f"{share:.1f} % of these labelled"
+        )
 
 
 def run(argv: list[str]) -> int:
@@ -143,11 +163,8 @@ def run(argv: list[str]) -> int:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     console.use_threads(arguments.threads)
     sources = list_images(arguments.inputs)
-    _check_camera(sources, arguments)
-    frames = _list_frames(sources, arguments)
-    if len(frames) == 1:
-        return _label_one(frames[0])
-    return _label_sequence(frames)
+    jobs = _list_jobs(sources, arguments)
+    return _label_one(jobs[0]) if len(jobs) == 1 else _label_sequence(jobs, arguments)
 
 
 def list_images(inputs: Sequence[Path]) -> tuple[Path, ...]:
@@ -174,18 +191,18 @@ def _is_image(path: Path) -> bool:
     return not is_hidden and path.suffix.lower() in (*DEPTH_SUFFIXES, _ORGANISED)
 
 
-def _check_camera(sources: Sequence[Path], arguments: Arguments) -> None:
-    """Refuse depth images without a camera and a scale, before any is read."""
-    if arguments.intrinsics is not None:
-        console.parse_intrinsics(arguments.intrinsics)
+def _list_jobs(sources: tuple[Path, ...], arguments: Arguments) -> list[FrameJob]:
+    """Return what is to be done; no result is written over another one or over an input.
+
+    Depth images without a camera and a scale are refused before any is read.
+    """
+    given = arguments.intrinsics
+    camera = None if given is None else console.parse_intrinsics(given)
     image = next((path for path in sources if path.suffix.lower() in DEPTH_SUFFIXES), None)
-    flag = "--intrinsics fx,fy,cx,cy" if arguments.intrinsics is None else "--depth-scale"
-    if image is not None and None in (arguments.intrinsics, arguments.depth_scale):
+    if image is not None and None in (camera, arguments.depth_scale):
+        flag = "--intrinsics fx,fy,cx,cy" if camera is None else "--depth-scale"
         raise ConfigError(f"{image}: expected {flag}, which depth images do not hold; pass it.")
-
-
-def _list_frames(sources: tuple[Path, ...], arguments: Arguments) -> list[Frame]:
-    """Return what is to be done; no result is written over another one or over an input."""
+    source = RGBDSource(sources[0].parent, arguments.depth, "images", camera, arguments.depth_scale)
     targets = console.output_paths(sources, arguments.out, suffix=".png")
     pictures = [
         picture or (target.with_name(f"{target.stem}_planes.png") if _is_png(target) else None)
@@ -199,9 +216,10 @@ def _list_frames(sources: tuple[Path, ...], arguments: Arguments) -> list[Frame]
     console.check_apart([*targets, *drawn], sources)
     for picture in drawn:
         check_place(picture)
+    scans = [Scan(str(path), (path,), _size_of(path)) for path in sources]
     return [
-        Frame(Scan(str(source), (source,), _size_of(source)), target, picture, arguments)
-        for source, target, picture in zip(sources, targets, pictures, strict=True)
+        FrameJob(source, scan, target.parent, target=target, picture=picture)
+        for scan, target, picture in zip(scans, targets, pictures, strict=True)
     ]
 
 
@@ -219,106 +237,56 @@ def _size_of(source: Path) -> int:
         return 0
 
 
-def _label_one(frame: Frame) -> int:
-    """Label one image, and print one line about it."""
+def _label_one(job: FrameJob) -> int:
+    """Label one image here, and print one line about it."""
     begin = time.perf_counter()
-    found = label_frame(frame)
+    found, words = job.label()
     for warning in found.warnings:
-        console.warn(f"{frame.source}: {warning}")
-    height, width = found.shape
-    share = 100 * found.num_labelled / max(found.num_seen, 1)
-    print(
-        f"{frame.source}: {width} x {height} pixels, {found.num_seen:,} with depth, "
-        f"{found.num_planes:,} planes, {share:.1f} % of these labelled, "
-        f"{time.perf_counter() - begin:.1f} s -> {frame.target}"
-    )
+        console.warn(f"{job.name}: {warning}")
+    print(f"{job.name}: {words}, {time.perf_counter() - begin:.1f} s -> {job.target}")
     return 0
 
 
-def _label_sequence(frames: Sequence[Frame]) -> int:
-    """Label images side by side, say which failed, and how many a second there were."""
-    begin, reports = time.perf_counter(), dict[str, TaskReport]()
-    bar = tqdm(total=len(frames), unit="frame", disable=None)
-    with bar, contextlib.closing(_reports(frames)) as arriving:
-        for report in arriving:
-            if report is not None:
-                reports[report.name] = report
-            bar.update(report is not None)
-    seconds = time.perf_counter() - begin
-    for report in (reports[frame.scan.name] for frame in frames):
-        for warning in report.warnings:
-            console.warn(f"{report.name}: {warning}")
-        if report.status == "failed":
-            console.fail(f"{report.name}: {report.reason.removeprefix(f'{report.name}: ')}")
-    done = [report for report in reports.values() if report.status == "converted"]
-    print(
-        f"{len(done):,} of {len(frames):,} frames, {sum(r.num_regions for r in done):,} planes, "
-        f"{seconds:,.1f} s, {len(done) / seconds:.2f} frames a second -> {frames[0].arguments.out}"
-    )
-    if len(done) == len(frames):
-        return 0
-    message = f"{len(frames) - len(done)} of {len(frames)} inputs failed, the others are written."
-    return console.fail(message, code=console.SOME_FAILED)
+def _label_sequence(jobs: Sequence[FrameJob], arguments: Arguments) -> int:
+    """Label the images that are not done, in processes if they are worth their start.
 
-
-def _reports(frames: Sequence[Frame]) -> Reports:
-    """Run the frames, in processes if they are worth their start."""
-    worthwhile = min(console.num_cores(), max(len(frames) // _FRAMES_OF_WORKER, 1))
-    workers = min(frames[0].arguments.workers or worthwhile, len(frames))
-    return run_local(frames, workers=workers) if workers > 1 else run_here(frames)
-
-
-def report_frame(frame: Frame) -> TaskReport:
-    """Label one image; what goes wrong with it is in the report and never raised."""
-
-    def convert(begin: Callable[[str], None]) -> Converted:
-        begin("planes")
-        with marked_parts(frame.mark):
-            found = label_frame(frame)
-        files = tuple(path.name for path in (frame.target, frame.picture) if path is not None)
-        height, width = found.shape
-        return Converted(height * width, found.num_planes, files, warnings=found.warnings)
-
-    return report_on(frame.scan.name, convert)
-
-
-def label_frame(frame: Frame) -> Labelled:
-    """Segment one image and write its result.
-
-    Raises:
-        TorchrgError: If the image cannot be read, or a result not be written.
+    Says which failed, and how many a second there were.
     """
-    source, target, arguments = frame.source, frame.target, frame.arguments
-    cloud, depth, intrinsics = _read_frame(source, arguments)
-    check_place(target) if _is_png(target) else check_output(target, cloud)
-    # Results are about the cloud's origin.
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = -torch.from_numpy(cloud.origin)
-    seg = segment_depth(depth, intrinsics, arguments.depth, pose=pose)
-    is_beside = target.suffix.lower() not in (".png", ".npz")
-    notes = notes_on_results(cloud.fields, RESULT_FIELDS) if is_beside else []
-    if _is_png(target):
-        write_png(target, seg.labels + 1)
-    else:
-        provenance = describe_run(source, arguments.depth) | {
-            "config": {"depth": dataclasses.asdict(arguments.depth)},
-            "intrinsics": arguments.intrinsics,
-            "depth_scale": arguments.depth_scale,
-        }
-        not_images = ("planes", "points")
-        images = {name: part for name, part in seg._asdict().items() if name not in not_images}
-        rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
-        write_cloud(target, cloud, rows, provenance=provenance)
-    if frame.picture is not None:
-        colors = color_planes(seg.labels, _thinned(cloud.points.view(*depth.shape, 3)))
-        write_png(frame.picture, colors * (depth > 0)[..., None])
-    return Labelled(
-        (depth.shape[0], depth.shape[1]),
-        int((depth > 0).sum()),
-        int((seg.labels >= 0).sum()),
-        len(seg.planes.count),
-        (*cloud.notes, *notes),
+    with DirectoryLock(arguments.out) as lock:
+        jobs = [dataclasses.replace(job, mark=lock.mark_of(job.target.name)) for job in jobs]
+        plan = make_plan(jobs, threads=console.num_cores())
+        frames = plan.to_convert
+        worthwhile = min(console.num_cores(), max(len(frames) // _FRAMES_OF_WORKER, 1))
+        workers = min(arguments.workers or worthwhile, max(len(frames), 1))
+        started = run_local(frames, workers=workers, lock=lock) if workers > 1 else run_here(frames)
+        report = run_with_bar(plan, started, engine="local", workers=workers, unit="frame")
+        lock.remove()
+    for frame in report.scans:
+        for warning in frame.warnings:
+            console.warn(f"{frame.name}: {warning}")
+        tell_failure(frame)
+    code = finish(report, arguments.out, unit="frame")
+    num_new = len(report.with_status("converted"))
+    print(
+        f"{len(report.complete):,} of {len(jobs):,} frames, "
+        f"{sum(frame.num_regions for frame in report.complete):,} planes, {report.seconds:,.1f} s, "
+        f"{num_new / max(report.seconds, 1e-9):.2f} frames a second -> {arguments.out}"
     )
+    return code
+
+
+def _write_cloud(job: FrameJob, cloud: Cloud, seg: Segmentation) -> None:
+    """Write an image that is alone as a cloud with its results."""
+    source = job.source
+    camera = source.intrinsics and ",".join(f"{value:.15g}" for value in source.intrinsics)
+    provenance = describe_run(job.inputs[0], source.settings) | {
+        "config": {"depth": dataclasses.asdict(source.settings)},
+        "intrinsics": camera,
+        "depth_scale": source.depth_scale,
+    }
+    images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
+    rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
+    write_cloud(job.target, cloud, rows, provenance=provenance)
 
 
 def _thinned(points: Tensor) -> Tensor:
@@ -329,31 +297,31 @@ def _thinned(points: Tensor) -> Tensor:
     return thinned
 
 
-def _read_frame(source: Path, arguments: Arguments) -> tuple[Cloud, Tensor, Tensor]:
+def _read_frame(path: Path, source: RGBDSource) -> tuple[Cloud, Tensor, Tensor]:
     """Return the cloud in camera coordinates, its depth ``(H, W)``, and the camera matrix."""
-    given, scale = arguments.intrinsics, arguments.depth_scale
-    camera = None if given is None else make_intrinsics(*console.parse_intrinsics(given))
-    if camera is None or scale is None or source.suffix.lower() not in DEPTH_SUFFIXES:
-        return _read_organised(source, camera)
-    depth = read_depth(source, depth_scale=scale)
+    given, scale = source.intrinsics, source.depth_scale
+    camera = None if given is None else make_intrinsics(*given)
+    if camera is None or scale is None or path.suffix.lower() not in DEPTH_SUFFIXES:
+        return _read_organised(path, camera)
+    depth = read_depth(path, depth_scale=scale)
     height, width = depth.shape
     points = depth_to_points(depth[None].double(), camera[None]).view(-1, 3).float()
-    return Cloud(points.numpy(), grid_shape=(height, width), source=str(source)), depth, camera
+    return Cloud(points.numpy(), grid_shape=(height, width), source=str(path)), depth, camera
 
 
-def _read_organised(source: Path, camera: Tensor | None) -> tuple[Cloud, Tensor, Tensor]:
+def _read_organised(path: Path, camera: Tensor | None) -> tuple[Cloud, Tensor, Tensor]:
     """Return an organised cloud, its depth, and the camera that is given or found."""
-    cloud = read_cloud(source)
+    cloud = read_cloud(path)
     if cloud.grid_shape is None:
         raise FormatError(
-            f"{source}: expected an organised cloud, with a height above 1, got a list of points; "
+            f"{path}: expected an organised cloud, with a height above 1, got a list of points; "
             "use torchrg segment."
         )
     points = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
     camera = find_intrinsics(points) if camera is None else camera
     if camera is None:
         raise FormatError(
-            f"{source}: expected points of a pinhole camera in its own coordinates, got others; "
+            f"{path}: expected points of a pinhole camera in its own coordinates, got others; "
             "use torchrg segment."
         )
     depth = points[..., 2]

@@ -13,6 +13,7 @@ import tyro
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
+from torchrg.cli.loop import run_each
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
@@ -61,7 +62,9 @@ def run(argv: list[str]) -> int:
     console.ColumnNames.parse(arguments.columns, arguments.inputs)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     console.check_apart(outputs, arguments.inputs)
-    return console.run_each(_estimate_file, arguments, arguments.inputs, outputs)
+    return run_each(
+        _estimate_file, arguments, list(map(str, arguments.inputs)), arguments.inputs, outputs
+    )
 
 
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:

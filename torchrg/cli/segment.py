@@ -23,6 +23,7 @@ from torchrg.batch.tiles import (
     segmented_in_tiles,
 )
 from torchrg.cli import console
+from torchrg.cli.loop import run_each
 from torchrg.config import SuperpointsConfig
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
@@ -50,6 +51,11 @@ from torchrg.render.gallery import (
 from torchrg.structures import Cloud, Segmentation
 
 STAGES = ("neighbors", "normals", "regions", "planes")
+_WHOLE = {
+    "superpoints": "superpoints merge along chains of any length, so that no tile tells them",
+    "picture": "a picture is drawn of all points at once",
+}
+"""What needs the whole cloud in memory, and why."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 """Flags of depth images, which have a command of their own."""
 
@@ -113,7 +119,7 @@ def run(argv: list[str]) -> int:
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
     console.use_threads(arguments.threads)
-    _check_memory(arguments)
+    console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
@@ -124,7 +130,9 @@ def run(argv: list[str]) -> int:
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    code = console.run_each(_segment, arguments, clouds, outputs, pictures)
+    code = run_each(
+        _segment, arguments, [_name_of(cloud) for cloud in clouds], clouds, outputs, pictures
+    )
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
@@ -156,15 +164,6 @@ def _refuse_images(argv: list[str]) -> None:
                 f"segment: expected point clouds, got {what}{argument}; use: torchrg depth {name} "
                 "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
             )
-
-
-def _check_memory(arguments: Arguments) -> None:
-    """Refuse what is said about memory and the engine where it makes no sense."""
-    limit = arguments.limit_memory
-    if limit is not None and not limit > 0:
-        raise ConfigError(f"expected --limit-memory > 0, in GB, got {limit}.")
-    if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
 
 
 def _segment(
@@ -209,11 +208,12 @@ def _segment_tiles(
 ) -> None:
     """Segment a cloud in tiles, after a line that says so."""
     begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
-    for name in ("voxel", "superpoints", "picture"):
+    for name, reason in _WHOLE.items():
         if getattr(arguments, name):
             raise ConfigError(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
-                f"takes more than {limit / 1e9:.2f} GB; raise --limit-memory, or leave it out."
+                f"takes more than {limit / 1e9:.2f} GB: {reason}; raise --limit-memory, or leave "
+                "it out."
             )
     try:
         tile_size = choose_tile_size(num_points, limit)
@@ -245,6 +245,7 @@ def _segment_tiles(
             start=_engine(arguments, limit),
             on_stage=show,
             columns=arguments.columns,
+            voxel=arguments.voxel,
         ) as seg:
             write_cloud(target, stream, seg, provenance=_describe(arguments, sources))
             seconds, without = time.perf_counter() - begin, console.without(target, fields)
@@ -291,6 +292,8 @@ def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]
     provenance = describe_run(sources[0], settings)
     if arguments.columns is not None:
         provenance["columns"] = arguments.columns
+    if arguments.voxel is not None:
+        provenance["voxel"] = arguments.voxel
     if len(sources) > 1:
         provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
     return provenance
@@ -330,8 +333,6 @@ def _segment_whole(
                 voxel=voxel,
             )
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
-    if voxel is not None:
-        provenance["voxel"] = voxel
     write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
         result = with_results(cloud, seg, parts)

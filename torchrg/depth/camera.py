@@ -7,8 +7,8 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg.errors import ConfigError
 
 
-def depth_to_points(depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """Return the point of each pixel in camera coordinates.
+def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = None) -> Tensor:
+    """Return the point of each pixel in camera coordinates, or in those of the world.
 
     Convention:
         Camera axes are x to the right, y down, z forwards; ``depth`` is z, not the length of the
@@ -18,10 +18,12 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor) -> Tensor:
     Args:
         depth: Shape ``(B, H, W)``, floating point, in any unit.
         intrinsics: Camera matrices, shape ``(B, 3, 3)``, without skew.
+        poses: Matrices from camera to world coordinates, shape ``(B, 4, 4)``. Default: the points
+            are in camera coordinates.
 
     Returns:
-        Points, shape ``(B, H, W, 3)``, in the unit and dtype of ``depth``; NaN where depth is not
-        finite or not positive.
+        Points, shape ``(B, H, W, 3)``, in the unit of ``depth`` and in its dtype, or in that of the
+        poses; NaN where depth is not finite or not positive.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
@@ -32,13 +34,22 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor) -> Tensor:
         tensor([[-1., nan],
                 [-1.,  1.]])
     """
-    check_shapes("depth_to_points", depth=(depth, "B H W"), intrinsics=(intrinsics, "B 3 3"))
+    check_shapes(
+        "depth_to_points",
+        depth=(depth, "B H W"),
+        intrinsics=(intrinsics, "B 3 3"),
+        poses=(poses, "B 4 4"),
+    )
     check_floating("depth_to_points", depth=depth)
     from kornia.geometry.depth import depth_to_3d_v2
 
     seen = has_depth(depth)
     points: Tensor = depth_to_3d_v2(torch.where(seen, depth, 1.0), intrinsics.to(depth))
-    return torch.where(seen[..., None], points, torch.nan)
+    points = torch.where(seen[..., None], points, torch.nan)
+    if poses is None:
+        return points
+    poses = poses.to(depth.device)
+    return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
 
 
 def has_depth(depth: Tensor) -> Tensor:

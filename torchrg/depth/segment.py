@@ -89,11 +89,12 @@ def segment_depth(
     normals[borders] = plane_normals[labels[borders]]
     valid.view(-1)[borders] = True
 
-    points = depth_to_points(depth[None].double(), intrinsics[None].double())[0]
     if pose is not None:
-        pose = pose.to(points)
-        points = points @ pose[:3, :3].T + pose[:3, 3]
+        pose = pose.to(normals)
         normals = normals @ pose[:3, :3].T
+    points = depth_to_points(
+        depth[None].double(), intrinsics[None].double(), None if pose is None else pose[None]
+    )[0]
     rows = seen.flatten().nonzero().squeeze(1)
     table = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
     return Segmentation(

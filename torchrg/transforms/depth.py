@@ -83,11 +83,7 @@ class DepthToCloud(DepthTransform):
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with the cloud."""
         depth, intrinsics, poses = self.read_images(sample)
-        images = depth_to_points(depth, intrinsics)
-        if poses is not None:
-            poses = poses.to(depth.device)
-            turned = images.to(poses.dtype) @ poses[:, None, :3, :3].mT
-            images = turned + poses[:, None, None, :3, 3]
+        images = depth_to_points(depth, intrinsics, poses)
         seen = images[..., 2].isfinite()
         pixel = torch.arange(depth[0].numel(), device=depth.device).view(depth.shape[1:])
         result = {

@@ -1,0 +1,73 @@
+"""The memory model: what processes take is measured, and stays within what is promised for it."""
+
+import subprocess
+import sys
+
+import pytest
+
+from torchrg.batch.memory import memory_between_tiles, memory_of_scan, memory_of_tile
+
+MEASURE = """
+import sys
+import numpy as np
+import torch
+from torchrg.batch.memory import peak_memory, reset_peak_memory
+from torchrg.config import load_config
+torch.set_num_threads(1)
+what, preset, num_points, folder = *sys.argv[1:3], int(sys.argv[3]), sys.argv[4]
+if what == "frame":
+    from torchrg.depth import make_intrinsics, segment_depth
+    noise = torch.randn(num_points // 640, 640, generator=torch.Generator().manual_seed(0))
+    depth = 2 + torch.arange(640) / 640 + 0.003 * noise
+    reset_peak_memory()
+    segment_depth(depth, make_intrinsics(525.0, 525.0, 319.5, 239.5))
+    print(peak_memory())
+    sys.exit()
+from torchrg.scenes import make_room
+from torchrg.structures import Cloud
+points = make_room(num_points, noise=0.003, seed=0).points
+config = load_config(preset)
+from torchrg.pipeline import segment_planes
+if what == "scan":
+    reset_peak_memory()
+    segment_planes(points, config)
+    print(peak_memory())
+    sys.exit()
+from torchrg.store import FolderStore
+peaks, stages = {}, ["points"]
+def note(stage, done, of):
+    peaks[stages[-1]] = max(peaks.get(stages[-1], 0), peak_memory())
+    stages.append(stage)
+    reset_peak_memory()
+reset_peak_memory()
+store = FolderStore(folder, tile_size=num_points // 2, on_progress=note)
+segment_planes([Cloud(points.numpy())], config, store=store)
+note("done", 1, 1)
+in_tiles = ("neighbors", "normals", "edges")
+print(max(peaks[stage] for stage in in_tiles))
+print(max(peaks[stage] for stage in peaks if stage not in in_tiles))
+"""
+
+
+def peaks(folder, what, preset, num_points):
+    """Return the peaks of memory that a process of its own has measured."""
+    command = [sys.executable, "-c", MEASURE, what, preset, str(num_points), str(folder)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return [int(line) for line in done.stdout.split()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["classic", "paper", "consensus", "frame"])
+def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, preset):
+    num_points = 300_000 if preset != "frame" else 640 * 480
+    (peak,) = peaks(tmp_path, "frame" if preset == "frame" else "scan", preset, num_points)
+    assert 0.5 * memory_of_scan(num_points) < peak < memory_of_scan(num_points)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
+def test_what_tiles_and_the_stages_between_them_take_is_what_the_model_says(tmp_path, preset):
+    num_points = 300_000
+    tile, whole = peaks(tmp_path, "tiles", preset, num_points)
+    assert 0.5 * memory_of_tile(num_points // 2) < tile < memory_of_tile(num_points // 2)
+    assert 0.5 * memory_between_tiles(num_points) < whole < memory_between_tiles(num_points)
