@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -69,7 +68,9 @@ _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 
 def begin(store: Store, config: PipelineConfig, voxel: float | None) -> None:
     """Tell a store what decides the result."""
-    if isinstance(store, FolderStore) and config.normals.adaptive_k is not None:
+    if isinstance(store, MemoryStore):
+        return
+    if config.normals.adaptive_k is not None:
         raise ConfigError(
             "segment_planes: expected normals.adaptive_k of none, got "
             f"{config.normals.adaptive_k}: in tiles k is known before the noise of the whole cloud "
@@ -111,19 +112,18 @@ def _choose_tiles(store: FolderStore, points: NDArray[np.floating]) -> list[int]
     wanted = np.arange(0, len(points), store.tile_size)
     ends = boxes.starts[np.searchsorted(boxes.starts, wanted)]
     # Tiles that are done stay, where the order alone is made again.
-    earlier: dict[str, Any] = store.facts("order") or {}
-    found: list[int] = np.unique(np.append(ends, len(points))).tolist()
-    return list(earlier.get("bounds", found))
+    found = np.unique(np.append(ends, len(points))).tolist()
+    return list(store.known("order").get("bounds", found))
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage that runs block by block: the arrays it needs before, and its work on a block.
+    """A stage that runs block by block: the files it needs before, and its work on a block.
 
-    Arrays that are there already, of a run that ended early, keep their rows.
+    Those that are there already, of a run that ended early, keep their rows.
     """
 
-    begin: Callable[[Store, PipelineConfig], None]
+    begin: Callable[[FolderStore, PipelineConfig], None]
     work: Callable[[Store, slice, int, PipelineConfig], None]
 
 
@@ -164,7 +164,6 @@ def run_blocks(store: Store, name: str, config: PipelineConfig) -> None:
     """Run a stage on each block that it is not done on."""
     stage, bounds = BLOCK_STAGES[name], store.known("order")["bounds"]
     if isinstance(store, MemoryStore):
-        stage.begin(store, config)
         stage.work(store, slice(*bounds), 0, config)
         return
     tiles = enumerate(itertools.pairwise(bounds))
@@ -189,7 +188,7 @@ def run_once(store: Store, name: str, step: Callable[[], None]) -> None:
     step()
 
 
-def _begin_neighbors(store: Store, config: PipelineConfig) -> None:
+def _begin_neighbors(store: FolderStore, config: PipelineConfig) -> None:
     order = store.known("order")
     store.create("neighbors", np.int32, (order["num_points"], order["k"]))
 
@@ -214,9 +213,8 @@ def _around(store: Store, block: slice, steps: int) -> Part:
     return Part(block, block, Neighbors(store.get("neighbors")))
 
 
-def _begin_normals(store: Store, config: PipelineConfig) -> None:
-    num_points = store.known("order")["num_points"]
-    kind = _dtype(store)
+def _begin_normals(store: FolderStore, config: PipelineConfig) -> None:
+    num_points, kind = store.known("order")["num_points"], store.read("cloud").dtype
     for name, dtype in zip(_FIT, (kind, kind, np.bool_, kind, np.bool_), strict=True):
         store.create(name, dtype, (num_points, 3) if name == "normals" else (num_points,))
 
@@ -231,21 +229,14 @@ def _estimate(store: Store, block: slice, number: int, config: PipelineConfig) -
         store.write(name, block.start, values[part.own])
 
 
-def _dtype(store: Store) -> Any:  # noqa: ANN401 - as NumPy has it
-    """Return the type of coordinates."""
-    return np.dtype(str(store.lazy("cloud").dtype).removeprefix("torch."))
-
-
-def _begin_edges(store: Store, config: PipelineConfig) -> None:
+def _begin_edges(store: FolderStore, config: PipelineConfig) -> None:
     order = store.known("order")
-    num_points = order["num_points"]
-    if isinstance(store, FolderStore):
-        lists = ("edges", "sources", "targets") if config.growing.is_order_free else ("edges",)
-        tiles = range(len(order["bounds"]) - 1)
-        store.reserve(*(store.path(f"{name}_{number}").name for name in lists for number in tiles))
+    num_points, tiles = order["num_points"], range(len(order["bounds"]) - 1)
+    lists = ("edges", "sources", "targets")
+    store.reserve(*(store.path(f"{name}_{number}").name for name in lists for number in tiles))
     store.create("counts", np.int32, (num_points,))
     store.create("components", np.int32, (num_points,))
-    store.create("reach", _dtype(store), (num_points,))
+    store.create("reach", store.read("cloud").dtype, (num_points,))
     if config.growing.promotes_late:
         store.create("claims", np.bool_, (num_points, order["k"]))
 

@@ -58,13 +58,6 @@ class MemoryStore:
     def __init__(self) -> None:
         self._values: dict[str, Any] = {}
 
-    def begin(self, **identity: Any) -> None:  # noqa: ANN401
-        """Do nothing: no other run has left anything."""
-
-    def is_done(self, step: str) -> bool:
-        """Return False: nothing outlives its run."""
-        return False
-
     def note(self, step: str, **found: Any) -> None:  # noqa: ANN401
         """Keep what a step has found."""
         self._values[f"{step} found"] = found
@@ -73,9 +66,6 @@ class MemoryStore:
         """Return what a step that is done found."""
         found: dict[str, Any] = self._values[f"{step} found"]
         return found
-
-    def create(self, name: str, dtype: Any, shape: Sequence[int]) -> None:  # noqa: ANN401
-        """Do nothing: :meth:`write` brings the whole array."""
 
     def write(self, name: str, start: int, values: Any) -> None:  # noqa: ANN401
         """Keep the rows of an array, which are all."""
@@ -303,15 +293,10 @@ class FolderStore:
             return False
         return checksum == part.checksum
 
-    def facts(self, step: str) -> dict[str, Any] | None:
-        """Return what a step found, None if it has never been done."""
-        facts: dict[str, Any] | None = self._record.done.get(step, {}).get("found")
-        return facts
-
     def known(self, step: str) -> dict[str, Any]:
-        """Return what a step that is done found."""
-        facts: dict[str, Any] = self._record.done[step]["found"]
-        return facts
+        """Return what a step found, nothing if it has never been done."""
+        found: dict[str, Any] = self._record.done.get(step, {}).get("found", {})
+        return found
 
     def path(self, name: str) -> Path:
         """Return the file of an array."""
@@ -415,7 +400,7 @@ class FolderStore:
 
     def _check_known(self, **found: Any) -> None:  # noqa: ANN401
         """Refuse other points than those that were there."""
-        if self.facts("points") not in (None, found):
+        if self.known("points") not in ({}, found):
             raise FormatError(
                 f"{self.path('points')}: is damaged, and the points that are given now are others; "
                 f"give the same again, or remove {self.folder}."
