@@ -19,7 +19,7 @@ from torchrg.linalg import (
     unsigned_angle_deg,
 )
 from torchrg.linalg.eigen import principal_frame
-from torchrg.linalg.moments import fit_planes, fit_planes_to_each, residuals, split_columns
+from torchrg.linalg.moments import fit_planes_to_each, fit_weighted_planes, residuals, split_columns
 
 PACKAGE = Path(__file__).parents[1] / "torchrg"
 # The row of linalg itself, and the largest number that a file can hold.
@@ -112,7 +112,7 @@ def test_gradient_of_the_smallest_eigenvalue_is_that_of_its_direction():
 def test_planes_are_those_of_the_neighbors_with_a_weight():
     columns = split_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
     weights = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
-    normals, offsets, values = fit_planes(columns, weights[0])
+    normals, offsets, values = fit_weighted_planes(columns, weights[0])
     assert normals.abs().tolist() == [[0.0, 0.0, 1.0]]
     assert values[0, 0] == 0
     assert residuals(columns, normals, offsets).abs().tolist() == [[0.0, 0.0, 0.0, 1.0]]

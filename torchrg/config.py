@@ -98,8 +98,8 @@ class GrowingConfig:
     min_size: int = 50
     """Smaller regions are not labelled. With ``absorb`` the points at their borders count."""
     cut_bridges: bool = False
-    """Whether regions of several faces that a few doubtful points join are split: faces 12 degrees
-    apart, floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
+    """Whether regions of several faces that a few points join are split: faces 12 degrees apart,
+    floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
     max_plane_residual: float | None = None
     """After growth, points farther from the plane of their region than this many times its
     thickness lose their label. None: they keep it."""
@@ -110,7 +110,7 @@ class GrowingConfig:
     """They are on it when they are within this many times its thickness."""
     absorb_angle_deg: float = 45.0
     """And when their normal is within this angle of the plane's."""
-    settle_rims: bool = False
+    refine_borders: bool = False
     """Whether points where regions touch then go to the one that explains them best: of two planes
     within reach by the line in which these meet. Only with ``absorb``. Most of all in faces a few
     centimetres wide."""
@@ -137,21 +137,6 @@ class GrowingConfig:
         _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
-    @property
-    def is_order_free(self) -> bool:
-        """Whether a claimed point spreads by what it is, not by which edges lead to it."""
-        return self.seed_rule == "curvature" and not self.promotes_late
-
-    @property
-    def promotes_late(self) -> bool:
-        """Whether any edge of its region makes a point a seed, not only the one that claimed it."""
-        return self.connectivity is not None and self.connectivity_scope == "seed"
-
-    @property
-    def is_refined(self) -> bool:
-        """Whether any step follows growth: release, absorption or merging."""
-        return self.max_plane_residual is not None or self.absorb or self.merge_coplanar
-
 
 @dataclass(frozen=True)
 class PlanesConfig:
@@ -161,15 +146,6 @@ class PlanesConfig:
     """Axis that points up: planes are then floor, ceiling, wall or other. None: not told apart."""
     outline: bool = False
     """Whether to trace the outline of each plane; needs shapely."""
-
-    @property
-    def up_direction(self) -> tuple[float, float, float] | None:
-        """The upward direction as a vector, None where there is none."""
-        if self.up is None:
-            return None
-        length = -1.0 if self.up.startswith("-") else 1.0
-        x, y, z = (length if self.up.endswith(axis) else 0.0 for axis in "xyz")
-        return x, y, z
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,13 @@ from torchrg.neighbors.tiles import Part, cut_part, search_tile
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.regions import summarize_planes
 from torchrg.regions.condensed import Condensed, condense, join_condensed
-from torchrg.regions.edges import EDGE_STEPS, EdgeLists, GrowingCloud
+from torchrg.regions.edges import (
+    EDGE_STEPS,
+    EdgeLists,
+    GrowingCloud,
+    is_order_free,
+    promotes_late,
+)
 from torchrg.regions.growth import (
     GrowthEdges,
     GrowthOrder,
@@ -95,7 +101,7 @@ def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> No
     num_points, k = len(rows), max(min(config.normals.k, len(rows)), 1)
     bounds = [0, num_points]
     if isinstance(store, FolderStore):
-        edge_bytes = 0 if config.growing.is_order_free else 5 * k
+        edge_bytes = 0 if is_order_free(config.growing) else 5 * k
         check_space(store.folder, num_points * (_ROW_BYTES + 4 * k + edge_bytes), "the work")
     store.save("rows", rows)
     store.save("cloud", points[rows])
@@ -237,7 +243,7 @@ def _begin_edges(store: FolderStore, config: PipelineConfig) -> None:
     store.create("counts", np.int32, (num_points,))
     store.create("components", np.int32, (num_points,))
     store.create("reach", store.read("cloud").dtype, (num_points,))
-    if config.growing.promotes_late:
+    if promotes_late(config.growing):
         store.create("claims", np.bool_, (num_points, order["k"]))
 
 
@@ -326,24 +332,23 @@ def grow_regions(store: Store, config: PipelineConfig) -> None:
 def _grow_on_disk(
     store: FolderStore, order: GrowthOrder, config: PipelineConfig
 ) -> NDArray[np.int32]:
-    """Grow along the edges of tiles: condensed ones in memory, others read in parts."""
-    starts, bounds = _join_edges(store), store.known("order")["bounds"]
-    late, reach = config.growing.promotes_late, None
-    if config.growing.is_order_free:
-        components = store.get("components").numpy()
-        parts = [
-            Condensed(
-                components[slice(*rows)],
-                store.get(f"sources_{number}").numpy(),
-                store.get(f"targets_{number}").numpy(),
-            )
-            for number, rows in enumerate(itertools.pairwise(bounds))
-        ]
-        reach = partial(join_condensed, parts)
-    edges = GrowthEdges(
-        EdgeLists(starts, store.read("edges")), claims=store.read("claims") if late else None
-    )
-    return grow_along(edges, order, store.read("neighbors"), config.growing, reach)
+    """Grow along the edges of tiles: condensed ones in memory, all of them read in parts."""
+    starts, lists = _join_edges(store), store.read("neighbors")
+    if not is_order_free(config.growing):
+        claims = store.read("claims") if promotes_late(config.growing) else None
+        edges = GrowthEdges(EdgeLists(starts, store.read("edges")), claims=claims)
+        return grow_along(edges, order, lists, config.growing)
+    components = store.get("components").numpy()
+    parts = [
+        Condensed(
+            components[slice(*rows)],
+            store.get(f"sources_{number}").numpy(),
+            store.get(f"targets_{number}").numpy(),
+        )
+        for number, rows in enumerate(itertools.pairwise(store.known("order")["bounds"]))
+    ]
+    edges = GrowthEdges(EdgeLists(starts, store.get("edges").numpy()))
+    return grow_along(edges, order, lists, config.growing, partial(join_condensed, parts))
 
 
 def _join_edges(store: FolderStore) -> NDArray[np.int64]:
@@ -380,7 +385,7 @@ def tabulate_planes(store: Store, config: PipelineConfig) -> None:
         store.get("normals"),
         store.get("labels"),
         neighbors=Neighbors(store.lazy("neighbors")),
-        up=config.planes.up_direction,
+        up=config.planes.up,
         outline=config.planes.outline,
     )
     store.save_planes("planes", planes)
@@ -417,7 +422,7 @@ def _describe_all_points(store: Store, config: PipelineConfig) -> None:
     rows = finite_rows(points)
     planes = summarize_planes(
         *(values[rows] for values in (points, store.get("result_normals"), labels)),
-        up=config.planes.up_direction,
+        up=config.planes.up,
         outline=config.planes.outline,
     )
     adjacency = _renumbered(found.adjacency, place)

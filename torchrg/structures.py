@@ -141,7 +141,7 @@ class Neighbors(NamedTuple):
         """Return which entries of some points are neighbours, shape ``(n, K)``, bool."""
         if self.valid is not None:
             return self.valid[rows]
-        own = self.indices[rows, 0]
+        own = self.indices[rows, :1]
         return torch.ones(len(own), self.indices.shape[1], dtype=torch.bool, device=own.device)
 
 

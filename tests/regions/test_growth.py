@@ -192,7 +192,7 @@ def test_points_of_another_color_join_only_within_the_distance():
         assert labels.tolist() == expected
     with pytest.raises(ConfigError, match="grow_regions: expected colors"):
         grow_regions(*cloud, CLASSIC, max_color_distance=35.0)
-    with pytest.raises(ConfigError, match="grow_regions: expected max_color_distance >= 0, got -1"):
+    with pytest.raises(ConfigError, match="expected colors and max_color_distance >= 0"):
         grow_regions(*cloud, CLASSIC, colors=colors, max_color_distance=-1.0)
 
 

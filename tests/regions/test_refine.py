@@ -10,10 +10,10 @@ from torchrg.errors import ConfigError
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.adjacency import contact_neighbors, count_contacts
+from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.edges import GrowingCloud
-from torchrg.regions.planes import fit_planes, fit_regions
-from torchrg.regions.refine import absorb_points, refine_regions
+from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
+from torchrg.regions.repair import absorb_points, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 OFF = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)
@@ -88,10 +88,10 @@ def test_invalid_points_are_not_absorbed():
     assert (refined[(order >= 100) & (order < 200)] == 0).float().mean() > 0.9
 
 
-def absorbed_one_by_one(points, normals, labels, neighbors, planes, valid, max_angle_deg):
+def absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid, max_angle_deg):
     """The rule of absorption, literally."""
-    normal, center, reach = (part.tolist() for part in planes)
-    nearest = contact_neighbors(neighbors)[0].tolist()
+    normal, center, reach = (part.tolist() for part in (planes.normal, planes.center, reach))
+    nearest = neighbors.indices[:, 1:9].tolist()
     labels = labels.tolist()
     least_cosine = np.cos(np.radians(max_angle_deg))
     while True:
@@ -118,27 +118,51 @@ def test_absorption_follows_its_rule_literally():
     cloud = growing_clouds.prepare(growing_clouds.room(rng, 300, 0.01), 12)
     points, normals, _, neighbors = cloud
     labels = torch.full((len(points),), UNLABELED)
-    planes = (
-        torch.eye(3).double(),
-        torch.zeros(3, 3).double(),
-        torch.tensor([0.05, 0.02, float("nan")]).double(),
-    )
+    axes = Segments(torch.arange(3))
+    planes = fit_planes(axes, torch.zeros(3, 3).double(), torch.eye(3).double())
+    reach = torch.tensor([0.05, 0.02, float("nan")]).double()
     for axis in range(3):
         labels[(points[:, axis].abs() < 0.02).nonzero()[:30, 0]] = axis
     valid = torch.from_numpy(rng.random(len(points)) < 0.9)
     found = absorb_points(
-        points, normals, labels, neighbors, planes, valid=valid, max_angle_deg=30.0
+        points,
+        labels,
+        NearestPoints(neighbors),
+        planes,
+        reach,
+        valid=valid,
+        normals=normals,
+        max_angle_deg=30.0,
     )
-    expected = absorbed_one_by_one(points, normals, labels, neighbors, planes, valid, 30.0)
+    expected = absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid, 30.0)
     assert found.tolist() == expected
     assert (found >= 0).sum() > (labels >= 0).sum()
 
 
 def test_contacts_of_touching_regions_are_counted():
     neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
-    pairs, counts = count_contacts(torch.tensor([0, 1, 1]), neighbors)
+    pairs, counts = NearestPoints(neighbors).contacts(torch.tensor([0, 1, 1]))
     assert (pairs.tolist(), counts.tolist()) == ([[0, 1]], [2])
-    assert contact_neighbors(neighbors)[0].tolist() == [[1], [0], [1]]
+    assert NearestPoints(neighbors).around(torch.arange(3)).tolist() == [[1], [0], [1]]
+
+
+def test_entries_that_are_no_neighbours_are_beside_no_point():
+    valid = torch.tensor([[True, True], [True, False], [True, False]])
+    beside = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 2], [2, 0]]), valid))
+    assert beside.around(torch.tensor([0, 1, 2])).tolist() == [[1], [1], [2]]
+    assert beside.around(slice(1, 3)).tolist() == [[1], [2]]
+    assert beside.reached(torch.tensor([0, 1]), torch.tensor([2])).tolist() == []
+    assert beside.contacts(torch.tensor([0, 1, 2]))[0].tolist() == [[0, 1]]
+
+
+def test_planes_are_fitted_again_only_when_labels_have_changed():
+    cloud, _ = flat_cloud(sheet(np.random.default_rng(0)))
+    fits = RegionFits(cloud, OFF)
+    labels = (cloud.points[:, 0] > 0.5).long()
+    planes = fits.of(labels)
+    assert fits.of(labels.clone()) is planes
+    other = (cloud.points[:, 0] > 0.6).long()
+    assert torch.equal(fits.of(other).center, fit_regions(cloud, other, OFF).center)
 
 
 def test_touching_pieces_of_one_plane_are_merged():
@@ -153,7 +177,7 @@ def test_pieces_across_a_gap_are_not_merged():
     points[points[:, 0] > 0.5, 0] += 0.07
     cloud, _ = flat_cloud(points, k=50)
     labels = (cloud.points[:, 0] > 0.5).long()
-    assert len(count_contacts(labels, cloud.neighbors)[0]) == 0
+    assert len(NearestPoints(cloud.neighbors).contacts(labels)[0]) == 0
     refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
     assert torch.equal(refined, labels)
 
@@ -167,7 +191,7 @@ def test_a_step_or_a_bend_is_not_merged(noise):
     for points in (step, bend):
         cloud, _ = flat_cloud(points)
         labels = (cloud.points[:, 0] > 0.5).long()
-        assert len(count_contacts(labels, cloud.neighbors)[0]) == 1
+        assert len(NearestPoints(cloud.neighbors).contacts(labels)[0]) == 1
         refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
         assert torch.equal(refined, labels)
 
@@ -193,12 +217,11 @@ def test_planes_of_large_regions_are_those_of_all_their_points():
     cloud = cloud._replace(normals=normals)
     found = fit_regions(cloud, labels, OFF)
     full = fit_planes(Segments(labels), cloud.points, cloud.normals)
-    assert found.fit.num_points.tolist() == [10_000, 10_000]
+    assert found.num_points.tolist() == [10_000, 10_000]
     torch.testing.assert_close(found.thickness, full.thickness, rtol=0.03, atol=0)
-    assert (found.fit.normal * full.normal).sum(dim=1).min() > np.cos(np.radians(0.02))
+    assert (found.normal * full.normal).sum(dim=1).min() > np.cos(np.radians(0.02))
     away = found.distances(cloud.points, labels)
-    in_order = torch.empty_like(away).index_copy_(0, Segments(labels).rows, full.residuals.abs())
-    assert (away - in_order).abs().max() < 1e-3
+    assert (away - full.distances(cloud.points, labels)).abs().max() < 1e-3
 
 
 def scattered(rng, count, angle_deg):
@@ -214,13 +237,13 @@ def test_scattered_normals_make_a_region_curved_only_where_noise_does_not_explai
     cloud, _ = flat_cloud(strip, normals=scattered(rng, 400, 10.0))
     whole = torch.zeros(400, dtype=torch.int64)
     reach = torch.full((400,), 4 * 0.002)
-    assert fit_regions(cloud, whole, OFF).fit.curved.tolist() == [True]
+    assert fit_regions(cloud, whole, OFF).curved.tolist() == [True]
     found = fit_regions(cloud._replace(reach=reach), whole, OFF)
-    assert (found.fit.curved.tolist(), found.bent.tolist()) == ([False], [False])
+    assert (found.curved.tolist(), found.bent.tolist()) == ([False], [False])
     assert found.noise.item() == pytest.approx(0.002, rel=0.2)
     for unknown in (reach / 4, torch.full_like(reach, torch.inf)):
         found = fit_regions(cloud._replace(reach=unknown), whole, OFF)
-        assert (found.fit.curved.tolist(), found.noise.tolist()) == ([True], [0.0])
+        assert (found.curved.tolist(), found.noise.tolist()) == ([True], [0.0])
 
 
 @pytest.mark.parametrize("width", [0.2, 1.0])

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions.edges import GrowingCloud
-from torchrg.regions.refine import RimPlanes, settle_rims
+from torchrg.regions.fit import fit_planes
+from torchrg.regions.repair import refine_borders
 from torchrg.structures import UNLABELED
 
 NOISE = 0.003
@@ -25,8 +27,8 @@ def floor_and_wall(rng, num_points=6000, width=0.5, angle_deg=90.0):
     return points, truth, normals
 
 
-def settled(points, labels, normals, valid=None, reach=9e-3):
-    """Labels after settling, in the order of the points."""
+def refined(points, labels, normals, valid=None, reach=9e-3):
+    """Labels after refinement, in the order of the points."""
     points = torch.tensor(points)
     order = canonical_order(points)
     placed = points[order]
@@ -40,9 +42,10 @@ def settled(points, labels, normals, valid=None, reach=9e-3):
         valid[order],
     )
     count = len(normals)
-    sizes = torch.full((count,), NOISE).double(), torch.full((count,), reach).double()
-    planes = RimPlanes(normals, torch.zeros(count, 3).double(), *sizes)
-    found = settle_rims(cloud, torch.as_tensor(labels)[order], planes)
+    planes = fit_planes(Segments(torch.arange(count)), torch.zeros(count, 3).double(), normals)
+    planes = planes._replace(thickness=torch.full((count,), NOISE).double())
+    reach = torch.full((count,), reach).double()
+    found = refine_borders(cloud, torch.as_tensor(labels)[order], planes, reach)
     return torch.empty_like(found).index_copy_(0, order, found)
 
 
@@ -54,7 +57,7 @@ def nearest_plane(points, normals):
 def test_the_line_where_two_planes_meet_halves_the_errors_of_the_nearest_plane(angle_deg):
     points, truth, normals = floor_and_wall(np.random.default_rng(0), angle_deg=angle_deg)
     labels = nearest_plane(points, normals)
-    found = settled(points, labels, normals).numpy()
+    found = refined(points, labels, normals).numpy()
     assert (found != truth).sum() < 0.7 * (labels != truth).sum()
 
 
@@ -62,7 +65,7 @@ def test_points_without_a_label_join_what_they_lie_on():
     points, truth, normals = floor_and_wall(np.random.default_rng(1))
     labels = np.where(points[:, 0] > -0.02, UNLABELED, truth)
     labels[(truth == 1) & (points[:, 2] > 0.02)] = 1
-    found = settled(points, labels, normals).numpy()
+    found = refined(points, labels, normals).numpy()
     assert (found == truth).mean() > 0.99
 
 
@@ -73,7 +76,7 @@ def test_points_far_from_every_plane_and_invalid_ones_stay_as_they_are():
     labels[:600] = UNLABELED
     valid = torch.arange(len(points)) >= 600
     valid[:300] = True
-    found = settled(points, labels, normals, valid=valid)
+    found = refined(points, labels, normals, valid=valid)
     assert (found[300:600] == UNLABELED).all()
     off = torch.tensor((np.abs(points @ normals.T) > 9e-3).all(axis=1))[:300]
     assert off.sum() > 100
@@ -86,7 +89,7 @@ def test_a_face_that_goes_on_behind_another_does_not_end_there():
     beyond = points[truth == 0][::8] * [-1, 1, 1]
     points = np.concatenate([points, beyond])
     truth = np.concatenate([truth, np.zeros(len(beyond), dtype=int)])
-    found = settled(points, truth, normals).numpy()
+    found = refined(points, truth, normals).numpy()
     behind = (truth == 0) & (points[:, 0] > 0.004)
     assert (found[behind] == 0).all()
 
@@ -94,19 +97,19 @@ def test_a_face_that_goes_on_behind_another_does_not_end_there():
 def test_regions_that_are_not_flat_or_nearly_parallel_keep_their_points():
     points, truth, normals = floor_and_wall(np.random.default_rng(4))
     labels = np.where(np.abs(points[:, 0]) < 0.01, 0, truth)
-    kept = settled(points, labels, normals, reach=float("nan"))
+    kept = refined(points, labels, normals, reach=float("nan"))
     assert torch.equal(kept, torch.tensor(labels))
     labels = (points[:, 1] > 0.5).astype(int)
     flat = truth == 0
     tilted = np.array([[0.0, 0, 1], [0, np.sin(0.1), np.cos(0.1)]])
-    found = settled(points[flat], labels[flat], tilted, reach=1.0)
+    found = refined(points[flat], labels[flat], tilted, reach=1.0)
     assert torch.equal(found, torch.tensor(labels[flat]))
 
 
 def test_order_and_unit_change_nothing(rng):
     points, _, normals = floor_and_wall(np.random.default_rng(5), 3000)
     labels = nearest_plane(points, normals)
-    found = settled(points, labels, normals)
+    found = refined(points, labels, normals)
     assert not torch.equal(found, torch.tensor(labels))
     order = torch.randperm(len(points), generator=rng)
-    assert torch.equal(settled(points[order], labels[order], normals), found[order])
+    assert torch.equal(refined(points[order], labels[order], normals), found[order])

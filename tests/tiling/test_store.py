@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError, FormatError
-from torchrg.regions.adjacency import contact_neighbors
+from torchrg.regions.adjacency import NearestPoints
 from torchrg.store import FolderStore
 from torchrg.structures import Neighbors
 
@@ -47,10 +47,10 @@ def test_rows_on_disk_are_those_of_the_array(kept):
 
 def test_nearest_neighbors_are_columns_that_stay_on_disk(kept):
     store, arrays = kept
-    nearest, counted = contact_neighbors(Neighbors(store.lazy("lists")))
+    beside = NearestPoints(Neighbors(store.lazy("lists")))
     rows = torch.tensor([4, 4999, 4, 77])
-    np.testing.assert_array_equal(nearest[rows], arrays["lists"][rows, 1:9])
-    assert nearest.shape == counted.shape == (5000, 8)
+    np.testing.assert_array_equal(beside.around(rows), arrays["lists"][rows, 1:9])
+    assert beside.neighbors.indices.shape == (5000, 8)
     np.testing.assert_array_equal(store.lazy("lists")[rows, 0], arrays["lists"][rows, 0])
 
 

@@ -4,7 +4,7 @@ import torch
 
 from torchrg.depth.growth import InverseCloud, move_to_creases
 from torchrg.linalg.moments import Segments
-from torchrg.regions.planes import fit_planes
+from torchrg.regions.fit import fit_planes
 
 
 def moved(image, step, *, fill):

@@ -10,7 +10,7 @@ from torchrg.config import SuperpointsConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.scenes import make_room
-from torchrg.transforms import EstimateNormals, GrowRegions, SegmentPlanes, Superpoints
+from torchrg.transforms import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
 
 
 @pytest.fixture(scope="module")
@@ -101,21 +101,22 @@ def test_normals_then_regions_with_the_residual_are_the_whole_method():
 
 def test_superpoints_are_those_of_the_function(coord):
     sample = SegmentPlanes("classic")({"coord": coord, "color": coord * 0})
-    found = Superpoints(strengths=(0.2,), min_size=5)(sample)
+    found = MakeSuperpoints(strengths=(0.2,), min_size=5)(sample)
     config = SuperpointsConfig(strengths=(0.2,), min_size=5)
     seg = segment_planes(coord, load_config("classic"))
     expected = make_superpoints(coord, seg, config).labels
     assert torch.equal(found["superpoint"], expected)
     assert set(found) == {*sample, "superpoint"}
-    assert repr(pickle.loads(pickle.dumps(Superpoints(config)))) == repr(Superpoints(config))
+    step = MakeSuperpoints(config)
+    assert repr(pickle.loads(pickle.dumps(step))) == repr(step)
 
 
 def test_superpoints_read_colours_where_they_are_asked_to(coord):
     color = torch.where(coord[:, :1] < coord[:, 0].mean(), 255.0, 0.0).expand(-1, 3)
     sample = {**SegmentPlanes("classic")({"coord": coord}), "color": color}
-    plain, colored = Superpoints()(sample), Superpoints(white=255)(sample)
+    plain, colored = MakeSuperpoints()(sample), MakeSuperpoints(white=255)(sample)
     assert len(plain["superpoint"].unique()) < len(colored["superpoint"].unique())
     with pytest.raises(ConfigError, match="white > 0"):
-        Superpoints(white=0)
+        MakeSuperpoints(white=0)
     with pytest.raises(ConfigError, match="expected a sample with 'plane'"):
-        Superpoints()({"coord": coord, "normal": coord})
+        MakeSuperpoints()({"coord": coord, "normal": coord})

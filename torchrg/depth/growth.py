@@ -11,12 +11,10 @@ from torchrg.config import DepthConfig
 from torchrg.depth.normals import PixelPlanes
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
-from torchrg.regions.faces import merge_coplanar
+from torchrg.regions.fit import BISQUARE_CUT, RegionPlanes
 from torchrg.regions.growth import number_by_size
-from torchrg.regions.planes import FittedPlanes
-from torchrg.regions.refine import reach_of_planes
+from torchrg.regions.repair import absorb_points, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
-from torchrg.structures import UNLABELED
 
 _AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
 """Steps in rows and columns to those around a pixel that come after it."""
@@ -27,25 +25,22 @@ _NUM_PASSES = 2
 """Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
 
 _CURVED = 3.0
-"""A region this many times thicker than its noise is no plane,"""
+"""Times the noise. A region that is no thicker is a plane, however it is bent."""
 
 _BENT = 0.03
-"""if it is also thicker than this share of its own extent: a slightly bent face is a face. A column
-has 0.4."""
+"""Share of a region's own extent. One that is no thicker than this is a plane, too: a slightly bent
+face is a face. A column is 0.4 of its extent thick."""
 
 _NUM_FITS = 2
 """A plain fit and a reweighted one: pixels that grew into a region are near its plane already."""
 
-_BISQUARE_CUT = 4.685
-"""Pixels this many standard deviations from a region's plane have no weight in it."""
-
 _ALIKE = 1.75
-"""Normals of two windows that both hold both pixels may differ by this many times the angle: on a
-column large windows turn by more than the angle from one cell to the next,"""
+"""Times the angle. Normals of two windows that both hold both pixels may differ by so much: on a
+column large windows turn by more than the angle from one cell to the next."""
 
 _SLOPE_NOISE = 1.0
-"""or by as much as makes their slopes differ by this many standard deviations: small windows of a
-narrow face turn by noise alone."""
+"""Standard deviations. Slopes of two such windows may also differ by this, whatever the angle:
+small windows of a narrow face turn by noise alone."""
 
 _MOST_MOVES = 16
 """In pixels: windows hardly reach farther from their middle."""
@@ -82,7 +77,7 @@ def grow_pixels(
     ``(H, W, 3)`` are within the angle, and at both pixels their two planes differ by at most
     ``max_step`` times what a flat window may deviate by: no region crosses a step. Where both
     windows hold both pixels the angle may be larger: a crease between the pixels would lie within
-    two flat windows. Regions are what hangs together by such pairs.
+    two flat windows. Regions are the connected components of such pairs.
 
     ``u`` ``(W,)`` and ``v`` ``(H, 1)`` count columns and rows from the optical axis.
 
@@ -137,7 +132,7 @@ def _joins(
 
 
 def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
-    """Return the parts of an image that hang together ``(H * W,)``, -1 where it is not flat.
+    """Return the connected components of an image ``(H * W,)``, -1 where it is not flat.
 
     From which pixels join the next one, ``(H - 1, W)`` and ``(H, W - 1)``. On a grid with a place
     for each pixel and each pair they are the connected components of scipy.
@@ -153,47 +148,62 @@ def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
     return torch.from_numpy(parts.ravel() - 1).to(flat.device)
 
 
-def _pixels_around(pixels: Tensor, shape: torch.Size) -> Tensor:
-    """Return the pixels around each of some ``(n,)``, by row-major place, shape ``(n, 8)``.
+class PixelGrid:
+    """Who is beside whom in an image: the eight pixels around each one, by row-major place.
 
-    For those outside of the image stand the nearest inside.
+    As :class:`torchrg.regions.repair.Beside` asks for it.
+
+    Args:
+        shape: Rows and columns.
     """
-    height, width = shape
-    down, right = torch.tensor(_AROUND, device=pixels.device).T
-    row = (pixels[:, None] // width + down).clamp(0, height - 1)
-    column = (pixels[:, None] % width + right).clamp(0, width - 1)
-    around: Tensor = row * width + column
-    return around
 
+    def __init__(self, shape: torch.Size) -> None:
+        self.height, self.width = shape
 
-def _border_pixels(labels: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """Return the pairs of pixels of two regions side by side, each once, by row-major place."""
-    pairs = []
-    for down, right in _AHEAD:
-        step = down * width + right
-        here = places_of(labels[: max(len(labels) - step, 0)] != labels[step:])
-        column = here % width + right
-        has_next = (column >= 0) & (column < width)
-        here = here[has_next & (labels[here] >= 0) & (labels[here + step] >= 0)]
-        pairs.append((here, here + step))
-    first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
-    return first, second
+    def around(self, rows: Tensor) -> Tensor:
+        """Return the pixels around each of some ``(n,)``, shape ``(n, 8)``.
 
+        For those outside of the image stand the nearest inside.
+        """
+        down, right = torch.tensor(_AROUND, device=rows.device).T
+        row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
+        column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
+        around: Tensor = row * self.width + column
+        return around
 
-def _contacts(labels: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """Do as :func:`torchrg.regions.adjacency.count_contacts` where pixels side by side touch."""
-    regions = torch.stack([labels[pixels] for pixels in _border_pixels(labels, width)])
-    num_regions = int(labels.max()) + 1
-    keys = regions.amin(dim=0) * num_regions + regions.amax(dim=0)
-    keys, counts = torch.unique(keys, return_counts=True)
-    # Either pixel is a neighbour of the other.
-    return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
+    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
+        """Return those of the pixels that have a new one beside them."""
+        is_reached = waiting.new_zeros(self.height * self.width, dtype=torch.bool)
+        is_reached[self.around(new)] = True
+        return waiting[is_reached[waiting]]
+
+    def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pairs of regions that touch, and the number of contacts of each pair."""
+        regions = torch.stack([labels[pixels] for pixels in self.borders(labels)])
+        num_regions = int(labels.max()) + 1
+        keys = regions.amin(dim=0) * num_regions + regions.amax(dim=0)
+        keys, counts = torch.unique(keys, return_counts=True)
+        # Either pixel is beside the other.
+        return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
+
+    def borders(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pairs of pixels of two regions side by side, each once."""
+        pairs = []
+        for down, right in _AHEAD:
+            step = down * self.width + right
+            here = places_of(labels[: max(len(labels) - step, 0)] != labels[step:])
+            column = here % self.width + right
+            has_next = (column >= 0) & (column < self.width)
+            here = here[has_next & (labels[here] >= 0) & (labels[here + step] >= 0)]
+            pairs.append((here, here + step))
+        first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
+        return first, second
 
 
 def _refine(
     cloud: InverseCloud, labels: Tensor, config: DepthConfig
-) -> tuple[Tensor, FittedPlanes]:
-    """Settle borders and parts of the regions of a depth image.
+) -> tuple[Tensor, RegionPlanes]:
+    """Give border pixels and parts of one face to the regions of a depth image.
 
     Twice, pixels without a region join the one beside them whose plane they are on, and flat
     regions that touch and lie on one plane are merged. Then borders between regions move to the
@@ -202,35 +212,31 @@ def _refine(
     At least one pixel has a label. Returns labels by descending size, and the planes of the regions
     in the cloud; curved are those thicker than noise and a slight bend can make them.
     """
+    beside, seen = PixelGrid(cloud.seen.shape), cloud.seen.flatten()
     for _ in range(_NUM_PASSES):
-        fit, noise = _fit(cloud, labels)
-        reach = reach_of_planes(fit, noise, config.absorb_reach)
-        labels = absorb_pixels(cloud, labels, fit, reach)
-        contacts = _contacts(labels, cloud.seen.shape[1])
-        merged = merge_coplanar(labels, contacts, fit, noise, tolerance=config.merge_tolerance)
+        planes = fit_inverse_planes(cloud, labels)
+        reach = planes.times_thickness(config.absorb_reach)
+        labels = absorb_points(cloud.points, labels, beside, planes, reach, valid=seen)
+        contacts, tolerance = beside.contacts(labels), config.merge_tolerance
+        merged = merge_coplanar(labels, contacts, planes, tolerance=tolerance)
         labels = number_by_size(merged, config.min_size)
-    fit, noise = _fit(cloud, labels)
-    reach = reach_of_planes(fit, noise, config.absorb_reach)
-    moved = move_to_creases(cloud, labels, fit, reach)
+    planes = fit_inverse_planes(cloud, labels)
+    reach = planes.times_thickness(config.absorb_reach)
+    moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
-    return labels, _fit(cloud, labels)[0]
+    return labels, fit_inverse_planes(cloud, labels)
 
 
-def _fit(cloud: InverseCloud, labels: Tensor) -> tuple[FittedPlanes, Tensor]:
-    """Return the planes of the regions, and the noise of each, shape ``(M,)``."""
-    segments = Segments(labels)
-    noise = segments.mean(segments.take(cloud.noise))
-    return fit_regions(segments, cloud.points, noise), noise
-
-
-def fit_regions(segments: Segments, points: Tensor, noise: Tensor) -> FittedPlanes:
+def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, which alone has noise.
 
-    A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.planes.fit_planes` has;
-    the thickness, along the normals, is never taken for less than the ``noise`` ``(M,)`` there.
-    Curved is what is thicker than noise and a slight bend can make it.
+    A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.fit.fit_planes` has; the
+    thickness, along the normals, is never taken for less than the mean noise of the region. Curved
+    is what is thicker than noise and a slight bend can make it.
     """
-    columns = segments.take_columns(points)
+    segments = Segments(labels)
+    noise = segments.mean(segments.take(cloud.noise))
+    columns = segments.take_columns(cloud.points)
     x, y, w = columns
     weights = torch.ones_like(w)
     for last in range(_NUM_FITS):
@@ -247,55 +253,29 @@ def fit_regions(segments: Segments, points: Tensor, noise: Tensor) -> FittedPlan
         thickness = MAD_FACTOR * segments.median(residuals.abs())
         if last == _NUM_FITS - 1:
             break
-        ratio = residuals / segments.spread(_BISQUARE_CUT * torch.maximum(thickness, noise))
+        ratio = residuals / segments.spread(BISQUARE_CUT * torch.maximum(thickness, noise))
         weights = (1 - ratio * ratio).clamp(min=0).square()
     normal = torch.cat([-slopes, torch.ones_like(slopes[:, :1])], dim=1)
     length = normal.norm(dim=1, keepdim=True)
     # In the distance d of a plane from the camera, w is 1 / d of the cosine along a ray.
     nearness = torch.cat([slopes, offset[:, None]], dim=1).norm(dim=1)
     extent = torch.linalg.eigvalsh(covariance[:, :2, :2])[:, 0].clamp(min=0).sqrt()
-    return FittedPlanes(
+    return RegionPlanes(
         normal / length,
         center,
-        normal / length,
         covariance,
-        thickness / length.squeeze(1),
-        residuals,
-        segments.counts,
-        thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
+        torch.maximum(thickness / length.squeeze(1), noise),
+        rms=segments.mean(residuals * residuals).sqrt() / length.squeeze(1),
+        num_points=segments.counts,
+        curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
+        floor=noise,
+        reach=torch.full_like(noise, torch.inf),
+        bent=torch.zeros_like(noise, dtype=torch.bool),
     )
 
 
-def absorb_pixels(cloud: InverseCloud, labels: Tensor, fit: FittedPlanes, reach: Tensor) -> Tensor:
-    """Give pixels without a region to regions they touch, until none can be given.
-
-    This is :func:`torchrg.regions.refine.absorb_points` without an angle, where whoever is beside a
-    pixel has it beside itself: after the first time, only pixels beside those that joined are
-    looked at. ``reach`` ``(M,)`` is that of the planes, NaN where a region takes none.
-    """
-    labels, offset = labels.clone(), (fit.normal * fit.center).sum(dim=1)
-    free = (labels == UNLABELED) & cloud.seen.flatten()
-    rows = free.nonzero().squeeze(1)
-    while len(rows):
-        near = labels[_pixels_around(rows, cloud.seen.shape)]
-        touches = (near >= 0).any(dim=1)
-        rows, near = rows[touches], near[touches]
-        region = near.clamp(min=0)
-        away = (cloud.points[rows][:, None] * fit.normal[region]).sum(dim=2) - offset[region]
-        away = torch.where((near >= 0) & (away.abs() <= reach[region]), away.abs(), torch.inf)
-        least = away.amin(dim=1, keepdim=True)
-        joined = least.squeeze(1).isfinite()
-        choice = torch.where(away == least, near, len(offset)).amin(dim=1)
-        rows = rows[joined]
-        labels[rows] = choice[joined]
-        free[rows] = False
-        beside = _pixels_around(rows, cloud.seen.shape)
-        rows = torch.unique(beside[free[beside]])
-    return labels
-
-
 def move_to_creases(
-    cloud: InverseCloud, labels: Tensor, fit: FittedPlanes, reach: Tensor
+    cloud: InverseCloud, labels: Tensor, fit: RegionPlanes, reach: Tensor
 ) -> Tensor:
     """Move borders between flat regions to where their planes meet.
 
@@ -311,9 +291,10 @@ def move_to_creases(
     planes = torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
     middles = torch.cat([fit.center[:, :2], torch.ones_like(offset)], dim=1)
     labels = labels.clone()
-    rows = torch.unique(torch.cat(_border_pixels(labels, cloud.seen.shape[1])))
+    grid = PixelGrid(cloud.seen.shape)
+    rows = torch.unique(torch.cat(grid.borders(labels)))
     for _ in range(_MOST_MOVES):
-        around = _pixels_around(rows, cloud.seen.shape)
+        around = grid.around(rows)
         near = labels[around]
         other = (near >= 0) & (near != labels[rows][:, None])
         at_border = other.any(dim=1)

@@ -27,7 +27,7 @@ from torchrg.io.npy import (
 from torchrg.io.pcd import count_pcd, open_pcd, write_pcd
 from torchrg.io.ply import count_ply, open_ply, write_ply
 from torchrg.io.stream import (
-    CHUNK_SIZE,
+    POINTS_A_CHUNK,
     SILENT,
     CloudStream,
     Table,
@@ -133,7 +133,7 @@ def stream_cloud(
     path: str | os.PathLike[str],
     *,
     columns: Sequence[str] | None = None,
-    chunk_size: int = CHUNK_SIZE,
+    chunk_size: int = POINTS_A_CHUNK,
 ) -> CloudStream:
     r"""Read a point cloud in chunks, for clouds larger than memory; the suffix says how.
 
@@ -255,7 +255,7 @@ def write_cloud(
         for name, values in cloud.fields.items():
             check_length(target, name, values, len(cloud))
         points = checked_coordinates(target, cloud.coordinates)
-        stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=CHUNK_SIZE)
+        stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=POINTS_A_CHUNK)
     else:
         stream = cloud
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):

@@ -38,7 +38,7 @@ from torchrg.io.fields import (
     rule_for,
 )
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
-from torchrg.io.stream import CHUNK_SIZE, CloudStream, Table, slices
+from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Table, slices
 from torchrg.structures import PLANE_KINDS, PlaneAdjacency, Planes, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
@@ -218,12 +218,12 @@ def _field(stream: CloudStream, name: str) -> Iterator[NDArray[Any]]:
 
 def _cut(values: Tensor) -> Iterator[NDArray[Any]]:
     """Give the rows of a tensor in chunks."""
-    return (values[rows].numpy(force=True) for rows in slices(len(values), CHUNK_SIZE))
+    return (values[rows].numpy(force=True) for rows in slices(len(values), POINTS_A_CHUNK))
 
 
 def _level(superpoints: Superpoints, name: str) -> Iterator[NDArray[Any]]:
     """Give a level of superpoints in chunks."""
-    for rows in slices(len(superpoints.labels), CHUNK_SIZE):
+    for rows in slices(len(superpoints.labels), POINTS_A_CHUNK):
         yield superpoints.rows(rows).by_level()[name]
 
 

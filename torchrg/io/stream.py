@@ -27,7 +27,7 @@ from torchrg.io.fields import (
 )
 from torchrg.structures import Cloud, origin_of_box
 
-CHUNK_SIZE = 1 << 20
+POINTS_A_CHUNK = 1 << 20
 """Points of a chunk: tens of megabytes, and few enough calls for each that they do not count."""
 SILENT: dict[str, Any] = {"over": "ignore", "invalid": "ignore"}
 """Files may hold any bits as numbers: values that overflow or signal are kept, not reported."""
@@ -130,7 +130,7 @@ class CloudStream:
     measure: Callable[[], "Extent"] | None = None
 
     @classmethod
-    def of(cls, cloud: Cloud, *, chunk_size: int = CHUNK_SIZE) -> "CloudStream":
+    def of(cls, cloud: Cloud, *, chunk_size: int = POINTS_A_CHUNK) -> "CloudStream":
         """Cut a cloud into chunks, which are views of it."""
 
         def cut() -> Iterator[Cloud]:

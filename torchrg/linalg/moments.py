@@ -250,7 +250,7 @@ def along(columns: Columns, axes: Tensor) -> Tensor:
     return (x * a).add_(y * b).add_(z * c)
 
 
-def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Fit a plane to each neighbourhood by least squares with weights ``(n, K)``, not negative.
 
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset``, and the
@@ -262,7 +262,7 @@ def fit_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Fit a plane to the neighbours with each of several weights; see :func:`fit_planes`.
+    """Fit a plane to the neighbours with each of several weights; see :func:`fit_weighted_planes`.
 
     Returns unit normals ``(n, 3)`` and offsets ``(n,)`` for each.
     """

@@ -329,8 +329,7 @@ def _near_obstacles(points: Tensor, normals: Tensor, neighbors: Neighbors) -> tu
         height = (patches * normals[chunk, None]).sum(dim=-1)
         sq_distance = (patches * patches).sum(dim=-1)
         steep = height * height > _STEEP * _STEEP * sq_distance
-        if neighbors.valid is not None:
-            steep &= neighbors.valid[chunk]
+        steep &= neighbors.counted(chunk)
         ahead = torch.where(steep & (height > 0), height, torch.inf).amin(dim=-1)
         behind = torch.where(steep & (height < 0), -height, torch.inf).amin(dim=-1)
         return ahead, behind

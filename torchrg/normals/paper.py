@@ -62,13 +62,10 @@ def find_sharp_points(
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
 
     def classify(block: slice) -> None:
-        indices = neighbors.indices[block]
-        counted = None if neighbors.valid is None else neighbors.valid[block]
-        if valid is not None:
-            has_normal = valid.index_select(0, indices.reshape(-1)).view(indices.shape)
-            counted = has_normal if counted is None else counted & has_normal
-        near = [c.index_select(0, indices.reshape(-1)).view(indices.shape) for c in columns]
-        chords = sq_chords([component[:, :1] for component in near], near)
+        near = neighbors.at(block)
+        counted = near.valid if valid is None else near.counted() & near.of(valid)
+        around = [near.of(column) for column in columns]
+        chords = sq_chords([component[:, :1] for component in around], around)
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
         sharp[block] = exceeds(chords, counted, angle_deg)
 

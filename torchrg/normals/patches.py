@@ -34,8 +34,8 @@ def fit_points(
 
     def fit_chunk(chunk: slice) -> NormalFit:
         chosen = chunk if rows is None else rows[chunk]
-        mask = None if neighbors.valid is None else neighbors.valid[chosen]
-        patches = gather_patches(points, neighbors.indices[chosen])
+        indices, mask = neighbors.at(chosen)
+        patches = gather_patches(points, indices)
         own = {name: values[chosen] for name, values in of_points.items()}
         return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **own)
 

@@ -2,7 +2,7 @@
 
 from torchrg.regions.axes import align_axes
 from torchrg.regions.growth import grow_regions
-from torchrg.regions.planes import summarize_planes
 from torchrg.regions.superpoints import partition_points
+from torchrg.regions.table import summarize_planes
 
 __all__ = ["align_axes", "grow_regions", "partition_points", "summarize_planes"]

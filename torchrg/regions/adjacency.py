@@ -12,21 +12,23 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of, places_of
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.structures import Neighbors, PlaneAdjacency
+from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
-_NUM_CONTACTS = 8
+NUM_CONTACTS = 8
 """So many neighbours surround a point of a surface; more reach across gaps."""
 
-_LEAST_CONTACTS = 3
-"""Regions that touch in fewer edges do not meet: one may be an outlier's."""
+LEAST_CONTACTS = 3
+"""Regions that touch in fewer edges neither meet nor are merged: one may be an outlier's."""
 
-_PARALLEL_DEG = 15.0
-"""At a smaller angle the line in which two planes cross may be far from where they meet."""
+PARALLEL_DEG = 15.0
+"""At a smaller angle the line in which two planes cross may be far from where the faces end."""
 
 _REACH = 4.0
+"""Thicknesses of the planes. An edge that leads across them by no more is within their noise."""
+
 _MAX_STEEPNESS = 0.25
-"""An edge that leads farther across the planes than this many times their thickness, and than a
-quarter of the way to the 8th neighbour, leads to a parallel surface."""
+"""Share of the way to the 8th neighbour. An edge that leads across the planes by no more follows
+the surface. One that leads farther than this and than the noise goes to a parallel surface."""
 
 
 def find_adjacency(
@@ -58,14 +60,14 @@ def find_adjacency(
     pairs = border.pairs
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
     angle = unsigned_angle_deg(first, second)
-    crossing = (angle > _PARALLEL_DEG) & ~curved[pairs].any(dim=1)
+    crossing = (angle > PARALLEL_DEG) & ~curved[pairs].any(dim=1)
     reach = _REACH * thickness[pairs].amax(dim=1)
     lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
     for contacts in border.contacts():
         is_crossing = crossing[contacts.pair]
         on_lines = _select(contacts, is_crossing)
         lines.add(on_lines.pair, _edges(points, on_lines).norm(dim=1))
-        on_curves = _select(contacts, ~is_crossing & (contacts.column <= _NUM_CONTACTS))
+        on_curves = _select(contacts, ~is_crossing & (contacts.column <= NUM_CONTACTS))
         edge, pair = _edges(points, on_curves), on_curves.pair
         across = torch.stack([(edge * side[pair]).sum(dim=1) for side in (first, second)])
         spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
@@ -79,27 +81,51 @@ def find_adjacency(
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
     length = _length_on_line(points, border, along, sizes / on_line)
-    kept = on_line + on_curve >= _LEAST_CONTACTS
+    kept = on_line + on_curve >= LEAST_CONTACTS
     return PlaneAdjacency(pairs[kept], torch.where(crossing, length, shares)[kept], angle[kept])
 
 
-def contact_neighbors(neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the (at most) 8 nearest neighbours of each point ``(N, n)``, and which count."""
-    columns = slice(1, _NUM_CONTACTS + 1)
-    nearest = neighbors.indices[:, columns]
-    if neighbors.valid is None:
-        return nearest, torch.ones((), dtype=torch.bool, device=nearest.device).expand_as(nearest)
-    return nearest, neighbors.valid[:, columns]
+class NearestPoints:
+    """Who is beside whom in a cloud: the 8 nearest neighbours, at most, are beside each point.
 
-
-def count_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the pairs of regions that touch, and the number of contacts of each pair.
-
-    Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending, and
-    counts ``(E,)``.
+    Example:
+        >>> beside = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
+        >>> beside.around(torch.tensor([2, 0])).tolist()
+        [[1], [1]]
+        >>> beside.contacts(torch.tensor([0, 1, 1]))
+        (tensor([[0, 1]]), tensor([2]))
     """
-    border = _Border(labels, Neighbors(*contact_neighbors(neighbors)))
-    return border.pairs, border.counts
+
+    def __init__(self, neighbors: Neighbors) -> None:
+        columns, valid = slice(1, NUM_CONTACTS + 1), neighbors.valid
+        valid = None if valid is None else valid[:, columns]
+        self.neighbors = Neighbors(neighbors.indices[:, columns], valid)
+
+    def around(self, rows: Rows) -> Tensor:
+        """Return the points beside some, shape ``(n, 8)``; where there are fewer, the point."""
+        near, counted = self.neighbors.at(rows)
+        if counted is None:
+            return near
+        own = rows
+        if isinstance(own, slice):
+            own = torch.arange(len(self.neighbors.indices), device=near.device)[own]
+        return torch.where(counted, near, own[:, None].to(near.dtype))
+
+    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
+        """Return those of the rows that have a new one beside them."""
+        num_points = len(self.neighbors.indices)
+        is_new = torch.zeros(num_points, dtype=torch.bool, device=waiting.device)
+        is_new[new] = True
+        return waiting[is_new[self.around(waiting)].any(dim=1)]
+
+    def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pairs of regions that touch, and the number of contacts of each pair.
+
+        Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending,
+        and counts ``(E,)``.
+        """
+        border = _Border(labels, self.neighbors)
+        return border.pairs, border.counts
 
 
 class _Contacts(NamedTuple):
@@ -160,16 +186,16 @@ class _Border:
 
     def _edges_of(self, rows: slice | Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where in the lists of some points other regions are, the lists, and the pairs."""
-        own, targets = self._labels[rows], self._neighbors.indices[rows]
-        other = self._labels.index_select(0, targets.reshape(-1)).view(targets.shape)
+        own, near = self._labels[rows], self._neighbors.at(rows)
+        other = near.of(self._labels)
         touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
-        if self._neighbors.valid is not None:
-            touches &= self._neighbors.valid[rows]
+        if near.valid is not None:
+            touches &= near.valid
         places = places_of(touches)
         first = own.index_select(0, places // self._width)
         second = other.reshape(-1).index_select(0, places)
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
-        return places, targets, lower.long() * self._num_regions + higher
+        return places, near.indices, lower.long() * self._num_regions + higher
 
     def contacts(self) -> Iterator[_Contacts]:
         """Yield all edges, those of some points at a time, in the order of their rows."""
@@ -227,10 +253,7 @@ def _each_once(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance to the last of the contact neighbours of points, and their number."""
-    mask = neighbors.valid
-    nearest, counted = contact_neighbors(
-        Neighbors(neighbors.indices[rows], None if mask is None else mask[rows])
-    )
-    number = counted.sum(dim=1)
-    last = nearest.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
+    nearest = NearestPoints(neighbors).neighbors.at(rows)
+    number = nearest.counted().sum(dim=1)
+    last = nearest.indices.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
     return (points[last].double() - points[rows].double()).norm(dim=1), number

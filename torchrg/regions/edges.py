@@ -7,9 +7,9 @@ one that reads more also raises :data:`EDGE_STEPS`.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +23,6 @@ from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors, Rows
-
-Found = TypeVar("Found")
 
 EDGE_STEPS = 2
 """Steps from neighbour to neighbour, from a point, to all points that decide its edges. A part of a
@@ -51,6 +49,7 @@ class GrowingCloud(NamedTuple):
         colors: Shape ``(N, C)``, floating point, or None.
         max_color_distance: Largest difference of colours across which regions grow.
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0.
+        angle_share: Share of the largest angle between normals across which regions grow.
     """
 
     points: Tensor
@@ -62,6 +61,17 @@ class GrowingCloud(NamedTuple):
     colors: Tensor | None = None
     max_color_distance: float = math.inf
     signed_normals: bool = False
+    angle_share: float = 1.0
+
+
+def is_order_free(config: GrowingConfig) -> bool:
+    """Tell whether what a claimed point does next depends on itself, not on who claimed it."""
+    return config.seed_rule == "curvature" and not promotes_late(config)
+
+
+def promotes_late(config: GrowingConfig) -> bool:
+    """Tell whether any edge of its region makes a point a seed, not only that which claimed it."""
+    return config.connectivity is not None and config.connectivity_scope == "seed"
 
 
 class EdgeLists(NamedTuple):
@@ -87,22 +97,21 @@ def find_coded_edges(
     With late promotion these are only the edges that do make a seed. Then there is a second result:
     which neighbours a point merely claims, shape ``(N, K)``; these are most edges, and lists of
     them would take more time and memory. ``limit`` is that of the curvature, a scalar. Chunks of
-    every size give the same edges.
+    every size, and parts of a cloud with :data:`EDGE_STEPS` around, give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
     indices = cloud.neighbors.indices
-    claims = np.empty(indices.shape, dtype=bool) if config.promotes_late else None
+    claims = np.empty(indices.shape, dtype=bool) if promotes_late(config) else None
 
-    def find(rows: slice) -> _Edges:
+    def find(rows: slice) -> list[_Edges]:
         joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
         becomes_seed = _become_seeds(cloud, config, rows, limit, connected)
         if claims is not None:
             claims[rows] = (joins & ~becomes_seed).cpu().numpy()
             joins &= becomes_seed
-        return _pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)
+        return [_pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)]
 
-    found = _in_chunks(find, cloud, chunk_size)
-    return _pack(found, cloud.neighbors.indices.numel()), claims
+    return _pack(find, cloud, None, chunk_size)[0], claims
 
 
 def find_edges(
@@ -116,26 +125,21 @@ def find_edges(
     """Return the edges of points of at most the curvature limit, and those of all others.
 
     The first have the edges of ``more`` nodes behind them, the second are coded as
-    :func:`find_coded_edges` does. Chunks of every size give the same edges.
+    :func:`find_coded_edges` does. Chunks of every size, and parts of a cloud with
+    :data:`EDGE_STEPS` around, give the same edges.
     """
     shared = _shared_neighbors(cloud, config)
     is_seed = cloud.curvature <= limit
 
-    def find(rows: slice) -> tuple[_Edges, _Edges]:
+    def find(rows: slice) -> list[_Edges]:
         joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
         targets, seeds = cloud.neighbors.indices[rows], is_seed[rows, None]
         coded = targets.to(torch.int32) * 2
-        return _pick(targets, joins & seeds), _pick(coded, joins & ~seeds)
+        return [_pick(targets, joins & seeds), _pick(coded, joins & ~seeds)]
 
-    rest: list[_Edges] = []
-
-    def of_seeds() -> Iterator[_Edges]:
-        for edges, others in _in_chunks(find, cloud, chunk_size):
-            rest.append(others)
-            yield edges
-
-    edges = _pack(of_seeds(), cloud.neighbors.indices.numel(), more)
-    return edges, _pack(rest, sum(len(others.targets) for others in rest))
+    edges, rest = _pack(find, cloud, more, chunk_size)
+    targets, counts = zip(*rest, strict=True)
+    return edges, EdgeLists(np.concatenate([[0], *counts]).cumsum(), np.concatenate(targets))
 
 
 def _become_seeds(
@@ -169,7 +173,8 @@ def accept_edges(
     the edges that it is asked for.
     """
     joins = are_valid(cloud, rows)
-    joins &= within_angle(cloud, rows, config.max_angle_deg, signed=cloud.signed_normals)
+    max_angle_deg = cloud.angle_share * config.max_angle_deg
+    joins &= within_angle(cloud, rows, max_angle_deg, signed=cloud.signed_normals)
     if config.max_distance is not None:
         joins &= within_distance(cloud, rows, cloud.points, config.max_distance)
     if cloud.colors is not None:
@@ -216,31 +221,37 @@ def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
     return _Edges(chosen.cpu().numpy(), np.count_nonzero(accepted.cpu().numpy(), axis=1))
 
 
-def _in_chunks(
-    find: Callable[[slice], Found], cloud: GrowingCloud, chunk_size: int
-) -> Iterator[Found]:
-    """Yield what is found in successive chunks, on as many threads as torch uses."""
-    chunks = chunks_of(len(cloud.points), chunk_size)
+def _pack(
+    find: Callable[[slice], list[_Edges]],
+    cloud: GrowingCloud,
+    more: EdgeLists | None,
+    chunk_size: int,
+) -> tuple[EdgeLists, list[_Edges]]:
+    """Join the first edges of successive chunks, and those of more nodes; collect what is left.
+
+    The edges are found by as many threads as torch uses.
+    """
+    chunks = chunks_of(len(cloud.points), chunk_size) or [slice(0, 0)]
     at_once = _CHUNKS_A_THREAD * allowed_threads()
-    for first in range(0, len(chunks), at_once):
-        yield from map_tasks(find, chunks[first : first + at_once], cloud.points.device)
-
-
-def _pack(found: Iterable[_Edges], most: int, more: EdgeLists | None = None) -> EdgeLists:
-    """Join the edges of successive chunks, at most so many, and those of more nodes behind them."""
-    counts, used, spare = [], 0, 0 if more is None else len(more.targets)
+    spare = 0 if more is None else len(more.targets)
     # As long as it can get: memory that is not used is not touched.
-    targets = np.empty(most + spare, dtype=np.int32)
-    for edges in found:
+    targets = np.empty(cloud.neighbors.indices.numel() + spare, dtype=np.int32)
+    counts, rest, used = [], [], 0
+
+    def append(edges: _Edges) -> None:
+        nonlocal used
         targets[used : used + len(edges.targets)] = edges.targets
         used += len(edges.targets)
         counts.append(edges.counts)
+
+    for first in range(0, len(chunks), at_once):
+        for edges, *others in map_tasks(find, chunks[first : first + at_once], cloud.points.device):
+            append(edges)
+            rest += others
     if more is not None:
-        targets[used : used + spare] = more.targets
-        counts.append(np.diff(more.starts))
+        append(_Edges(more.targets, np.diff(more.starts)))
     dtype = np.int32 if len(targets) < 2**31 else np.int64
-    starts = np.concatenate([[0], *counts]).cumsum(dtype=dtype)
-    return EdgeLists(starts, targets[: used + spare])
+    return EdgeLists(np.concatenate([[0], *counts]).cumsum(dtype=dtype), targets[:used]), rest
 
 
 def are_valid(cloud: GrowingCloud, rows: Rows) -> Tensor:

@@ -3,7 +3,6 @@
 import math
 from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +15,17 @@ from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_op
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
+from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import (
     EdgeLists,
     GrowingCloud,
     find_coded_edges,
     find_edges,
+    is_order_free,
     neighborhood_radii,
 )
-from torchrg.regions.faces import cut_bridges
-from torchrg.regions.planes import LEAST_FITTED
-from torchrg.regions.refine import refine_regions
+from torchrg.regions.fit import LEAST_FITTED, RegionFits
+from torchrg.regions.repair import refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 _LONG_QUEUE = 32
@@ -77,9 +77,9 @@ def grow_regions(
             finite never join.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
             :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
-        colors: Colours of the points, shape ``(N, C)``. Default: they play no part.
+        colors: Colours of the points, shape ``(N, C)``.
         max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
-            unit of the colours) does not join.
+            unit of the colours) does not join. Default: colours play no part.
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0, so that the two
             faces of a thin wall never join. For normals that are oriented.
         canonical: Whether the points already are in canonical order; saves a copy.
@@ -91,8 +91,7 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If the settings ask for residuals, and there are none, or
-            ``max_color_distance`` is given without colours, or negative.
+        ConfigError: If residuals or colours are needed, and there are none.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -108,20 +107,14 @@ def grow_regions(
     config = GrowingConfig() if config is None else config
     cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
-    if colors is not None:
+    if max_color_distance < math.inf:
         cloud = _with_colors(cloud, colors, max_color_distance)
-    elif max_color_distance < math.inf:
-        raise ConfigError(
-            "grow_regions: expected colors, which max_color_distance needs, got None; pass them or "
-            "leave max_color_distance out."
-        )
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    roots = torch.from_numpy(grow(cloud, config, chunk_size)).to(cloud.points.device)
-    labels = label_regions(cloud, roots, config, chunk_size)
+    labels = label_regions(cloud, grow(cloud, config, chunk_size), config, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 
@@ -130,25 +123,21 @@ def label_regions(
 ) -> Tensor:
     """Return labels of regions that have grown, after all that the settings ask for.
 
-    ``roots`` ``(N,)`` are what :func:`grow` gives. This step looks at the whole cloud: regions have
-    no bounded reach.
+    ``roots`` ``(N,)`` are what :func:`grow` gives. This needs the whole cloud, too.
     """
     least = config.min_size
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
         least = min(least, max(least // 2, LEAST_FITTED))
-    labels = number_by_size(roots, least)
+    labels, fits = number_by_size(roots, least), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
-
-        def grow_within(part: GrowingCloud, share: float) -> Tensor:
-            part, strict = _within_share(part, config, share)
-            found = torch.from_numpy(grow(part, strict, chunk_size)).to(part.points.device)
-            return number_by_size(found, config.min_size)
-
-        labels = cut_bridges(cloud, labels, config, grow_within, chunk_size=chunk_size)
-        labels = number_by_size(labels, least)
-    if config.is_refined:
-        labels = number_by_size(refine_regions(cloud, labels, config), config.min_size)
+        mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)
+        if mixed is not None:
+            cores = number_by_size(grow(mixed.part, config, chunk_size), config.min_size)
+            labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
+            labels = number_by_size(labels, least)
+    if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
+        labels = number_by_size(refine_regions(cloud, labels, config, fits), config.min_size)
     return labels
 
 
@@ -204,13 +193,16 @@ def checked_cloud(
 
 
 def _with_colors(
-    cloud: GrowingCloud, colors: Tensor | NDArray[np.generic], max_distance: float
+    cloud: GrowingCloud, colors: Tensor | NDArray[np.generic] | None, max_distance: float
 ) -> GrowingCloud:
     """Return the cloud with colours, and how much they may differ."""
+    if colors is None or max_distance < 0:
+        raise ConfigError(
+            "grow_regions: expected colors and max_color_distance >= 0, got "
+            f"{max_distance!r} and {'no' if colors is None else 'some'} colors."
+        )
     colors = as_tensor("grow_regions", "colors", colors)
     check_shapes("grow_regions", points=(cloud.points, "N 3"), colors=(colors, "N C"))
-    if not max_distance >= 0:
-        raise ConfigError(f"grow_regions: expected max_color_distance >= 0, got {max_distance!r}.")
     colors = by_column(colors.to(cloud.points.dtype))
     return cloud._replace(colors=colors, max_color_distance=max_distance)
 
@@ -219,14 +211,12 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
     """Return the cloud, and the rows its neighbours name, in an order ``(N,)`` of old rows."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    mask = cloud.neighbors.valid
+    neighbors = cloud.neighbors.at(order)
     return cloud._replace(
         points=by_column(cloud.points[order]),
         normals=by_column(cloud.normals[order]),
         curvature=cloud.curvature[order],
-        neighbors=Neighbors(
-            cloud.neighbors.of(row_of, order), None if mask is None else mask[order]
-        ),
+        neighbors=neighbors._replace(indices=neighbors.of(row_of)),
         valid=cloud.valid[order],
         reach=None if cloud.reach is None else cloud.reach[order],
         colors=None if cloud.colors is None else by_column(cloud.colors[order]),
@@ -236,14 +226,6 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
 def by_column(vectors: Tensor) -> Tensor:
     """Return vectors ``(N, C)`` laid out column by column."""
     return vectors.T.contiguous().T
-
-
-def _within_share(
-    cloud: GrowingCloud, config: GrowingConfig, share: float
-) -> tuple[GrowingCloud, GrowingConfig]:
-    """Return a cloud and settings whose limits of angle and distance are a share of those given."""
-    reach = None if cloud.reach is None else share * cloud.reach
-    return cloud._replace(reach=reach), replace(config, max_angle_deg=share * config.max_angle_deg)
 
 
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:
@@ -304,14 +286,16 @@ class GrowthEdges(NamedTuple):
     claims: NDArray[np.bool_] | None = None
 
 
-def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> NDArray[np.int32]:
-    """Return the root of each point's region, by whichever way the settings allow.
+def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
+    """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
 
-    The root of a region is the point it began with. Of a point that is not valid it is -1.
+    The root of a region is the point it began with. Of a point that is not valid it is -1. This
+    needs the edges of the whole cloud: regions have no bounded reach.
     """
     order = growth_order(cloud.curvature, cloud.valid, config)
     edges = find_growth_edges(cloud, config, order, chunk_size=chunk_size)
-    return grow_along(edges, order, cloud.neighbors.indices.cpu().numpy(), config)
+    roots = grow_along(edges, order, cloud.neighbors.indices.cpu().numpy(), config)
+    return torch.from_numpy(roots).to(cloud.points.device)
 
 
 def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> GrowthOrder:
@@ -332,7 +316,7 @@ def find_growth_edges(
     whole: bool = True,
 ) -> GrowthEdges:
     """Return the edges that regions grow along; of a whole cloud with the chain of its seeds."""
-    if not config.is_order_free:
+    if not is_order_free(config):
         coded, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
         return GrowthEdges(coded, claims=claims)
     chain = chain_of(order.seeds, len(cloud.points)) if whole else None

@@ -152,10 +152,10 @@ def _sum_of_bits(words: NDArray[np.uint64], at_most: int) -> NDArray[np.unsigned
     if at_most >= 2**8:
         total: NDArray[np.unsignedinteger] = counts.sum(axis=1, dtype=np.uint64)
         return total
-    lanes = counts.view(np.uint64)
-    total = lanes[:, 0].copy()
-    for column in range(1, lanes.shape[1]):
-        total += lanes[:, column]
+    sums = counts.view(np.uint64)
+    total = sums[:, 0].copy()
+    for column in range(1, sums.shape[1]):
+        total += sums[:, column]
     # The product adds all eight bytes up in the highest one.
     total *= np.uint64(0x0101010101010101)
     total >>= np.uint64(56)

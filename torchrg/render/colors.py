@@ -14,7 +14,7 @@ from torchrg.metrics.contingency import check_labels, contingency_table, number_
 from torchrg.metrics.labels import match_regions
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
-from torchrg.regions.adjacency import count_contacts
+from torchrg.regions.adjacency import NearestPoints
 
 
 def rgb_to_lab(colors: Tensor) -> Tensor:
@@ -395,4 +395,4 @@ def _touching_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
         return labels.new_zeros((0, 2))
     sample = sample_voxels(points, extent / num_voxels).rows
     neighbors = search_knn(points[sample], min(_CONTACTS, len(sample)))
-    return count_contacts(labels[sample], neighbors)[0]
+    return NearestPoints(neighbors).contacts(labels[sample])[0]

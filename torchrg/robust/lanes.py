@@ -1,7 +1,8 @@
-"""Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches (lanes).
+"""Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches.
 
-Every lane is computed by the same operations in the same order wherever it stands, so a result
-does not depend, to the last bit, on the chunk it was computed in.
+Like the lanes of a vector unit, patches laid out so are called lanes. Every lane is computed by the
+same operations in the same order wherever it stands, so a result does not depend, to the last bit,
+on the chunk it was computed in.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from torchrg.linalg import at_most, eigh3, second_moments
 from torchrg.robust.scale import median_of_sorted, sort_rows, sum_points
 
 
-def split_columns(patches: Tensor) -> list[Tensor]:
+def columns_of_points(patches: Tensor) -> list[Tensor]:
     """Lay patches ``(B, K, P)`` out as P contiguous columns of shape ``(K, B)``."""
     return list(patches.permute(2, 1, 0).contiguous().unbind(0))
 

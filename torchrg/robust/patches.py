@@ -13,10 +13,10 @@ from torchrg.errors import ConfigError
 from torchrg.linalg import flatness_tolerance, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
+    columns_of_points,
     covariance_entries,
     map_values,
     median_points,
-    split_columns,
     take_lanes,
 )
 from torchrg.robust.scale import sum_points
@@ -307,7 +307,7 @@ def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
     """Columns about each patch's median, of size 1/2 to 1, with their frame and tolerance."""
     unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
     patches = patches * unit[:, None, None]
-    columns = split_columns(patches)
+    columns = columns_of_points(patches)
     middle = [median_points(column) for column in columns]
     columns = [column - center for column, center in zip(columns, middle, strict=True)]
     extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)

@@ -6,7 +6,7 @@
 
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
-from torchrg.transforms.planes import EstimateNormals, GrowRegions, SegmentPlanes, Superpoints
+from torchrg.transforms.planes import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
 from torchrg.transforms.sample import CenterCloud, KeepFinite
 from torchrg.transforms.voxels import SampleVoxels
 
@@ -16,10 +16,10 @@ __all__ = [
     "EstimateNormals",
     "GrowRegions",
     "KeepFinite",
+    "MakeSuperpoints",
     "SampleVoxels",
     "SegmentDepth",
     "SegmentPlanes",
-    "Superpoints",
     "fuse_depth",
     "restore_points",
     "sample_voxels",

@@ -151,7 +151,7 @@ class SegmentPlanes(CloudTransform):
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
 
 
-class Superpoints(CloudTransform):
+class MakeSuperpoints(CloudTransform):
     """Add superpoints, a partition of all points; see :func:`torchrg.make_superpoints`.
 
     Reads ``coord``, ``normal`` ``(N, 3)`` and ``plane`` ``(N,)``, as :class:`SegmentPlanes` adds
@@ -167,7 +167,7 @@ class Superpoints(CloudTransform):
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
         >>> sample = SegmentPlanes()({"coord": torch.stack([x, y, 10 * (x > 9)], dim=1)})
-        >>> Superpoints()(sample)["superpoint"].unique(return_counts=True)[1]
+        >>> MakeSuperpoints()(sample)["superpoint"].unique(return_counts=True)[1]
         tensor([200, 200])
     """
 
@@ -181,7 +181,7 @@ class Superpoints(CloudTransform):
     ) -> None:
         super().__init__(keys=keys)
         if white is not None and not white > 0:
-            raise ConfigError(f"Superpoints: expected white > 0 or none, got {white!r}.")
+            raise ConfigError(f"MakeSuperpoints: expected white > 0 or none, got {white!r}.")
         self.config = dataclasses.replace(config or SuperpointsConfig(), **changes)
         self.white = white
         self.reads = ("coord", "normal", "plane", *["color"] * (white is not None))

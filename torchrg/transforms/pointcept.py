@@ -23,7 +23,7 @@ import numpy as np
 
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
-from torchrg.transforms.planes import GrowRegions, Superpoints
+from torchrg.transforms.planes import GrowRegions, MakeSuperpoints
 from torchrg.transforms.rows import OUR_KEYS, with_listed
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform
 from torchrg.transforms.voxels import SampleVoxels
@@ -90,7 +90,7 @@ _TRANSFORMS = (
     KeepFinite,
     SampleVoxels,
     SegmentPlanes,
-    Superpoints,
+    MakeSuperpoints,
 )
 """What configs can name."""
 _OWN: dict[str, Callable[..., dict[str, Any]]] = {}

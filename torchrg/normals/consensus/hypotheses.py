@@ -13,8 +13,8 @@ from torchrg.linalg import above, at_most
 from torchrg.linalg.moments import (
     Columns,
     along,
-    fit_planes,
     fit_planes_to_each,
+    fit_weighted_planes,
     residuals,
     sq_lengths,
 )
@@ -110,7 +110,7 @@ def _refit(
     columns: Columns, weights: Tensor, normals: Tensor, offsets: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return fitted planes; the given ones where the weighted points span none."""
-    fitted, moved, values = fit_planes(columns, weights)
+    fitted, moved, values = fit_weighted_planes(columns, weights)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
     return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
 
@@ -294,7 +294,7 @@ def split_by_votes(
     anchor = rest.argmax(dim=1, keepdim=True)
     moved = tuple(column - column.gather(1, anchor) for column in columns)
     about: Columns = (moved[0], moved[1], moved[2])
-    plane = vote_planes(about, noise, fit_planes(about, rest)[0], rest)
+    plane = vote_planes(about, noise, fit_weighted_planes(about, rest)[0], rest)
     second = _near(residuals(about, *plane), noise) * rest
     return first, second, rest - second
 

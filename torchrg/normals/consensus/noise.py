@@ -13,7 +13,7 @@ from torchrg.linalg.moments import (
     Columns,
     along,
     fit_parallel_planes,
-    fit_planes,
+    fit_weighted_planes,
     residuals,
     split_columns,
     sq_lengths,
@@ -116,8 +116,8 @@ def _deviations(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, block: slice
 ) -> tuple[Tensor, ...]:
     """Return offsets, radius and deviations from planes of all and of the nearest neighbours."""
-    patches = gather_patches(points, neighbors.indices[block])
-    mask = None if neighbors.valid is None else neighbors.valid[block]
+    indices, mask = neighbors.at(block)
+    patches = gather_patches(points, indices)
     columns = split_columns(patches)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
     normals, valid = fit.normals[block], fit.valid[block]
@@ -182,7 +182,7 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
     columns = split_columns(patches[:, :count])
-    normals, offsets, values = fit_planes(columns, counted[:, :count])
+    normals, offsets, values = fit_weighted_planes(columns, counted[:, :count])
     rests = residuals(columns, normals, offsets)
     spread = (rests * rests).sum(dim=1) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, count - 1] > 0)

@@ -5,7 +5,13 @@ from torch import Tensor
 
 from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg import signs
-from torchrg.linalg.moments import Columns, fit_planes, residuals, split_columns, sq_lengths
+from torchrg.linalg.moments import (
+    Columns,
+    fit_weighted_planes,
+    residuals,
+    split_columns,
+    sq_lengths,
+)
 from torchrg.neighbors import gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
@@ -40,24 +46,23 @@ def smooth_planes(
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        indices = neighbors.indices[chosen]
-        flat = indices.reshape(-1)
-        columns = split_columns(gather_patches(points, indices))
-        x, y, z = (part.index_select(0, flat).view(indices.shape) for part in parts)
+        near = neighbors.at(chosen)
+        columns = split_columns(gather_patches(points, near.indices))
+        x, y, z = (near.of(part) for part in parts)
         a, b, c = (part.index_select(0, chosen)[:, None] for part in parts)
         cosines = x * a + y * b + z * c
         sign = signs(cosines)
-        offset = planes.offsets.index_select(0, flat).view(indices.shape)
+        offset = near.of(planes.offsets)
         rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
         sq_chords = 2 * (1 - cosines.abs())
-        sq_error = errors.index_select(0, flat).view(indices.shape).square()
+        sq_error = near.of(errors).square()
         sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
         reach = constants.SMOOTHING_REACH * noise[chosen][:, None]
         weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
         weights *= (1 - (rests / reach).square_()).clamp_(min=0)
         weights *= _falling(columns, constants.FIT_FALLOFF)
-        if neighbors.valid is not None:
-            weights *= neighbors.valid[chosen]
+        if near.valid is not None:
+            weights *= near.valid
         weights = _balanced(columns, weights) * sign
         mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
         length = (mean * mean).sum(dim=1).sqrt_()
@@ -176,14 +181,10 @@ def _inliers(
 ) -> tuple[Tensor, Tensor]:
     """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
     columns = split_columns(gather_patches(points, neighbors.indices[rows]))
-    near = (
-        residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
-        <= (constants.INLIER_REACH * noise[rows])[:, None]
-    )
-    if neighbors.valid is not None:
-        near &= neighbors.valid[rows]
-    weights = near.to(points.dtype)
-    return weights.sum(dim=1), fit_planes(columns, weights)[2]
+    rests = residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
+    near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]
+    weights = (near & neighbors.counted(rows)).to(points.dtype)
+    return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 
 def _falling(columns: Columns, share: float) -> Tensor:

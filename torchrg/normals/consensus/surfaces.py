@@ -109,9 +109,7 @@ def fit_surfaces(
 def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns, Tensor]:
     """Return columns of the neighbours and which count, as 0 or 1."""
     columns = split_columns(gather_patches(points, neighbors.indices[rows]))
-    if neighbors.valid is None:
-        return columns, torch.ones_like(columns[0])
-    return columns, neighbors.valid[rows].to(points.dtype)
+    return columns, neighbors.counted(rows).to(points.dtype)
 
 
 def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
@@ -149,8 +147,7 @@ def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> T
     means = torch.empty_like(values)
 
     def work(part: slice) -> None:
-        indices = neighbors.indices[part, : constants.NUM_POOLED]
-        near = values.index_select(0, indices.reshape(-1)).view(indices.shape)
+        near = Neighbors(neighbors.indices[part, : constants.NUM_POOLED]).of(values)
         if neighbors.valid is None:
             means[part] = near.mean(dim=1)
             return

@@ -1,0 +1,283 @@
+"""Bridges: regions of several faces that only a few points join are split.
+
+Which regions are mixed comes first (:func:`find_mixed_regions`). Within them growth goes on once
+more, under stricter limits; what it finds are *cores* of faces. :func:`cut_bridges` decides which
+cores are one surface, and gives the points between the others to the nearest.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg.config import GrowingConfig
+from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg.moments import Segments
+from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
+from torchrg.regions.fit import MOST_FITTED, RegionPlanes, fit_planes
+from torchrg.regions.repair import misfit_of_pairs
+from torchrg.structures import UNLABELED, Neighbors
+
+_CORE_SHARE = 0.5
+"""Share of the limits of angle and distance within which the core of a face is connected."""
+
+_SMOOTH_ANGLE = 0.3
+"""Share of the largest angle. Where normals of neighbours differ by less, a surface is smooth."""
+
+_LEAST_SMOOTH = 0.7
+"""Share of the median of a region. At points with a smaller share of such neighbours two faces may
+meet in noise, where normals turn from one to the other by and by: no core grows through them."""
+
+_MOST_OFF_PLANE = 0.1
+"""Share of a region's points off its plane up to which the others are one face."""
+
+_EXACT_REACH = 4.0
+"""Times the least thickness. Distance from a plane within which points of exact faces are on it."""
+
+_LEAST_FLAT = 0.5
+"""Share of a region's points in flat cores from which it is faces: a noisy column breaks into cores
+that are few, and curved."""
+
+_OPEN_SHARE = 0.1
+"""Least share of the edges between two cores that pass the criteria where a surface goes on; where
+a bridge joins them it is a few in a hundred."""
+
+_LEAST_MISFIT = 2.0
+"""Times the thickness. Two cores lie on one plane when they are nearer to it: parts of a face that
+noise has bent are."""
+
+
+class MixedRegions(NamedTuple):
+    """Regions that do not lie on one plane, ``min_size`` points or more being off it.
+
+    Attributes:
+        rows: Points that may be of another face, ascending, shape ``(n,)``: those off the plane
+            where nearly all points are on it, else all of the region.
+        part: These points as a cloud with limits of a core; only those are valid where the surface
+            bends no more than is usual in the region.
+        near: Points on the plane of a region of which nearly all are, whose normals are within the
+            largest angle of the plane's, shape ``(N,)``, bool.
+        aligned: Those of them whose normals are within the limits of a core.
+        on_plane: Regions of which nearly all points are on one plane, shape ``(M,)``, bool.
+    """
+
+    rows: Tensor
+    part: GrowingCloud
+    near: Tensor
+    aligned: Tensor
+    on_plane: Tensor
+
+
+class _InnerEdges(NamedTuple):
+    """Edges from some points to neighbours of the same region, and which pass all limits.
+
+    ``rows`` ``(n,)``, ``targets``, ``inside`` and ``passed`` ``(n, K)``.
+    """
+
+    rows: Tensor
+    targets: Tensor
+    inside: Tensor
+    passed: Tensor
+
+
+def find_mixed_regions(
+    cloud: GrowingCloud,
+    labels: Tensor,
+    planes: RegionPlanes,
+    config: GrowingConfig,
+    chunk_size: int,
+) -> MixedRegions | None:
+    """Find the regions that may be several faces, None if there are none.
+
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` those of the regions.
+    """
+    limit = _EXACT_REACH * planes.floor
+    limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
+    region, has_region = labels.clamp(min=0), labels >= 0
+    off = has_region & (planes.distances(cloud.points, region) > limit[region])
+    num_off = torch.bincount(labels[off], minlength=len(limit))
+    on_plane = num_off <= _MOST_OFF_PLANE * planes.num_points
+    mixed = num_off >= config.min_size
+    rows = (torch.where(on_plane[region], off, has_region) & mixed[region]).nonzero().squeeze(1)
+    if len(rows) == 0:
+        return None
+    others = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
+    turns = [
+        sq_chords(
+            cloud.normals[some].double().unbind(dim=1),
+            planes.normal[labels[some]].unbind(dim=1),
+        )
+        for some in torch.split(others, ROWS_AT_ONCE)
+    ]
+    turn = torch.cat(turns)
+    near, aligned = (
+        torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
+        for limit in (config.max_angle_deg, _CORE_SHARE * config.max_angle_deg)
+    )
+    part = _part_of(cloud, labels, rows)
+    smooth = _are_smooth(part, labels[rows], _SMOOTH_ANGLE * config.max_angle_deg, chunk_size)
+    part = part._replace(
+        valid=part.valid & smooth,
+        reach=None if part.reach is None else _CORE_SHARE * part.reach,
+        angle_share=_CORE_SHARE,
+    )
+    return MixedRegions(rows, part, near, aligned, on_plane)
+
+
+def cut_bridges(
+    cloud: GrowingCloud,
+    labels: Tensor,
+    mixed: MixedRegions,
+    grown: Tensor,
+    config: GrowingConfig,
+    chunk_size: int,
+) -> Tensor:
+    """Split regions of several faces that only a few points join.
+
+    ``grown`` ``(n,)`` are the cores in the ``part`` of the mixed regions, 0 to C-1 or
+    :data:`torchrg.UNLABELED`. They, and the plane if nearly all points are on one, belong together
+    where the surface goes on from one to the next, a tenth of the edges between them passing the
+    whole limits, and where one plane explains both. Regions with cores that do not, and with most
+    of their points in flat cores, are split: the other points join the core of the nearest
+    neighbour that they have an edge to, and no core grows through them.
+
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
+    perhaps with gaps in their numbers.
+    """
+    rows = mixed.rows[grown >= 0]
+    if len(rows) == 0:
+        return labels
+    cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
+    cores, on_core_plane = _add_planes(labels, cores, mixed)
+    around = cloud.neighbors.of(cores.to(torch.int32), rows)
+    rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
+    cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
+    split = _are_several_faces(cloud, labels, cores, mixed.on_plane)
+    free = (labels >= 0) & split[labels.clamp(min=0)]
+    # Of points on the plane only those with its direction tell which cores it meets.
+    plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
+    plane_of[labels[on_core_plane]] = cores[on_core_plane]
+    cores = torch.where(mixed.near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
+    waiting = (free & (cores < 0)).nonzero().squeeze(1)
+    cores = _propagate(cores, _find_edges(cloud, labels, config, waiting, chunk_size))
+    new = torch.where(cores >= 0, cores + len(split), UNLABELED)
+    return torch.where(free, new, labels)
+
+
+def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
+    """Make cores of the planes of regions that have other cores, too; number all without gaps.
+
+    Returns the cores ``(N,)``, and which points are in those of planes.
+    """
+    has_core = torch.zeros_like(mixed.on_plane)
+    has_core[labels[cores >= 0]] = True
+    on_plane = mixed.aligned & has_core[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
+    cores = torch.where(on_plane, labels + int(cores.max()) + 1, cores)
+    is_core = torch.bincount(cores + 1)[1:] > 0
+    return torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores], on_plane
+
+
+def _are_several_faces(
+    cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor
+) -> Tensor:
+    """Tell which regions ``(M,)`` have several cores, and are flat where these are."""
+    num_regions = len(on_plane)
+    owner = torch.full((int(cores.max()) + 1,), UNLABELED, device=labels.device)
+    owner[cores[cores >= 0]] = labels[cores >= 0]
+    flat = ~_planes_of(cloud, cores).curved
+    covered = torch.bincount(labels[(cores >= 0) & flat[cores.clamp(min=0)]], minlength=num_regions)
+    is_flat = covered >= _LEAST_FLAT * torch.bincount(labels[labels >= 0])
+    return (torch.bincount(owner, minlength=num_regions) > 1) & (on_plane | is_flat)
+
+
+def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
+    """Return the planes of cores."""
+    return fit_planes(Segments(cores, most=MOST_FITTED), cloud.points, cloud.normals)
+
+
+def _are_smooth(
+    part: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
+) -> Tensor:
+    """Tell at which points the surface bends no more than is usual in their region."""
+    shares = torch.zeros_like(part.curvature, dtype=torch.float64)
+    for some in chunks_of(len(shares), chunk_size):
+        counted = part.neighbors.counted(some)
+        alike = within_angle(part, some, max_angle_deg, signed=False) & counted
+        shares[some] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
+    regions = torch.unique(regions, return_inverse=True)[1]
+    segments = Segments(regions)
+    usual = segments.median(segments.take(shares))
+    return shares >= _LEAST_SMOOTH * usual[regions]
+
+
+def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
+    """Return some points as a cloud, where those of one region are neighbours."""
+    row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
+    row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
+    near = cloud.neighbors.at(rows)
+    places = near.of(row_of)
+    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (places >= 0)
+    counted &= near.counted()
+    own = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
+    return cloud._replace(
+        points=cloud.points[rows],
+        normals=cloud.normals[rows],
+        curvature=cloud.curvature[rows],
+        neighbors=Neighbors(torch.where(counted, places, own), counted),
+        valid=cloud.valid[rows],
+        reach=None if cloud.reach is None else cloud.reach[rows],
+        colors=None if cloud.colors is None else cloud.colors[rows],
+    )
+
+
+def _find_edges(
+    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
+) -> _InnerEdges:
+    """Return the edges of some points."""
+    near = cloud.neighbors.at(rows)
+    inside = (near.of(labels) == labels[rows, None]) & near.counted()
+    passed = torch.zeros_like(inside)
+    for some in chunks_of(len(rows), chunk_size):
+        passed[some] = accept_edges(cloud, config, rows[some], None)[0]
+    return _InnerEdges(rows, near.indices.long(), inside, passed & inside)
+
+
+def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tensor:
+    """Return the cores ``(N,)`` with those of one surface as one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    num_cores = int(cores.max()) + 1
+    own, theirs = cores[edges.rows, None].expand_as(edges.targets), cores[edges.targets]
+    between = edges.inside & (theirs >= 0) & (theirs != own)
+    first, second = own[between], theirs[between]
+    keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
+    keys, numbers = torch.unique(keys, return_inverse=True)
+    pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
+    num_edges = torch.bincount(numbers, minlength=len(pairs))
+    num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
+    joined = misfit_of_pairs(_planes_of(cloud, cores), pairs) < _LEAST_MISFIT
+    joined |= num_open >= _OPEN_SHARE * num_edges
+    ends = pairs[joined].T.cpu().numpy()
+    ones = np.ones(ends.shape[1], dtype=np.int8)
+    graph = coo_array((ones, (ends[0], ends[1])), shape=(num_cores, num_cores))
+    _, owner = connected_components(graph, directed=False)
+    return torch.from_numpy(np.append(owner, UNLABELED)).to(cores)[cores]
+
+
+def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
+    """Give points between the cores to that of the nearest neighbour they have an edge to."""
+    cores = cores.clone()
+    waiting = torch.arange(len(edges.rows), device=cores.device)
+    while len(waiting):
+        targets = edges.targets[waiting]
+        known = edges.passed[waiting] & (cores[targets] >= 0)
+        nearest = known.to(torch.uint8).argmax(dim=1, keepdim=True)
+        joined = known.any(dim=1)
+        if not bool(joined.any()):
+            break
+        cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
+        waiting = waiting[~joined]
+    return cores

@@ -1,0 +1,250 @@
+"""Planes of regions: robust fits, and what is known of the noise of their points."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg.config import GrowingConfig
+from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
+from torchrg.linalg.moments import Segments
+from torchrg.regions.edges import GrowingCloud, neighborhood_radii
+from torchrg.robust.scale import MAD_FACTOR
+
+POINTS_AT_ONCE = 2**18
+"""Points of regions that are fitted or measured together: at some 400 bytes each."""
+
+BISQUARE_CUT = 4.685
+"""Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
+
+_NUM_FITS = 4
+"""After so many reweighted fits the plane no longer moves."""
+
+_FLAT_RATIO = 4.0
+"""Where one variance is not this many times the next smaller one, rounding and noise decide between
+their directions."""
+
+_SAME_MAGNITUDE = 1e-6
+"""Components of a normal that differ by less than this share are equal but for rounding."""
+
+_CURVED_SPREAD_DEG = 8.0
+"""Root mean square angle of a region's normals to the direction they share, from which on it is
+curved: a smooth bend by three to four times this angle has this spread, a full column 45."""
+
+MOST_FITTED = 4096
+"""Points of a region that its plane is fitted to while regions change: more of them move it by less
+than a fiftieth of their noise."""
+
+LEAST_FITTED = 10
+"""Points whose plane says where others at its border belong: that of three passes through them."""
+
+_BENT = 0.5
+"""Reaches. A region thicker than this share of the reach that its points have is bent: twice as
+thick as the neighbourhoods in it. From 0.3 to 0.5 made rooms come out the same."""
+
+_LEAST_HEIGHT = 0.2
+"""Of the product of angle and width, both as standard deviations: an arc is 0.45 of it thick, a cap
+of a sphere 0.41. Scattered normals in a thin region are noise."""
+
+
+class RegionPlanes(NamedTuple):
+    """Planes of M regions, and what is known of their noise, in float64.
+
+    Attributes:
+        normal: Unit normals, shape ``(M, 3)``.
+        center: A point of each plane, the weighted mean, shape ``(M, 3)``.
+        covariance: Weighted covariance, shape ``(M, 3, 3)``.
+        thickness: Robust standard deviation of the points from the plane, at least the floor, shape
+            ``(M,)``.
+        rms: Root mean square distance of the points from the plane, shape ``(M,)``.
+        num_points: Number of points, shape ``(M,)``, int64.
+        curved: Whether the points' normals are spread too much for a plane, shape ``(M,)``, bool.
+        floor: Least thickness that counts, shape ``(M,)``.
+        reach: Median distance within which the points take others for coplanar, shape ``(M,)``,
+            infinite where that is not known.
+        bent: Whether noise does not explain the thickness, shape ``(M,)``, bool.
+    """
+
+    normal: Tensor
+    center: Tensor
+    covariance: Tensor
+    thickness: Tensor
+    rms: Tensor
+    num_points: Tensor
+    curved: Tensor
+    floor: Tensor
+    reach: Tensor
+    bent: Tensor
+
+    @property
+    def noise(self) -> Tensor:
+        """The thickness where it is known to be noise, shape ``(M,)``, else 0."""
+        known = self.reach.isfinite() & ~self.bent & ~self.curved
+        return torch.where(known, self.thickness, 0.0)
+
+    def times_thickness(self, factor: float) -> Tensor:
+        """Return a distance from each plane ``(M,)``: NaN, no distance at all, if it is curved."""
+        return torch.where(self.curved, torch.nan, factor * self.thickness)
+
+    def distances(self, points: Tensor, regions: Tensor) -> Tensor:
+        """Return the distance of each point ``(n, 3)`` from the plane of a region ``(n,)``."""
+        away = points.new_zeros(len(points), dtype=torch.float64)
+        columns = [values.unbind(dim=1) for values in (points, self.center, self.normal)]
+        for some in chunks_of(len(points), ROWS_AT_ONCE):
+            owner = regions[some]
+            for place, center, normal in zip(*columns, strict=True):
+                away[some] += (place[some].double() - center[owner]) * normal[owner]
+        return away.abs_()
+
+    def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
+        """Return distances of points ``(n, 3)`` from planes of regions ``(n, C)``, with signs."""
+        away = points.double()[:, None] - self.center[regions]
+        return (away * self.normal[regions]).sum(dim=2)
+
+
+def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
+    r"""Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
+
+    The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
+    (1.4826 times their median), so that points of another surface do not tilt the plane.
+
+    ``normals`` of any sign decide where points do not, in regions of one or two points or along a
+    line. Of a plane's normal the component of largest magnitude, of equal ones the last, is
+    positive. Nothing is known of the noise: the floor is 0.
+
+    References:
+        [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
+    """
+    parts = [_fit_together(some, points, normals) for some in segments.split(POINTS_AT_ONCE)]
+    return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
+    """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
+    shares, directions = eigh3_of_few(_spread_of(segments, normals))
+    # The direction that the normals of a region share, signs aside, and their angle to it.
+    usual = directions[:, :, 2]
+    spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
+    origin = segments.first(points).double()
+    local = segments.take_about(points, origin)
+    weights = torch.ones_like(local[0])
+    resolution = coordinate_resolution(segments.first(points)).double()
+    for last in range(_NUM_FITS):
+        total = segments.sum(weights)
+        mean = torch.stack([segments.sum(x * weights) / total for x in local], dim=1)
+        centered = [x - segments.spread(m) for x, m in zip(local, mean.unbind(dim=1), strict=True)]
+        covariance = _covariances(segments, centered, weights)
+        variances, axes = eigh3_of_few(covariance)
+        normal = _with_sign(_plane_normals(variances, axes, usual))
+        residuals = coordinates_along(segments, centered, normal)
+        thickness = MAD_FACTOR * segments.median(residuals.abs())
+        if last == _NUM_FITS - 1:
+            break
+        cut = BISQUARE_CUT * torch.maximum(thickness, resolution)
+        # A region of one place at the origin has cut 0: its residuals are 0 too.
+        ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
+        weights = (1 - ratio * ratio).clamp(min=0).square()
+    # The angle times the width across the bend, which is at least the middle one, is its height.
+    height = _LEAST_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
+    # Of an arc without width the plane is its own, and says nothing of its thickness.
+    crosses = (usual * normal).sum(dim=1).abs() > math.sqrt(0.5)
+    return RegionPlanes(
+        normal,
+        origin + mean,
+        covariance,
+        thickness,
+        rms=segments.mean(residuals * residuals).sqrt(),
+        num_points=segments.counts,
+        curved=(spread > _CURVED_SPREAD_DEG) & ~(crosses & (thickness < height)),
+        floor=torch.zeros_like(thickness),
+        reach=torch.full_like(thickness, torch.inf),
+        bent=torch.zeros_like(crosses),
+    )
+
+
+def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> RegionPlanes:
+    """Return the planes of the regions of a cloud in canonical order.
+
+    They are fitted to some thousand points of each, in even steps. The floor of the thickness is a
+    fraction of the median neighbourhood's radius, as in the test of coplanarity. Curved are regions
+    whose normals are spread and that noise alone does not make so thick: in faces a few centimetres
+    wide, noise spreads normals, too.
+
+    ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative.
+    """
+    segments = Segments(labels, most=MOST_FITTED)
+    planes = fit_planes(segments, cloud.points, cloud.normals)
+    radii = [
+        neighborhood_radii(cloud.points, cloud.neighbors.at(rows))
+        for rows in torch.split(segments.rows, ROWS_AT_ONCE)
+    ]
+    floor = config.coplanarity_floor * segments.median(torch.cat(radii)).double()
+    planes = planes._replace(
+        thickness=torch.maximum(planes.thickness, floor),
+        num_points=torch.bincount(labels + 1, minlength=1)[1:],
+        floor=floor,
+    )
+    if cloud.reach is None:
+        return planes
+    reach = segments.median(segments.take(cloud.reach)).double()
+    explained = torch.where(reach.isfinite(), torch.maximum(_BENT * reach, floor), floor)
+    bent = planes.thickness > explained
+    return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)
+
+
+class RegionFits:
+    """The planes of the regions of a cloud, fitted again only when the labels have changed."""
+
+    def __init__(self, cloud: GrowingCloud, config: GrowingConfig) -> None:
+        self._cloud, self._config = cloud, config
+        self._known: tuple[Tensor, RegionPlanes] | None = None
+
+    def of(self, labels: Tensor) -> RegionPlanes:
+        """Return what :func:`fit_regions` does."""
+        if self._known is None or not torch.equal(self._known[0], labels):
+            self._known = labels, fit_regions(self._cloud, labels, self._config)
+        return self._known[1]
+
+
+def coordinates_along(segments: Segments, columns: Sequence[Tensor], axes: Tensor) -> Tensor:
+    """Return coordinates of points, given by columns, along the axis ``(M, 3)`` of their region."""
+    total = torch.zeros_like(columns[0])
+    # Products and sums apart: their rounding must not depend on where a block of memory ends.
+    for column, part in zip(columns, axes.unbind(dim=1), strict=True):
+        total += column * segments.spread(part)
+    return total
+
+
+def _spread_of(segments: Segments, normals: Tensor) -> Tensor:
+    """Return the second moments of the regions' normals, shape ``(M, 3, 3)``."""
+    columns = segments.take_columns(normals)
+    return _covariances(segments, columns, torch.ones_like(columns[0]))
+
+
+def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
+    """Return weighted second moments about zero, shape ``(M, 3, 3)``."""
+    return second_moments(columns, weights, segments.sum, segments.sum(weights))
+
+
+def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
+    """Return the normals of planes, from the points' own normals where the points give none."""
+    low, middle, high = variances.unbind(dim=1)
+    along = axes[:, :, 2]
+    is_line = high > _FLAT_RATIO * middle
+    component = (usual * along).sum(dim=1, keepdim=True) * along
+    across = usual - torch.where(is_line[:, None], component, 0.0)
+    length = across.norm(dim=1, keepdim=True)
+    across = torch.where(length > 0, across / length, axes[:, :, 0])
+    is_flat = middle > _FLAT_RATIO * low
+    return torch.where(is_flat[:, None], axes[:, :, 0], across)
+
+
+def _with_sign(normals: Tensor) -> Tensor:
+    """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
+    magnitudes = normals.abs()
+    near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)
+    last = 2 - near.flip(1).to(torch.uint8).argmax(dim=1, keepdim=True)
+    return torch.where(normals.gather(1, last) < 0, -normals, normals)

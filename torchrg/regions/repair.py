@@ -1,0 +1,414 @@
+"""Regions after growth: points at borders go where they belong, parts of one face are merged."""
+
+import heapq
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_chunks, places_of
+from torchrg.config import GrowingConfig
+from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords, unsigned_angle_deg
+from torchrg.linalg.moments import Segments
+from torchrg.regions.adjacency import LEAST_CONTACTS, PARALLEL_DEG, NearestPoints
+from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
+from torchrg.structures import UNLABELED, Neighbors
+
+_AGREE = 0.3
+"""Share of the largest angle. Regions too small before absorption whose normals are off by less,
+root mean square, are faces: of a small one half is border. Without this a cluttered office has 490
+regions instead of 306."""
+
+_MAX_PASSES = 10
+"""Times. Points that moved are neighbours of the next: narrow strips fill from their ends."""
+
+_ROUNDING = 0.01
+"""Thicknesses. Smaller distances decide nothing."""
+
+_ONE_SIDED = 0.5
+"""A face ends at another plane if the mean distance of its points from that, with signs, is this
+share of the mean without; of a face that goes on behind the plane it is near 0."""
+
+
+class Beside(Protocol):
+    """Who is beside whom: nearest points (:mod:`torchrg.regions.adjacency`), or pixels."""
+
+    def around(self, rows: Tensor) -> Tensor:
+        """Return the points beside some ``(n,)``, shape ``(n, 8)``."""
+
+    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
+        """Return those of the rows that have a new one beside them."""
+
+
+def refine_regions(
+    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, fits: RegionFits | None = None
+) -> Tensor:
+    """Apply the steps after growth that the settings ask for to a cloud in canonical order.
+
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
+    perhaps with gaps in their numbers. ``fits`` may know the planes of these labels already.
+    """
+    if not bool((labels >= 0).any()):
+        return labels
+    fits, beside = fits or RegionFits(cloud, config), NearestPoints(cloud.neighbors)
+    if config.max_plane_residual is not None:
+        planes = fits.of(labels)
+        limit, region = config.max_plane_residual * planes.thickness, labels.clamp(min=0)
+        far = planes.distances(cloud.points, region) > limit[region]
+        labels = torch.where(far, UNLABELED, labels)
+    if config.absorb:
+        planes = fits.of(labels)
+        labels = absorb_points(
+            cloud.points,
+            _drop_scattered(cloud, labels, planes.normal, config),
+            beside,
+            planes,
+            planes.times_thickness(config.absorb_reach),
+            valid=cloud.valid,
+            normals=cloud.normals,
+            max_angle_deg=config.absorb_angle_deg,
+        )
+        labels = _drop_small(labels, config.min_size)
+    if config.merge_coplanar:
+        contacts, tolerance = beside.contacts(labels), config.merge_tolerance
+        labels = merge_coplanar(labels, contacts, fits.of(labels), tolerance=tolerance)
+    if config.refine_borders:
+        labels = _drop_small(labels, 1)
+        planes = fits.of(labels)
+        # Where a bent face ends its plane does not say.
+        vague = planes.bent | (planes.num_points < LEAST_FITTED)
+        reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
+        labels = refine_borders(cloud, labels, planes, reach)
+    return labels
+
+
+def _drop_scattered(
+    cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
+) -> Tensor:
+    """Return labels without regions that are too small and whose normals do not agree.
+
+    Those that agree may be large enough with the points at their borders. Numbers have gaps then.
+    """
+    small = torch.bincount(labels + 1, minlength=1)[1:] < config.min_size
+    small = torch.cat([small, small.new_zeros(1)])
+    segments = Segments(torch.where(small[labels], labels, UNLABELED))
+    own, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)
+    agrees = segments.mean(sq_chords(own, theirs)) <= deg_to_sq_chord(_AGREE * config.max_angle_deg)
+    scattered = segments.rows[~segments.spread(agrees)]
+    return labels.index_fill(0, scattered, UNLABELED)
+
+
+def _drop_small(labels: Tensor, min_size: int) -> Tensor:
+    """Return labels without regions of fewer points, and without gaps in their numbers."""
+    kept = torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1)
+    numbers = torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
+    return torch.cat([numbers, numbers.new_tensor([UNLABELED])])[labels]
+
+
+def absorb_points(
+    points: Tensor,
+    labels: Tensor,
+    beside: Beside,
+    planes: RegionPlanes,
+    reach: Tensor,
+    *,
+    valid: Tensor,
+    normals: Tensor | None = None,
+    max_angle_deg: float = 90.0,
+) -> Tensor:
+    """Give points without a region to regions they touch, until none can be given.
+
+    A point may join a region when a point beside it belongs to it, its distance to the region's
+    plane is within reach, and its normal, if there are normals ``(N, 3)``, is within the angle of
+    the plane's. Of several regions it joins the one whose plane is nearest. Points that joined have
+    the next beside them.
+
+    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud, or of the pixels of an image, as
+    ``beside`` is. Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all.
+    ``valid`` ``(N,)`` tells which points may join.
+    """
+    # Narrow numbers are gathered faster, and take half of the memory.
+    labels = labels.to(torch.int32)
+    limit = deg_to_sq_chord(max_angle_deg)
+    rows = waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
+    while len(rows):
+        near = labels[beside.around(rows)]
+        touches = (near >= 0).any(dim=1)
+        rows, near = rows[touches], near[touches]
+        region = near.clamp(min=0)
+        distance = planes.signed_distances(points[rows], region).abs()
+        fits = (near >= 0) & (distance <= reach[region])
+        if normals is not None:
+            own = normals[rows].double()[:, :, None].unbind(dim=1)
+            fits &= sq_chords(own, planes.normal[region].unbind(dim=2)) <= limit
+        choice, least = _least(torch.where(fits, distance, torch.inf), near)
+        joined = least.isfinite()
+        rows = rows[joined]
+        labels[rows] = choice[joined]
+        waiting = waiting[labels[waiting] == UNLABELED]
+        # What did not fit does not fit later: only a new neighbour may change it.
+        rows = beside.reached(waiting, rows)
+    return labels.long()
+
+
+def _least(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the option ``(n,)`` of the least cost, of equal ones the smallest, and its cost."""
+    least = cost.amin(dim=1, keepdim=True)
+    ranked = torch.where(cost == least, options, torch.iinfo(options.dtype).max)
+    return ranked.amin(dim=1), least.squeeze(1)
+
+
+def merge_coplanar(
+    labels: Tensor,
+    contacts: tuple[Tensor, Tensor],
+    planes: RegionPlanes,
+    *,
+    tolerance: float,
+) -> Tensor:
+    """Merge regions that touch and lie on one plane, the pair that fits best first.
+
+    Two regions are merged when one plane explains both: the root mean square distance of either to
+    the plane through both is at most ``tolerance`` times what it is to its own. Of the smaller one
+    the larger one's noise counts if that is more: what noise breaks off a face is thinner than the
+    face, or curved. Otherwise curved regions have no plane. What is merged is one region from then
+    on.
+
+    ``contacts`` are pairs of regions that touch ``(E, 2)``, and how many contacts each has, as
+    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. A region's distance to its
+    own plane counts as at least the floor of the planes. A merged region has the smallest label of
+    its parts.
+    """
+    pairs, num_contacts = contacts
+    pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
+    moments = _moments_of(planes)
+    owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
+    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+
+
+class _Moments(NamedTuple):
+    """What merging reads of M regions, in float64.
+
+    Number of points, their mean, about an origin near them, and covariance, the distance from its
+    plane that counts as lying on it (none from that of a curved one), and the noise it lends.
+    """
+
+    weight: Tensor
+    mean: Tensor
+    covariance: Tensor
+    scale: Tensor
+    noise: Tensor
+
+    def at(self, rows: Tensor | slice) -> "_Moments":
+        """Return those of some of the regions."""
+        return _Moments(*(values[rows] for values in self))
+
+
+def _moments_of(planes: RegionPlanes) -> _Moments:
+    normal = planes.normal
+    own = (normal[:, None] @ planes.covariance @ normal[:, :, None])[:, 0, 0]
+    return _Moments(
+        planes.num_points.double(),
+        planes.center - planes.center[:1],
+        planes.covariance,
+        torch.where(planes.curved, 0.0, torch.maximum(own.clamp(min=0).sqrt(), planes.floor)),
+        planes.noise,
+    )
+
+
+def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
+    """Return how far from the joint plane the worse of two regions is, shape ``(E,)``.
+
+    In thicknesses of the thicker one, whether it is curved or not; nothing is known of the noise.
+    """
+    thickness = planes.thickness[pairs].amax(dim=1)
+    moments = _moments_of(planes)
+    first, second = (moments.at(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
+    return _misfit(first, second)
+
+
+def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
+    """Return for each region the smallest of those that it is merged with."""
+    groups = _Moments(*(values.clone() for values in moments))
+    touching: list[set[int]] = [set() for _ in groups.weight]
+    owner, age = list(range(len(touching))), [0] * len(touching)
+    queue: list[tuple[float, int, int, int, int]] = []
+
+    def offer(pairs: Tensor) -> None:
+        first, second = pairs.unbind(dim=1)
+        misfits = _misfit(groups.at(first), groups.at(second)).tolist()
+        for (a, b), misfit in zip(pairs.tolist(), misfits, strict=True):
+            if misfit <= tolerance:
+                heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
+
+    for a, b in pairs.tolist():
+        touching[a].add(b)
+        touching[b].add(a)
+    offer(pairs)
+    while queue:
+        _, a, b, age_a, age_b = heapq.heappop(queue)
+        if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
+            continue
+        both = _joined(groups.at(slice(a, a + 1)), groups.at(slice(b, b + 1)))
+        for values, joined in zip(groups, both, strict=True):
+            values[a] = joined[0]
+        owner[b] = a
+        age[a] += 1
+        touching[a] = {_root(owner, c) for c in touching[a] | touching[b]} - {a}
+        for c in touching[a]:
+            touching[c].add(a)
+        beside = [(min(a, c), max(a, c)) for c in touching[a]]
+        offer(torch.tensor(beside, dtype=torch.int64).view(-1, 2))
+    return [_root(owner, i) for i in range(len(owner))]
+
+
+def _root(owner: list[int], i: int) -> int:
+    """Return the region that region i has become part of."""
+    while owner[i] != i:
+        owner[i] = owner[owner[i]]
+        i = owner[i]
+    return i
+
+
+def _joined(a: _Moments, b: _Moments) -> _Moments:
+    """Return the moments of two sets of regions, taken together one by one."""
+    weight = a.weight + b.weight
+    share_a, share_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
+    mean = share_a * a.mean + share_b * b.mean
+    covariance = torch.zeros_like(a.covariance)
+    for part, share in ((a, share_a), (b, share_b)):
+        shift = part.mean - mean
+        spread = part.covariance + shift[:, :, None] * shift[:, None, :]
+        covariance = covariance + share[:, :, None] * spread
+    noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
+    return _Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale), noise)
+
+
+def _misfit(a: _Moments, b: _Moments) -> Tensor:
+    """Return how far from the joint plane the worse of two regions is, in its own scales."""
+    both = _joined(a, b)
+    normal = eigh3_of_few(both.covariance)[1][:, :, 0]
+    misfits = []
+    for part, other in ((a, b), (b, a)):
+        own = (normal[:, None] @ part.covariance @ normal[:, :, None])[:, 0, 0]
+        shift = ((part.mean - both.mean) * normal).sum(dim=1)
+        rms = (own.clamp(min=0) + shift * shift).sqrt()
+        lent = torch.where(other.weight > part.weight, other.noise, 0.0)
+        misfits.append(torch.where(rms > 0, rms / torch.maximum(part.scale, lent), 0.0))
+    return torch.maximum(*misfits)
+
+
+def refine_borders(
+    cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
+) -> Tensor:
+    r"""Give points where regions touch to the one that explains them best.
+
+    Of the flat regions of a point's 8 nearest neighbours and its own, the two with the nearest
+    planes, by their thickness, count if they are within reach. With the distances :math:`r` from a
+    plane and :math:`e` of the point's foot on it beyond the line in which it meets the other plane,
+    the point joins the region of the smaller :math:`r^2 + e^2`: noise moves points off their plane,
+    not along it. A region ends at the other plane where its points among the point's neighbours are
+    on one side of that. Points of nearly parallel planes stay where they are. Points that moved
+    and their neighbours are decided again in the next pass.
+
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are those returned. ``reach``
+    ``(M,)`` is the distance up to which points may be on a plane, NaN for regions that are not flat
+    and keep what they have.
+    """
+    beside = NearestPoints(cloud.neighbors)
+    flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
+    labels = labels.clone()
+    rows = _touching(labels, beside)
+    for _ in range(_MAX_PASSES):
+        rows = rows[cloud.valid[rows] & flat[labels[rows]]]
+        around, chosen = beside.around(rows), labels[rows]
+        near = labels[around]
+
+        def work(
+            block: slice, rows: Tensor = rows, near: Tensor = near, chosen: Tensor = chosen
+        ) -> None:
+            chosen[block] = _choose(cloud, labels, planes, reach, rows[block], near[block])
+
+        map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device)
+        moved = chosen != labels[rows]
+        if not bool(moved.any()):
+            break
+        rows = rows[moved]
+        labels[rows] = chosen[moved]
+        rows = torch.unique(torch.cat([rows, around[moved].flatten()]))
+    return labels
+
+
+def _touching(labels: Tensor, beside: NearestPoints) -> Tensor:
+    """Return the points that have one of another region among their nearest neighbours."""
+    # Narrow numbers are gathered three times as fast.
+    narrow = labels.to(torch.int32)
+    found = []
+    for some in chunks_of(len(labels), ROWS_AT_ONCE):
+        near = Neighbors(beside.around(some)).of(narrow)
+        touches = (near != narrow[some, None]) & (near >= 0)
+        found.append(some.start + places_of(touches.any(dim=1)))
+    return torch.cat(found)
+
+
+def _choose(
+    cloud: GrowingCloud,
+    labels: Tensor,
+    planes: RegionPlanes,
+    reach: Tensor,
+    rows: Tensor,
+    near: Tensor,
+) -> Tensor:
+    """Return the region of some points, of labels ``near`` ``(n, 8)`` and their own."""
+    own, place = labels[rows], cloud.points[rows].double()
+    options = torch.cat([own[:, None], near], dim=1)
+    known = options.clamp(min=0)
+    distance = planes.signed_distances(place, known).abs()
+    usable = (options >= 0) & (distance <= reach[known])
+    cost = (distance / planes.thickness[known]).square() + _ROUNDING**2 * (options != own[:, None])
+    cost = torch.where(usable, cost, torch.inf)
+    first, first_cost = _least(cost, options)
+    second, second_cost = _least(torch.where(options == first[:, None], torch.inf, cost), options)
+    # A region that the point is far from is growth's choice.
+    kept = ((own >= 0) & ~usable[:, 0]) | first_cost.isinf()
+    choice = torch.where(kept, own, first)
+
+    both = (second_cost.isfinite() & ~kept).nonzero().squeeze(1)
+    first, second, place = first[both], second[both], place[both]
+    scale = torch.maximum(planes.thickness[first], planes.thickness[second])
+    beyond = (
+        (_beyond(cloud, labels, planes, rows[both], place, *pair) / scale).square()
+        for pair in ((first, second), (second, first))
+    )
+    first_cost, second_cost = first_cost[both] + next(beyond), second_cost[both] + next(beyond)
+    better = torch.where(second_cost < first_cost, second, first)
+    angle = unsigned_angle_deg(planes.normal[first], planes.normal[second])
+    stays = (angle <= PARALLEL_DEG) & (own[both] >= 0)
+    choice[both] = torch.where(stays, own[both], better)
+    return choice
+
+
+def _beyond(
+    cloud: GrowingCloud,
+    labels: Tensor,
+    planes: RegionPlanes,
+    rows: Tensor,
+    place: Tensor,
+    own: Tensor,
+    other: Tensor,
+) -> Tensor:
+    """Return how far beyond another plane the feet of points on their own are, where that ends."""
+    near = cloud.neighbors.at(rows)
+    indices = near.indices.long()
+    inside = (labels[indices] == own[:, None]) & near.counted()
+    away = torch.zeros_like(inside, dtype=torch.float64)
+    columns = (cloud.points, planes.center[other], planes.normal[other])
+    for x, start, part in zip(*(values.unbind(dim=1) for values in columns), strict=True):
+        away += (x[indices].double() - start[:, None]) * part[:, None]
+    away *= inside
+    total = away.sum(dim=1)
+    rounding = _ROUNDING * planes.thickness[own] * inside.sum(dim=1)
+    one_sided = total.abs() > (_ONE_SIDED * away.abs().sum(dim=1)).clamp(min=rounding)
+    foot = place - planes.signed_distances(place, own[:, None]) * planes.normal[own]
+    over = -total.sign() * planes.signed_distances(foot, other[:, None]).squeeze(1)
+    return torch.where(one_sided, over.clamp(min=0), 0.0)
