@@ -10,7 +10,7 @@ LAYERS = [
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},
     {"store"},
-    {"stages"},
+    {"tiles"},
     {"pipeline"},
     {"depth", "nn"},
     {"transforms"},

@@ -52,50 +52,6 @@ _PAGE_BYTES = 4096
 """Bytes that a disk and its cache hold together: rows that lie apart are read with their page."""
 
 
-class MemoryStore:
-    """The arrays of one run in memory, as they were given: on any device, of any dtype."""
-
-    def __init__(self) -> None:
-        self._values: dict[str, Any] = {}
-
-    def note(self, step: str, **found: Any) -> None:  # noqa: ANN401
-        """Keep what a step has found."""
-        self._values[f"{step} found"] = found
-
-    def known(self, step: str) -> dict[str, Any]:
-        """Return what a step that is done found."""
-        found: dict[str, Any] = self._values[f"{step} found"]
-        return found
-
-    def write(self, name: str, start: int, values: Any) -> None:  # noqa: ANN401
-        """Keep the rows of an array, which are all."""
-        self._values[name] = values
-
-    def save(self, name: str, values: Any) -> None:  # noqa: ANN401
-        """Keep a whole array."""
-        self._values[name] = values
-
-    def get(self, name: str) -> Any:  # noqa: ANN401
-        """Return an array."""
-        return self._values[name]
-
-    lazy = map = load_planes = get
-
-    save_planes = save
-
-    def save_points(self, points: Tensor | Iterable[Cloud]) -> None:
-        """Keep points, those of chunks about the origin that the whole cloud has."""
-        if not isinstance(points, Tensor):
-            chunks = [chunk.coordinates for chunk in points] or [np.empty((0, 3), np.float32)]
-            points = Cloud(np.concatenate(chunks)).points
-        self._values["points"] = points
-
-    def remove(self, *names: str) -> None:
-        """Forget arrays that no other step reads."""
-        for name in names:
-            del self._values[name]
-
-
 class Written(NamedTuple):
     """Bytes that a step has written, to tell later whether the disk has kept them.
 

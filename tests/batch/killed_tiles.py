@@ -12,9 +12,9 @@ import numpy as np
 
 from torchrg.config import load_config
 from torchrg.pipeline import segment_planes
-from torchrg.stages import TileTask
 from torchrg.store import FolderStore
 from torchrg.structures import Cloud
+from torchrg.tiles import TileTask
 
 
 def main(path, folder, writes):

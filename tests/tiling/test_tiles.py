@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg import stages
+from torchrg import pipeline
 from torchrg.config import NormalsConfig, load_config
 from torchrg.errors import ConfigError, FormatError
 from torchrg.neighbors import finite_rows, search_knn
@@ -22,9 +22,9 @@ from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.pipeline import segment_planes
 from torchrg.regions.growth import checked_cloud, grow
 from torchrg.scenes import make_room
-from torchrg.stages import TileTask
 from torchrg.store import FolderStore
 from torchrg.structures import Cloud
+from torchrg.tiles import TileTask
 
 STAGES = (
     *("points", "order", "neighbors", "normals", "curvature", "edges"),
@@ -131,9 +131,9 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
     run = TileTask.run
     monkeypatch.setattr(TileTask, "run", lambda task: (done.append(task.name), run(task))[1])
     for name in ("sort_points", "sort_by_curvature", "grow_regions", "finish_regions"):
-        step = getattr(stages, name)
+        step = getattr(pipeline, name)
         counted = lambda *given, step=step: (step(*given), done.append(step.__name__))  # noqa: E731
-        monkeypatch.setattr(f"torchrg.stages.{name}", counted)
+        monkeypatch.setattr(f"torchrg.pipeline.{name}", counted)
     save = FolderStore.save_points
     monkeypatch.setattr(
         FolderStore, "save_points", lambda *given: (save(*given), done.append("points"))

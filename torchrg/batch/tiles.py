@@ -20,9 +20,9 @@ from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import marked_parts, remove_leftovers
 from torchrg.pipeline import segment_planes
-from torchrg.stages import BYTES_PER_TILE_POINT, TileTask
 from torchrg.store import TILE_SIZE, FolderStore, Written, make_folder, run_in_turn
 from torchrg.structures import Cloud, Segmentation
+from torchrg.tiles import BYTES_PER_TILE_POINT, TileTask
 
 _SMALLEST_TILE = 20_000
 """Points. Smaller ones are mostly what is around them."""
