@@ -19,6 +19,9 @@ from pathlib import Path
 
 import matplotlib as mpl
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+
 from reproduction import method, normals, readme, segmentation, study, times
 from reproduction.cells import Folder, Record
 from reproduction.clouds import TITLES
@@ -51,9 +54,12 @@ def main() -> None:
         folder.write(f"parts/{name}.json", json.dumps(part, indent=1))
         print(f"== {name}: {time.perf_counter() - begin:.0f} s", flush=True)
     report = write_report(folder, list(PARTS), quick=arguments.quick)
-    print(f"Look at {folder.path / 'report.html'} (also .md, .json)")
+    print(f"Look at {folder.path / 'report.html'} (also .json)")
     if arguments.readme:
-        readme.update(report)
+        try:
+            readme.update(report)
+        except ValueError as error:
+            sys.exit(f"reproduce_paper.py: {error}")
 
 
 def _parse() -> argparse.Namespace:

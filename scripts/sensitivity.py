@@ -3,9 +3,11 @@
 Halves and doubles every number of ``torchrg/normals/consensus/constants.py``, one at a time, on
 made rooms, shapes with sharp edges and smooth shapes, all with exact truth, and on scanned parts
 where their file is given (a cloud with ``labels``, 0 for points of no part). Where a score changes
-too much, less is tried. About ten minutes on one core with ``--quick``.
+too much, less is tried. About ten minutes on one core with ``--quick``. ``sensitivity.json`` beside
+this file is what the last run with ``--quick`` and parts found:
 
-python scripts/sensitivity.py [--parts office_parts.pcd] [--quick] [--json] [--only NAME ...]
+    python scripts/sensitivity.py --quick --parts office_parts.pcd --out scripts/sensitivity.json
+    python scripts/sensitivity.py --only FLAT_LIMIT CURVED_LIMIT
 """
 
 import argparse
@@ -20,10 +22,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+import surroundings
 import torch
-from reproduction.scenes import make_shape
+from benchmarks.harness import markdown
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+
+from tests.made import make_shape
 from torchrg import load_config
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels, score_normals
@@ -36,6 +42,10 @@ from torchrg.structures import Neighbors
 TOLERANCES = {"ARI": 1.0, "mean": 0.05, "RMS": 0.25}
 """Changes up to these count as none: percentage points of labels, degrees of normals. F1 and mean
 best IoU are means over faces; there one face won or lost counts as none, which chance decides."""
+NOTE = (
+    "No change: F1 and mean best IoU by at most one face, ARI by 1 point, angles by 0.05 degrees "
+    "(mean) and 0.25 (RMS). The cloud with adaptive k is small: changes of 0.3 degrees are chance."
+)
 FACTORS = (2.0, 1.5, 1.25, 1.1)
 """Tried from the first, up and down, until nothing changes."""
 MIN_SIZE = 50
@@ -45,27 +55,16 @@ _CHUNK_SIZE = 16384
 
 
 class Case(NamedTuple):
-    """A cloud and what is scored on it.
+    """A cloud and what is scored on it."""
 
-    Attributes:
-        name: For the table.
-        points: Shape ``(N, 3)``.
-        neighbors: Of all points.
-        labels: True faces, ``(N,)``; labels are scored where there are any.
-        normals: True normals, ``(N, 3)``, likewise.
-        num_faces: Number of true faces.
-        ignore: Label of points that are not scored.
-        adaptive_k: See :class:`torchrg.config.NormalsConfig`.
-    """
-
-    name: str
-    points: Tensor
-    neighbors: Neighbors
-    labels: Tensor | None
-    normals: Tensor | None
-    num_faces: int = 0
-    ignore: int | None = None
-    adaptive_k: int | None = None
+    name: str  # for the table
+    points: Tensor  # shape ``(N, 3)``
+    neighbors: Neighbors  # of all points
+    labels: Tensor | None  # true faces, ``(N,)``; labels are scored where there are any
+    normals: Tensor | None  # true normals, ``(N, 3)``, likewise
+    num_faces: int = 0  # number of true faces
+    ignore: int | None = None  # label of points that are not scored
+    adaptive_k: int | None = None  # see :class:`torchrg.config.NormalsConfig`
 
 
 class Constant(NamedTuple):
@@ -279,12 +278,12 @@ _SHAPES = {
 
 
 def main() -> None:
-    """Print the table."""
+    """Measure, print the table, and write it."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--parts", type=Path, help="cloud of scanned parts with labels")
     parser.add_argument("--quick", action="store_true", help="one room, and fewer points")
     parser.add_argument("--only", nargs="+", help="names of constants")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--out", type=Path, help="JSON file of what is found")
     arguments = parser.parse_args()
     if arguments.parts is not None and not arguments.parts.is_file():
         print(f"{arguments.parts}: not there; without scanned parts", file=sys.stderr)
@@ -292,24 +291,18 @@ def main() -> None:
     torch.set_num_threads(1)
     cases = make_cases(arguments.parts, quick=arguments.quick)
     table = [one for one in read_table() if not arguments.only or one.name in arguments.only]
-    findings = study(cases, table)
-    if arguments.json:
-        print(json.dumps([asdict(finding) for finding in findings], indent=1))
-        return
-    for case in cases:
-        shown = ", ".join(f"{name} {value:.2f}" for name, value in score(case).items())
-        print(f"{case.name:18} {len(case.points):7,} points: {shown}")
-    print(
-        "No change: F1 and mean best IoU by at most one face, ARI by 1 point, "
-        "angles by 0.05 degrees (mean) and 0.25 (RMS)."
-    )
-    print(f"{'constant':24} {'value':>8}  {'half':38} {'double':38} no change")
-    for found in findings:
-        span = f"x{found.lowest:.2g} to x{found.highest:.2g}"
-        print(
-            f"{found.constant:24} {found.value:8g}  {found.half!s:38} {found.double!s:38} {span}",
-            flush=True,
-        )
+    findings = list(study(cases, table))
+    scores = {case.name: {"points": len(case.points), **score(case)} for case in cases}
+    record = {"made_with": surroundings.describe(1), "clouds": scores}
+    record["findings"] = [asdict(finding) for finding in findings]
+    if arguments.out is not None:
+        arguments.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    print(markdown(["cloud", "scores"], scores.items()), f"\n{NOTE}\n", sep="\n")
+    rows = [
+        (one.constant, one.value, one.half, one.double, f"x{one.lowest:.2g} to x{one.highest:.2g}")
+        for one in findings
+    ]
+    print(markdown(["constant", "value", "half", "double", "no change"], rows))
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ def trace(preset: str) -> dict[str, list[str]]:
     """Return the files on the path of a preset, and the functions by which they are entered."""
     room = torchrg.scenes.make_room(num_points=NUM_POINTS, noise=0.003, seed=0)
     config = torchrg.load_config(preset)
+    torchrg.segment_planes(room.points[: NUM_POINTS // 8], config)  # Loads all the code.
     entered: dict[str, dict[str, None]] = {}
 
     def note(frame: FrameType, event: str, _: object) -> None:

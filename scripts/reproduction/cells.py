@@ -2,19 +2,14 @@
 
 import functools
 import json
-import os
-import platform
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import scipy
+import surroundings
 import torch
 
-from torchrg import __version__
 from torchrg.io import atomic_path
 
 Record = dict[str, Any]
@@ -48,7 +43,7 @@ class Folder:
         if path.exists() and (needs is None or needs.exists()) and not is_due:
             record: Record = json.loads(path.read_text())
             return record
-        record = {**work(), "made_with": surroundings()}
+        record = {**work(), "made_with": made_with()}
         self._renewed.add(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         self.write(Path("cells") / path.name, json.dumps(record, indent=1))
@@ -67,27 +62,9 @@ class Folder:
 
 
 @functools.cache
-def surroundings() -> Record:
+def made_with() -> Record:
     """Return versions, commit, processor and threads: what a time depends on."""
-    here = Path(__file__).parent
-    git = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],
-        cwd=here,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return {
-        "torchrg": __version__,
-        "commit": git.stdout.strip() or "unknown",
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-    }
+    return surroundings.describe(torch.get_num_threads())
 
 
 def describe_surroundings(records: list[Record]) -> str:
@@ -95,17 +72,7 @@ def describe_surroundings(records: list[Record]) -> str:
     made = [record["made_with"] for record in records]
     values = {
         name: ", ".join(dict.fromkeys(str(one[name]) for one in made))
-        for name in surroundings()
+        for name in made_with()
         if all(name in one for one in made)
     }
     return "; ".join(f"{name} {value}" for name, value in values.items())
-
-
-def _processor() -> str:
-    """Return the name of the processor."""
-    listing = Path("/proc/cpuinfo")
-    if listing.exists():
-        for line in listing.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

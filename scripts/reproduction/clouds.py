@@ -12,20 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from reproduction.paper_numbers import POINTS
-from reproduction.scenes import (
+from tests.made import (
+    CURVED_LAYOUT,
     HALL_LAYOUT,
     KINECT_LAYOUT,
     StoreyLayout,
-    cameras_around,
-    fuse_frames,
     make_kinect_room,
     make_storey,
-    render_depth,
+    on_voxels,
+    quantised_frame,
     scan_scene,
 )
 from torchrg.io import read_cloud
-from torchrg.neighbors.voxels import sample_voxels
-from torchrg.scenes import RoomLayout, Scene, build_room, make_room
+from torchrg.scenes import Scene, build_room, make_room
 from torchrg.structures import UNLABELED
 
 QUICK_POINTS = 30_000
@@ -59,29 +58,17 @@ HARD = {
 
 
 class EvalCloud(NamedTuple):
-    """A cloud to segment.
+    """A cloud to segment."""
 
-    Attributes:
-        key: A key of :data:`TITLES`, :data:`OTHERS` or :data:`HARD`.
-        name: Of its cells: another name for other points.
-        points: Finite points, shape ``(N, 3)``.
-        labels: True faces, shape ``(N,)``, or None.
-        normals: True normals, shape ``(N, 3)``, or None.
-        origin: What the cloud is, and how it differs from the paper's.
-        is_papers: Whether it is the paper's own.
-        objects: True objects, shape ``(N,)``, or None.
-        curved: Labels of the faces that are not planes, or None.
-    """
-
-    key: str
-    name: str
-    points: Tensor
-    labels: Tensor | None
-    normals: Tensor | None
-    origin: str
-    is_papers: bool = False
-    objects: Tensor | None = None
-    curved: Tensor | None = None
+    key: str  # a key of :data:`TITLES`, :data:`OTHERS` or :data:`HARD`
+    name: str  # of its cells: another name for other points
+    points: Tensor  # finite points, shape ``(N, 3)``
+    labels: Tensor | None  # true faces, shape ``(N,)``, or None
+    normals: Tensor | None  # true normals, shape ``(N, 3)``, or None
+    origin: str  # what the cloud is, and how it differs from the paper's
+    is_papers: bool = False  # whether it is the paper's own
+    objects: Tensor | None = None  # true objects, shape ``(N,)``, or None
+    curved: Tensor | None = None  # labels of the faces that are not planes, or None
 
     @property
     def title(self) -> str:
@@ -170,22 +157,6 @@ def faces_of_colors(colors: NDArray[np.uint8]) -> Tensor:
 
 _SHORT_HALL = replace(HALL_LAYOUT, size=(10.0, 2.4, 2.7), num_doors=5, num_cabinets=1, num_panels=2)
 _PIECE = replace(HALL_LAYOUT, size=(6.0, 2.4, 2.7), num_doors=2, num_cabinets=0, num_panels=1)
-_CURVED = RoomLayout(
-    size=(8.0, 6.0, 2.6),
-    num_doors=1,
-    num_windows=0,
-    num_cabinets=0,
-    num_shelves=0,
-    num_tables=0,
-    num_boxes=0,
-    num_small_boxes=0,
-    num_pillars=0,
-    num_columns=3,
-    num_round_tables=1,
-    num_balls=3,
-    num_lamps=1,
-    num_bent_walls=2,
-)
 _NOISE = 0.003
 """Metres."""
 _VOXEL = 0.03
@@ -201,20 +172,9 @@ def _laser_hall(quick: bool) -> Scene:
 
 
 def _depth_room(quick: bool, quantise: Callable[[Tensor], Tensor]) -> Scene:
-    """Return a depth frame without noise, its depth (0: none) replaced."""
+    """Return a depth frame without noise, its depth replaced."""
     model = build_room(layout=KINECT_LAYOUT)
-    frame = render_depth(model, cameras_around(model, 1)[0])
-    depth = quantise(frame.depth).where(frame.depth > 0, 0)
-    return fuse_frames(model, [frame._replace(depth=depth)], 30_000 if quick else 250_000)
-
-
-def _thinned_room(quick: bool) -> Scene:
-    """Return one point of each voxel of a room."""
-    scene = _room(quick, num_points=5)
-    rows = sample_voxels(scene.points, _VOXEL).rows
-    return scene._replace(
-        points=scene.points[rows], labels=scene.labels[rows], normals=scene.normals[rows]
-    )
+    return quantised_frame(model, quantise, 30_000 if quick else 250_000)
 
 
 def _room(quick: bool, num_points: int = 1, noise: float = _NOISE) -> Scene:
@@ -268,9 +228,12 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
         ),
         "one depth frame without noise, its disparity in eighths of a pixel",
     ),
-    "thinned": (_thinned_room, "a furnished room, noise 3 mm, one point of each voxel of 3 cm"),
+    "thinned": (
+        lambda quick: on_voxels(_room(quick, num_points=5), _VOXEL),
+        "a furnished room, noise 3 mm, one point of each voxel of 3 cm",
+    ),
     "curved": (
-        lambda quick: make_room(40_000 if quick else 250_000, layout=_CURVED),
+        lambda quick: make_room(40_000 if quick else 250_000, layout=CURVED_LAYOUT),
         "a small room with columns, balls, a lamp, a round table, two bent walls, noise 3 mm",
     ),
 }

@@ -8,7 +8,7 @@ from matplotlib import pyplot as plt
 from torch import Tensor
 
 from reproduction.cells import Record
-from reproduction.plotting import settings
+from reproduction.pictures import settings
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, text
 from torchrg import estimate_normals, load_config, search_knn
@@ -30,27 +30,16 @@ _COLORS = {
 
 
 class Case(NamedTuple):
-    """A point and its neighbours, seen along one axis.
-
-    Attributes:
-        title: What it shows.
-        axes: The two axes to draw.
-        cloud: All points about the point, shape ``(N, 3)``.
-        patch: Its neighbours, shape ``(K, 3)``.
-        normal: Its normal, shape ``(3,)``.
-        coplanar: Neighbours that pass eq. (11), shape ``(K,)``, bool.
-        connective: Neighbours that pass eq. (10), shape ``(K,)``, bool.
-        limit: Largest distance of a coplanar neighbour.
-    """
+    """A point and its neighbours, seen along one axis; all lengths are those of the points."""
 
     title: str
-    axes: tuple[int, int]
-    cloud: Tensor
-    patch: Tensor
-    normal: Tensor
-    coplanar: Tensor
-    connective: Tensor
-    limit: float
+    axes: tuple[int, int]  # that are drawn
+    cloud: Tensor  # all points about the point, (N, 3)
+    patch: Tensor  # its neighbours, (K, 3)
+    normal: Tensor  # (3,)
+    coplanar: Tensor  # by eq. (11), (K,)
+    connective: Tensor  # by eq. (10), (K,)
+    limit: float  # largest distance of a coplanar neighbour
 
 
 def make_figure5(run: Run) -> tuple[list[Block], Record]:

@@ -5,33 +5,24 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib import pyplot as plt
-from matplotlib.patches import FancyArrowPatch, Rectangle
 from mpl_toolkits.mplot3d import Axes3D
 
 from reproduction.cells import Record
 from reproduction.criteria import make_figure5
-from reproduction.plotting import settings
+from reproduction.pictures import settings
 from reproduction.runs import Run
-from reproduction.scenes import make_shape
-from reproduction.sections import figure, section
+from reproduction.sections import figure, section, text
+from tests.made import make_shape
 from torchrg import estimate_normals
 
-NORMALS = (
-    "k nearest\nneighbours",
-    "PCA: initial\nnormals",
-    "Qn of angles\n> 5°: sharp",
-    "DetMCD and\nPCA of inliers\nat sharp points",
+FRAMEWORK = (
+    "**Figure 1**, the framework, as it is built here. Normals: k nearest neighbours; PCA gives "
+    "initial normals; points whose Qn of the angles to their neighbours is above 5° are sharp; "
+    "there DetMCD, and PCA of its inliers. Region growing: the limit of curvature is its 95th "
+    "percentile; the seed is the point of least curvature; neighbours within the angle that are "
+    "coplanar join the region; those that are connective too, and whose increment is within the "
+    "limit, become seeds."
 )
-"""First half of Figure 1."""
-
-GROWTH = (
-    "curvature limit:\n95th percentile",
-    "seed of least\ncurvature",
-    "neighbours within\nangle, coplanar: join\nthe region",
-    "connective, increment\nwithin the limit:\nbecome seeds",
-)
-"""Second half of Figure 1."""
-
 SCALES = (1.0, 10.0, 100.0)
 """Values of mu in Figure 2."""
 
@@ -43,12 +34,11 @@ _FACES = ("#c44e52", "#4878a8", "#2a7f3f", "#e39b3d", "#7a4f9a", "#8c8c8c")
 
 def reproduce(run: Run) -> Record:
     """Make Figures 1, 2, 5 and 6."""
-    _draw_framework(run.folder.place("figures/figure1.png"))
     _draw_weights(run.folder.place("figures/figure2.png"))
     _draw_sphere(run.folder.place("figures/figure6.png"))
     figure5, counts = make_figure5(run)
     blocks = [
-        figure("figures/figure1.png", "**Figure 1**: the framework, as it is built here."),
+        text(FRAMEWORK),
         figure(
             "figures/figure2.png",
             "**Figure 2**: weights of Geman-McClure, eq. (5), of residuals r. Left as printed, "
@@ -63,39 +53,6 @@ def reproduce(run: Run) -> Record:
         ),
     ]
     return section("Figures 1, 2, 5 and 6: the method", blocks, counts)
-
-
-def _draw_framework(path: Path) -> None:
-    """Draw two rows of boxes, joined by arrows."""
-    width, height, gap = 0.86, 0.6, 0.14
-    with settings():
-        figure_, axis = plt.subplots(figsize=(7.5, 2.6), layout="constrained")
-        for bottom, title, steps in ((1.25, "Normals", NORMALS), (0, "Region growing", GROWTH)):
-            frame = (-gap, bottom - gap), len(steps) + gap, height + 0.4
-            axis.add_patch(Rectangle(*frame, fill=False, linestyle="--", linewidth=0.6))
-            axis.text(0, bottom + height + 0.12, title, fontstyle="italic", va="center")
-            middle = bottom + height / 2
-            for place, words in enumerate(steps):
-                box = Rectangle((place, bottom), width, height, facecolor="#eef3f8")
-                axis.add_patch(box)
-                axis.text(place + width / 2, middle, words, ha="center", va="center", fontsize=7)
-                if place:
-                    _draw_arrow(axis, (place - gap, middle), (place, middle))
-        _draw_arrow(axis, (2 - gap / 2, 1.25 - gap), (2 - gap / 2, height + 0.4 - gap))
-        axis.set_xlim(-0.2, 4.05)
-        axis.set_ylim(-0.2, 2.2)
-        axis.set_axis_off()
-        figure_.savefig(path)
-        plt.close(figure_)
-
-
-def _draw_arrow(axis: plt.Axes, begin: tuple[float, float], end: tuple[float, float]) -> None:
-    """Draw an arrow."""
-    axis.add_patch(
-        FancyArrowPatch(
-            begin, end, arrowstyle="-|>", mutation_scale=8, shrinkA=0, shrinkB=0, color="#333333"
-        )
-    )
 
 
 def _draw_weights(path: Path) -> None:

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from reproduction.cells import Record
 from reproduction.normal_tables import mean_score, where
-from reproduction.plotting import settings
-from reproduction.tiles import tile_pictures
-from torchrg.render import color_normals, color_sharp, render_cloud, write_png
+from reproduction.pictures import settings, write_tiles
+from torchrg.render import color_normals, color_sharp, render_cloud
 from torchrg.scenes import Scene
 
 STYLES = {
@@ -97,6 +96,5 @@ def draw_sharp_points(path: Path, clouds: list[tuple[str, Scene, Tensor]]) -> No
         )
         for paint, (_, scene, _) in zip(paints, clouds, strict=True)
     ]
-    names = [name.replace("_", " ") for name, _, _ in clouds]
-    titles = [*names, *("" for _ in names)]
-    write_png(path, tile_pictures(pictures, titles=titles, columns=len(clouds)))
+    titles = [*(name.replace("_", " ") for name, _, _ in clouds), *("" for _ in clouds)]
+    write_tiles(path, list(zip(titles, pictures, strict=True)), columns=len(clouds))

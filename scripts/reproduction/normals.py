@@ -19,8 +19,8 @@ from reproduction.normal_tables import (
     where,
 )
 from reproduction.runs import Run
-from reproduction.scenes import SHAPES, make_shape
 from reproduction.sections import Block, figure, section, text
+from tests.made import SHAPES, make_shape
 from torchrg.config import NormalsConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_normals
@@ -36,21 +36,14 @@ _NUM_DRAWN, _DRAWN_POINTS = 6, 100_000
 
 
 class Grid(NamedTuple):
-    """What is compared: every combination.
+    """What is compared: every combination."""
 
-    Attributes:
-        num_points: Of each cloud.
-        shapes: Names of shapes.
-        noises: Standard deviations of the noise, in percent of the diagonal of the bounding box.
-        seeds: Of points and noise; tables show means.
-        variants: Names of :data:`VARIANTS`.
-    """
-
-    num_points: int
-    shapes: tuple[str, ...]
+    num_points: int  # of each cloud
+    shapes: tuple[str, ...]  # names of shapes
+    # Standard deviations of the noise, in percent of the diagonal of the bounding box.
     noises: tuple[float, ...]
-    seeds: tuple[int, ...]
-    variants: tuple[str, ...]
+    seeds: tuple[int, ...]  # of points and noise; tables show means
+    variants: tuple[str, ...]  # names of :data:`VARIANTS`
 
 
 VARIANTS = {

@@ -1,28 +1,81 @@
-"""Pictures of segmentations side by side, and of what is wrong with them."""
+"""How plots look, pictures of clouds side by side, and of what is wrong with segmentations."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from importlib.util import find_spec
+from pathlib import Path
 
-import numpy as np
+import matplotlib as mpl
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib import pyplot as plt
 from matplotlib.patches import Patch
 from torch import Tensor
 
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
-from reproduction.tiles import tile_pictures
-from torchrg.render import color_planes, make_page, render_cloud, write_page, write_png
+from torchrg.render import color_planes, make_page, render_cloud, write_page
 from torchrg.render.outcomes import OUTCOMES, outcomes_of
 from torchrg.structures import Cloud
 
+SETTINGS = {
+    "font.family": "serif",
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.3,
+    "grid.color": "#dddddd",
+    "lines.linewidth": 1.1,
+    "lines.markersize": 4,
+    "legend.frameon": False,
+    "savefig.dpi": 250,
+    "savefig.bbox": "tight",
+    "savefig.pad_inches": 0.04,
+}
 _GRAY = 190
 """Of the cloud itself."""
 _WIDTH = 1000
 """Of a picture, in pixels."""
+_INCHES = 4.0
+"""Width of a picture among others."""
 _LONG = 2.2
 """Width over height of a picture that takes the place of two."""
+
+
+def settings() -> AbstractContextManager[None]:
+    """Return a context in which plots look like those of a paper."""
+    return mpl.rc_context(SETTINGS)
+
+
+def write_tiles(
+    path: Path,
+    pictures: Mapping[str, Tensor] | Sequence[tuple[str, Tensor]],
+    columns: int,
+    legend: Iterable[tuple[tuple[int, ...], str]] = (),
+) -> None:
+    """Write pictures ``(H, W, 3)`` side by side, each below its title, over what colours mean."""
+    tiles = list(pictures.items() if isinstance(pictures, Mapping) else pictures)
+    rows = -(-len(tiles) // columns)
+    height, width = tiles[0][1].shape[:2]
+    size = (_INCHES * columns, rows * (_INCHES * height / width + 0.25))
+    with settings():
+        figure, axes = plt.subplots(
+            rows, columns, figsize=size, squeeze=False, layout="constrained"
+        )
+        for axis in axes.flat:
+            axis.set_axis_off()
+        for axis, (title, picture) in zip(axes.flat, tiles, strict=False):
+            axis.imshow(picture.numpy())
+            axis.set_title(title)
+        patches = [
+            Patch(facecolor=[value / 255 for value in color], edgecolor="#888888", label=meaning)
+            for color, meaning in legend
+        ]
+        if patches:
+            figure.legend(handles=patches, loc="outside lower center", ncols=len(patches))
+        figure.savefig(path)
+        plt.close(figure)
 
 
 def draw_side_by_side(
@@ -103,31 +156,12 @@ def _tile(
     legend: Iterable[tuple[tuple[int, ...], str]] = (),
 ) -> str:
     """Render a cloud in several colourings, and write them as one picture."""
-    pictures = [
-        render_cloud(cloud.points, paint, normals=cloud.normals, width=_WIDTH)
-        for paint in paints.values()
-    ]
-    height, width = pictures[0].shape[:2]
+    pictures = {
+        title: render_cloud(cloud.points, paint, normals=cloud.normals, width=_WIDTH)
+        for title, paint in paints.items()
+    }
+    height, width = next(iter(pictures.values())).shape[:2]
     columns = 2 if width > _LONG * height or len(pictures) == 4 else 3
-    picture = tile_pictures(pictures, titles=list(paints), columns=columns)
-    if legend:
-        picture = torch.cat([picture, _draw_legend(legend, picture.shape[1])])
     file = f"figures/{name}.png"
-    write_png(folder.place(file), picture)
+    write_tiles(folder.place(file), pictures, min(columns, len(pictures)), legend)
     return file
-
-
-def _draw_legend(entries: Iterable[tuple[tuple[int, ...], str]], width: int) -> Tensor:
-    """Return a strip that says what colours mean, shape ``(h, width, 3)``, uint8."""
-    figure = Figure(figsize=(width / 100, width / 3400), dpi=100)
-    patches = [
-        Patch(facecolor=[value / 255 for value in color], edgecolor="#888888", label=meaning)
-        for color, meaning in entries
-    ]
-    figure.legend(
-        handles=patches, loc="center", ncols=len(patches), frameon=False, fontsize=width / 115
-    )
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    strip = torch.from_numpy(np.array(canvas.buffer_rgba())[..., :3])
-    return strip[:, :width]

@@ -11,8 +11,7 @@ from reproduction.cells import Record
 from reproduction.clouds import HARD
 from reproduction.faces import LARGE
 from reproduction.methods import DRAWN, titles
-from reproduction.rendering import markdown_table
-from reproduction.sections import mark_best, table
+from reproduction.sections import mark_best
 from torchrg.io import atomic_path
 
 README = Path(__file__).parents[2] / "README.md"
@@ -29,7 +28,15 @@ def update(report: Record) -> None:
 
     Args:
         report: All parts, as :func:`reproduction.report.write_report` returns it.
+
+    Raises:
+        ValueError: If some of it was made by code that is not committed.
     """
+    if "-dirty" in report["made_with"] or "commit unknown" in report["made_with"]:
+        raise ValueError(
+            f"update: expected a report made by committed code, got {report['made_with']}; commit, "
+            "then make the report again with --again."
+        )
     results = take_results(report)
     _write(RESULTS, json.dumps(results, indent=1) + "\n")
     _write(README, insert(README.read_text(encoding="utf-8"), results))
@@ -91,7 +98,8 @@ def to_section(results: Record) -> str:
         "clouds with truth (*: made in place of the paper's), from `scripts/reproduce_paper.py` "
         f"({made}; {results['made_with']}):"
     )
-    return markdown_table(table(title, ["cloud", *titles(dict.fromkeys(DRAWN))], rows))
+    lines = [["cloud", *titles(DRAWN)], ["---", *["--:"] * len(DRAWN)], *rows]
+    return "\n".join([title, "", *("| " + " | ".join(line) + " |" for line in lines)])
 
 
 def _write(path: Path, text: str) -> None:

@@ -1,11 +1,16 @@
-"""The report: one page of all parts that are there, as HTML, Markdown and JSON."""
+"""The report of all parts that are there: a page, by ``report.html.jinja``, and JSON."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment, StrictUndefined
+
 from reproduction.cells import Folder, Record, describe_surroundings
-from reproduction.rendering import to_html, to_markdown
+from reproduction.sections import Block, verdict
+
+TEMPLATE = Path(__file__).with_name("report.html.jinja")
 
 TITLE = "Indoor point cloud segmentation: the paper's evaluation, made again"
 INTRO = (
@@ -19,7 +24,7 @@ INTRO = (
 
 
 def write_report(folder: Folder, names: Sequence[str], *, quick: bool) -> Record:
-    """Write ``report.html``, ``report.md`` and ``report.json`` of the parts in a folder.
+    """Write ``report.html`` and ``report.json`` of the parts in a folder.
 
     Args:
         folder: Where parts and pictures are.
@@ -47,7 +52,6 @@ def write_report(folder: Folder, names: Sequence[str], *, quick: bool) -> Record
         "parts": parts,
     }
     folder.write("report.json", json.dumps(report, indent=1))
-    folder.write("report.md", to_markdown(report))
     folder.write("report.html", to_html(report))
     return report
 
@@ -61,3 +65,16 @@ def _find_made(value: Any) -> Iterator[Record]:  # noqa: ANN401
     if isinstance(value, list):
         for inner in value:
             yield from _find_made(inner)
+
+
+def to_html(report: Mapping[str, Any]) -> str:
+    """Return a report as one page; its pictures are files beside it."""
+    environment = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined)
+    environment.globals = {"verdict": verdict, "figures": _figures}
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(report)
+
+
+def _figures(claim: Block) -> str:
+    """Return the numbers behind a claim, and what else is to be known."""
+    numbers = "; ".join(f"{place}: {number}" for place, number in claim["numbers"].items())
+    return f"{numbers}. {claim['why']}".strip()

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from reproduction.cells import Record
 from reproduction.methods import METHODS
-from reproduction.pictures import draw_side_by_side
-from reproduction.plotting import settings
+from reproduction.pictures import draw_side_by_side, settings
 from reproduction.runs import Run
 from reproduction.sections import Block, claim, figure, section, table, text
 from reproduction.segmentations import count_regions, regrow

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 import torch
-from reproduction.scenes import make_shape
 
+from tests.made import make_shape
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import unsigned_angle_deg

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from reproduction.scenes import make_shape
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.made import make_shape
 from torchrg.neighbors import search_knn
 from torchrg.normals.consensus.noise import survey_noise
 from torchrg.normals.patches import fit_points

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from reproduction.scenes import make_shape
 
+from tests.made import make_shape
 from torchrg.errors import ConfigError
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, find_sharp_points

@@ -1,23 +1,9 @@
 import pytest
 import torch
 
+from tests.made import contaminated
 from torchrg.linalg import eigh3
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd
-
-
-def contaminated(kind, share, rng, count=30):
-    """Noisy planes turned at random, a share of the points outliers, and their normals."""
-    patches = torch.rand(count, 50, 3, generator=rng) - 0.5
-    patches[..., 2] = 0.01 * torch.randn(count, 50, generator=rng)
-    number = round(share * 50)
-    scatter = torch.randn(count, number, 3, generator=rng)
-    patches[:, :number] = {
-        "cluster": torch.tensor([0.2, 0.1, 0.4]) + 0.05 * scatter,
-        "shell": 0.5 * scatter / scatter.norm(dim=-1, keepdim=True),
-        "far": torch.tensor([5.0, 5.0, 10.0]) + scatter,
-    }[kind]
-    turn = torch.linalg.qr(torch.randn(count, 3, 3, generator=rng)).Q
-    return patches @ turn, turn[:, 2]
 
 
 def angles_deg(covariance, normals):

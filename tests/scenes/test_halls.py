@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from reproduction.scenes import (
+
+from tests.made import (
     HALL_LAYOUT,
     StoreyLayout,
     build_storey,
     cast_rays,
     make_storey,
 )
-
 from torchrg.errors import ConfigError
 from torchrg.scenes import make_room
 from torchrg.scenes.scene import is_occupied

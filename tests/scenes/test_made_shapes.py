@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from reproduction.scenes import SHAPES, make_shape
 from scipy.stats import chisquare, kstest
 
+from tests.made import SHAPES, make_shape
 from torchrg.errors import ConfigError
 
 GOLDEN = (1 + 5**0.5) / 2

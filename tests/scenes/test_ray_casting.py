@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from reproduction.scenes import (
+from scipy.stats import kstest
+
+from tests.made import (
     SHAPES,
     Camera,
     build_storey,
@@ -13,12 +15,10 @@ from reproduction.scenes import (
     render_depth,
     scan_scene,
 )
-from reproduction.scenes.cameras import KINECT_LAYOUT, fuse_frames
-from reproduction.scenes.extrusions import Outline, extrude
-from reproduction.scenes.rays import intersect, solve_quadratic
-from reproduction.scenes.shapes import Bumpy
-from scipy.stats import kstest
-
+from tests.made.cameras import KINECT_LAYOUT, fuse_frames
+from tests.made.extrusions import Outline, extrude
+from tests.made.rays import intersect, solve_quadratic
+from tests.made.shapes import Bumpy
 from torchrg.errors import ConfigError
 from torchrg.scenes import RoomLayout, SceneModel, build_room, make_room
 from torchrg.scenes.geometry import Frame, unit

@@ -12,19 +12,20 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes
 
 _JACOBI_SWEEPS = 5
-"""Rotations of all three pairs: 3x3 matrices are diagonal to rounding, in float64 too."""
+"""Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding, in float64
+too."""
 
 _FIRST_STEPS, _MORE_STEPS = 4, 6
-"""Steps of Newton's method: enough for a simple root, and for one that is nearly double."""
+"""Steps of Newton's method for a simple root, and further steps for one that is nearly double."""
 
-_SETTLED = 1e-9
-"""Share of the trace by which the last step may move a root that is as good as found."""
+_CONVERGED = 1e-9
+"""Share of the trace. A root that the last step moves by less has converged."""
 
 _NEARLY_EQUAL = 1e-9
-"""Share of the squared largest eigenvalue below which the adjugate has no direction."""
+"""Share of the squared largest eigenvalue below which the adjugate gives no direction."""
 
 _ROUNDED_STEPS = 8
-"""Rounding errors that a distance to a plane adds up, in units of the patch's own extent."""
+"""Rounding errors that add up in a distance to a plane, in units of the patch's own extent."""
 
 
 def machine_epsilon(dtype: torch.dtype) -> float:
@@ -125,11 +126,11 @@ def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     r"""Return eigenvalues and the first eigenvector of positive semi-definite 3x3 matrices.
 
-    A third of the time of :func:`eigh3`, and more accurate for matrices of thin neighbourhoods: the
-    smallest root of the characteristic polynomial by Newton's method from 0, which it approaches
-    from one side, then a column of the adjugate of :math:`A - \lambda I`, both in double
-    precision. Where the first two eigenvalues are equal to rounding, it is any vector across the
-    third eigenvector.
+    It takes a third of the time of :func:`eigh3` and is more accurate for matrices of thin
+    neighbourhoods. Newton's method from 0 approaches the smallest root of the characteristic
+    polynomial from one side; a column of the adjugate of :math:`A - \lambda I` is the eigenvector.
+    Both are found in double precision. Where the first two eigenvalues are equal to rounding, it is
+    any vector across the third eigenvector.
 
     Returns ascending eigenvalues ``(*, 3)``, not negative, right to 1e-8 of the largest or to
     rounding, and unit eigenvectors of the first ``(*, 3)``, of arbitrary sign.
@@ -158,7 +159,7 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     coefficients = torch.stack([values.reshape(-1) for values in (trace, minors, determinant)])
     root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
     # Convergence is quadratic but near a double root: few need the other steps.
-    rows = (step.abs() > _SETTLED * coefficients[0]).nonzero().squeeze(1)
+    rows = (step.abs() > _CONVERGED * coefficients[0]).nonzero().squeeze(1)
     if len(rows):
         root[rows] = _newton(root[rows], coefficients[:, rows], _MORE_STEPS)[0]
     return torch.where(root.isfinite(), root, 0.0).view_as(trace)

@@ -102,7 +102,7 @@ _NORMALS = {
     Index("count", None): "points",
     Index("count", False): "invalid",
 }
-"""Of sharp points and of regular ones the indices mean the same."""
+"""The indices of normals; those of sharp and of regular points have the same meaning."""
 
 
 def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str, Index]:

@@ -26,13 +26,13 @@ from torchrg.neighbors import canonical_order
 from torchrg.structures import UNLABELED
 
 _COINCIDENT = 1e-12
-"""Radians: closer centres, or directions of different clusters, differ by rounding only."""
+"""Radians. Closer centres, or closer directions of two clusters, differ by rounding alone."""
 _MAX_CELLS = 4096
-"""From so many cells on, the closest pair is searched by trees instead of a grid."""
+"""With more cells than this, the closest pair is searched in trees instead of a grid."""
 _FINEST_LEVEL = 50
-"""Cells of this level are as small as the rounding of coordinates."""
+"""Divisions after which cells are as small as the rounding of coordinates."""
 _QUERIES = 65536
-"""Directions that are looked up in a tree at a time: each shortens the search of the next."""
+"""Directions that are looked up in a tree at a time. Each time shortens the search of the next."""
 
 
 class ClusterScore(NamedTuple):
@@ -219,8 +219,8 @@ def closest_between(directions: Tensor, clusters: Tensor) -> float:
     """Return the smallest angle between directions of different clusters, for eq. (15).
 
     Exact for clouds of any size, by two searches. A grid on the sphere, made finer step by step,
-    drops the cells that are farther from every other cluster than two points known to be close;
-    it settles clusters that stand apart. What is left where many clusters overlap goes to
+    drops the cells that are farther from every other cluster than two points known to be close.
+    Clusters that stand apart need no more. What is left where many clusters overlap goes to
     kd-trees: the numbers of different clusters differ in one binary digit at least, so for each
     digit the directions are split by it and the closest pair across the split is found.
 

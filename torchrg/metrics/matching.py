@@ -16,15 +16,17 @@ from torchrg.neighbors import search_nearest
 from torchrg.structures import Cloud
 
 _MOST_DIGITS = 12
-"""Numbers of more decimals, or digits in all, are as exact as their type."""
+"""A number with more decimals than this, or with more digits in all, is as exact as its type."""
 _NOISE = 4
-"""Steps of its type that arithmetic, such as ``integer * scale + offset``, may move a number by."""
+"""Steps of the number's type by which arithmetic, such as ``integer * scale + offset``, may move
+it."""
 _EXTREME: dict[str, Any] = {"over": "ignore", "under": "ignore", "invalid": "ignore"}
-"""Coordinates of 1e-300 have no digits to speak of, and agree only where equal."""
+"""Settings under which coordinates of 1e-300, which have no digits to speak of, agree only if they
+are equal."""
 _SAMPLE = 10_000
 """Points that tell where the middle of a cloud is."""
 _FAR = 4.0
-"""Distance of a corner of a room from its middle, in median distances of its points, or more."""
+"""Median distances from the middle at which the corner of a room lies, or beyond."""
 
 
 class Rounding(NamedTuple):

@@ -14,7 +14,7 @@ from torchrg.metrics.contingency import check_one_device
 from torchrg.metrics.sphere import unit_vectors
 
 _CHUNK = 2**20
-"""Points at a time: a bound of memory."""
+"""Points that are scored at a time, which bounds the memory."""
 _LIMITS_DEG = (5, 10, 20)
 """Bounds of the shares of small errors, in degrees."""
 

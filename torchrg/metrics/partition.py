@@ -15,7 +15,7 @@ from torchrg.neighbors import search_knn
 from torchrg.structures import UNLABELED
 
 _NUM_NEIGHBORS = 8
-"""So many neighbours surround a point of a surface: a border runs between it and one of them."""
+"""Neighbours that surround a point of a surface. A border runs between it and one of them."""
 
 
 class PartitionScore(NamedTuple):

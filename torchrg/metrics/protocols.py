@@ -14,7 +14,7 @@ from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
 
 _MATCH_IOU, _PART_IOU = 0.75, 0.2
-"""Least IoU of a match and of an overlap in part, as in the EVOPS benchmark. Above 0.5 matches are
+"""Least IoU of a match, and of a partial overlap, as in the EVOPS benchmark. Above 0.5 a match is
 one to one."""
 
 
@@ -209,7 +209,7 @@ def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegComp
     split = _wholes(faces, in_face, of_region, table.overlaps, table.face_sizes, threshold)
     merged = _wholes(regions, in_region, of_face, table.overlaps, table.region_sizes, threshold)
 
-    # Two classes can only meet in a correct pair, so each pair settles its own conflict.
+    # Two classes can only meet in a correct pair, so each pair decides its own conflict.
     over, under = split[faces], merged[regions]
     correct = both & (fit >= over) & (fit >= under)
     is_split, is_merged = split > 0, merged > 0

@@ -14,10 +14,10 @@ from torch import Tensor
 from torchrg.neighbors import canonical_order
 
 _MAX_PAIRS = 2**17
-"""Distances in memory at a time: about what stays in a cache."""
+"""Distances that are computed at a time, about as many as stay in a cache."""
 
 _ROUNDING = 1e-12
-"""By how much an angle may come out too large, relative."""
+"""Relative error by which an angle may come out too large."""
 
 
 class Centers(NamedTuple):

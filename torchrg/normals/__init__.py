@@ -61,9 +61,10 @@ STEPS = dict.fromkeys(ESTIMATORS, 1) | {
     "paper": 2,
     "consensus": _NOISE_STEPS + 1 + 2 * constants.NUM_PASSES,
 }
-"""How many steps from neighbour to neighbour the points are away that decide a fit: 1 where it is
-that of the neighbourhood. Of the noise: deviations of neighbourhoods, their quantile, the quantile
-of these. ``consensus`` with ``adaptive_k`` looks at the whole cloud."""
+"""Steps from neighbour to neighbour within which the points lie that decide the fit of a point. It
+is 1 where only the point's own neighbourhood decides. Each step of an estimate of the noise adds
+one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles.
+``consensus`` with ``adaptive_k`` looks at the whole cloud."""
 
 
 @sequential_operations()

@@ -18,26 +18,27 @@ from torchrg.normals.pca import check_patches, fit_normals_pca
 from torchrg.structures import Neighbors, NormalFit
 
 _HEAVY = 0.25
-"""Points of a weight above this make up the plane."""
+"""Weight above which a point belongs to the plane."""
 
 _LEAST_STEPS = 5
-"""However near the start is to the limit."""
+"""Steps that are taken at least, even if the start is close to the limit."""
 
 _CLOSE_TO_PCA = 0.996
-"""Cosine, of 5 degrees: a normal that turned less from that of PCA has no edge beside it."""
+"""Cosine of 5 degrees. A normal that has turned less than that from the one of PCA has no edge
+beside it."""
 
 _SAME_SOLUTION = 0.95
-"""Cosine, of 18 degrees, above which two solutions are one."""
+"""Cosine of 18 degrees. Two solutions whose normals are closer than that are one."""
 
 _SECOND_START = 0.35
 """Quantile of the squared distances at which the second solution starts."""
 
 _LEAST_SHARE = 0.1
-"""Share of the points below which a solution gives way to the other."""
+"""Share of the points. A solution that explains fewer gives way to the other one."""
 
 _LEAST_NOISE = 1e-4
-"""Share of the distance to the farthest point: exact planes have no noise, and steps must end. (The
-numbers above are those of the authors' program.)"""
+"""Share of the distance to the farthest point. Exact planes have no noise, and without a least
+value the steps would never end. The numbers above are those of the authors' program."""
 
 
 class _Offsets(NamedTuple):

@@ -1,9 +1,9 @@
 """Quadratic height fields: normals and curvatures of curved surfaces.
 
-Two solvers, as they are for two ends. Jets are for all points of a cloud, in float64 as exact as
-CGAL's, with gradients: they are fitted by orthogonalisation. The paraboloids of the consensus need
-three digits and no gradient: normal equations square the condition, which costs nothing there, and
-take half the time.
+There are two solvers because there are two purposes. Jets serve all points of a cloud, with
+gradients, and are as exact as CGAL's in float64, so they are fitted by orthogonalisation. The
+paraboloids of the consensus need three digits and no gradient. Normal equations, which square the
+condition number, do them no harm and take half the time.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,12 @@ from torchrg.normals.pca import check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
-"""Of a quadratic in two coordinates; fewer points do not determine it."""
+"""Terms of a quadratic function of two coordinates, which fewer points do not determine."""
 
 _FLAT_PIVOT = 1e-5
-"""Share of its squared length that a term of a paraboloid keeps beside those before it, at least:
-normal equations in float32 have the root of it, three parts in a thousand, right to a percent."""
+"""Share of its squared length that a term of a paraboloid must keep beside the terms before it.
+Normal equations in float32 then give a share of the length, which is the root of this, three parts
+in a thousand, to within one percent."""
 
 
 def fit_normals_jet(

@@ -22,29 +22,32 @@ _NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""
 
 _NUM_LINKS = 12
-"""Nearest neighbours over which signs spread: enough to cross from face to face of a thin plate."""
+"""Nearest neighbours over which signs spread. So many reach from one face of a thin plate to the
+other."""
 
 _FACE_BEND = 0.05
-"""Largest bend within a face: between normals 18 degrees apart."""
+"""Largest bend within a face, that between normals 18 degrees apart."""
 
 _CLEARLY_OUTWARDS = 1e-3
-"""Share of its largest value beyond which a volume or a mean normal is more than rounding."""
+"""Share of its largest value beyond which a volume or a mean normal cannot be rounding."""
 
 _SPACINGS_PER_CELL = 1.5
 _SPACING_QUANTILE = 0.9
-"""Cells as wide as the spacing of sparse walls: these must have no holes."""
+"""Quantile of the spacing of the points that gives the side of a cell. Sparse walls must have no
+holes."""
 
 _CELLS_PER_POINT = 16
-"""A grid of more cells than this (and a thousand) is made coarser."""
+"""A grid with more cells a point than this, and more than a thousand, is made coarser."""
 
 _STEEP = 0.87
 """Cosine, of 30 degrees, above which a neighbour lies straight ahead."""
 
 _OPEN_WEIGHT = 0.5
-"""What a free path counts that leaves the cloud's box."""
+"""Weight of a free path that leaves the box around the cloud."""
 
 _HALF_WORTH = 8
-"""Free cells that count half: a gap counts less than a room, but a hall no more than a room."""
+"""Free cells at which a path gets half of the largest weight. A gap so weighs less than a room, and
+a hall no more than a room."""
 
 _OPEN = 1 << 24
 """Added to the length of paths that leave the box: more cells than any grid has in a row."""
@@ -64,8 +67,8 @@ def orient_normals(
     - ``"viewpoint"``: towards where the scanner stood.
     - ``"+x"`` ... ``"-z"``: along an axis.
     - ``"consistent"``: neighbours agree, over edges and across thin plates too, by propagation
-      along a spanning tree; outwards for a closed surface. Components of the neighbour graph are
-      turned each for itself.
+      along a spanning tree; outwards for a closed surface. Each component of the neighbour graph
+      is oriented on its own.
     - ``"interior"``: into the free space of rooms: floors up, ceilings down, walls into their own
       room, furniture away from its inside. Each point votes by the free paths in front of it and
       behind, and smooth faces decide by majority. Several rooms, storeys and missing ceilings are
@@ -290,7 +293,7 @@ def vote_free_side(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Ten
        measured to the next marked cell. A path that leaves the cloud's box without meeting anything
        counts half.
     3. If a neighbour lies straight in front, within 30 degrees of the normal, paths to the front
-       are no longer than that: thin plates, whose faces are closer than cells; so for behind.
+       end there, and paths to the back likewise. The faces of thin plates are closer than cells.
     4. The vote is the sum of ``sign(n . d) (n . d)^2 f(path)`` over the directions ``d``, where
        ``f`` rises from 0 to 1 and is half at 8 cells.
 

@@ -77,7 +77,7 @@ def _qn_exceeds(chords: Tensor, counted: Tensor | None, angle_deg: float) -> Ten
     """Return whether Qn of the angles exceeds the limit.
 
     If the majority of the angles lies within one difference of zero, all their pairs do, and they
-    are enough: most points of a room are settled by counting, and only the rest needs angles.
+    are enough: counting decides for most points of a room, and only the rest needs angles.
     """
     near = at_most(chords, deg_to_sq_chord(angle_deg / QN_FACTOR))
     if counted is None:

@@ -27,9 +27,9 @@ def fit_points(
 ) -> NormalFit:
     """Fit the neighbourhoods of some points of a cloud ``(N, 3)``, by default of all of them.
 
-    Patches in memory at a time are ``chunk_size``, which changes no result. Further keywords are
-    those of ``fit`` that have a value for each point, shape ``(N,)``. Returns the fit of the given
-    rows, without ``sharp``.
+    At most ``chunk_size`` patches are in memory at a time, which changes no result. Other keywords
+    are those of ``fit`` that have a value for each point, shape ``(N,)``. Returns the fit of the
+    given rows, without ``sharp``.
     """
 
     def fit_chunk(chunk: slice) -> NormalFit:

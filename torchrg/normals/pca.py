@@ -9,7 +9,8 @@ from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
 from torchrg.structures import NormalFit
 
 _NARROW = 0.03
-"""Share of its length below which the width of a patch drowns in the rounding of a covariance."""
+"""Share of its length. A patch whose width is below this share is lost in the rounding of its
+covariance."""
 
 
 def fit_normals_pca(
@@ -88,8 +89,9 @@ def _spans_plane(
 ) -> Tensor:
     """Return whether the second direction of each patch is more than rounding.
 
-    A covariance holds squares, so its own rounding hides widths below the root of its precision;
-    the few patches that narrow are looked at again: all of them where nobody can tell which.
+    A covariance holds squares, so its own rounding hides widths below the root of its precision.
+    Patches as narrow as that are few and are looked at again, or all are where a compiler cannot
+    tell which.
     """
     if resolution is None:
         resolution = patch_resolution(patches, mask)

@@ -2,7 +2,7 @@
 
 Breakdown: angle of the normal of noisy planes of 50 points, turned at random, with a share of
 outliers, in degrees, median / 90th percentile over 200 patches
-(``python scripts/bench_robust.py --breakdown``). The clusters are compact (0.05 beside an extent of
+(``python scripts/bench.py breakdown``). The clusters are compact (0.05 beside an extent of
 1 and a noise of 0.01), the shells surround the patch, the far points lie ten extents away.
 
 =============  ===========  ===========  ===========  ===========  ===========  ===========

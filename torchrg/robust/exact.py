@@ -13,16 +13,17 @@ from torchrg.robust.lanes import covariance_entries, dot, eigenvectors, sum_squa
 from torchrg.robust.scale import sum_points
 
 _NUM_SIMPLICES = 128
-"""Sets of P + 1 points looked at; 27 of 50 points on a plane escape all of them once in 25,000."""
+"""Sets of P + 1 points that are looked at. If 27 of 50 points lie on a plane, all sets miss it once
+in 25,000 patches."""
 
 _MAX_CANDIDATES = 16
-"""Flats of a lane whose points are counted: of exact planes nearly every simplex gives one."""
+"""Flats of a patch whose points are counted. On exact planes nearly every simplex gives one."""
 
 _LANES = 1024
-"""Patches looked at together: what they need fits the cache."""
+"""Patches that are looked at together, so that what they need fits the cache."""
 
 _MIN_EDGE = 0.01
-"""Height, in extents of a patch, below which an edge is too short to span the next dimension."""
+"""Share of the extent of a patch. A shorter edge does not span another dimension."""
 
 
 def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:

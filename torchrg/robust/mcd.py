@@ -39,17 +39,17 @@ from torchrg.robust.weights import (
 )
 
 _MAX_STEPS = 100
-"""Concentration steps after which tied points that follow each other are left as they are."""
+"""Concentration steps at most. Sets of tied points that alternate are left as they are then."""
 
 _NUM_KEPT = 10
 """Random starts that are concentrated to the end, as published."""
 
 _MAX_COMPARED = 16
-"""Starts of a lane up to which equal sets are found: comparing costs more than it saves
-where they are many."""
+"""Starts of a patch up to which equal sets are looked for. With more, comparing costs more than it
+saves."""
 
 _DIGITS = 24
-"""Points whose membership one number holds exactly, as a binary digit each."""
+"""Points whose membership one number holds exactly, a binary digit for each."""
 
 
 class _Settings(NamedTuple):
@@ -339,9 +339,9 @@ def _concentrate(
         value = determinant(ellipsoid, size - 1)
         candidate = smallest_points(sq_distances(ellipsoid, size - 1), size)
         # Rounding may let the determinant grow, or two sets of tied points follow each other.
-        settled = (sum_points(candidate * members) >= size) | ~(value < previous)
-        settled |= step == max_steps
-        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+        converged = (sum_points(candidate * members) >= size) | ~(value < previous)
+        converged |= step == max_steps
+        done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
         final.index_copy_(1, places[done], members.index_select(1, done))
         best[places[done]] = value[done]
         if len(moving) == 0:

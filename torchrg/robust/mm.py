@@ -34,16 +34,16 @@ _BREAKDOWN = 0.5
 """Share of the points that may be arbitrary."""
 
 _EFFICIENCY = 0.95
-"""Of the MM-estimate for normal data."""
+"""Efficiency of the MM-estimate for normal data."""
 
 _MAX_STEPS = 300
-"""Reweightings after which weights that have not settled are left as they are."""
+"""Reweightings at most. Weights that have not converged are left as they are then."""
 
-_SETTLED = {torch.float32: 16, torch.float64: 4096}
-"""Relative change of a reweighting, in roundings, at which weights have settled."""
+_CONVERGED = {torch.float32: 16, torch.float64: 4096}
+"""Relative change of a reweighting, in units of rounding, below which weights have converged."""
 
 _CHECK_EVERY = 4
-"""Reweightings between two looks at what has settled."""
+"""Reweightings between two looks at which weights have converged."""
 
 
 class _Shape(NamedTuple):
@@ -178,8 +178,8 @@ def _best_s_estimate(
         members = smallest_points(sq_distances(ellipsoid, count), size)
         shape = _shape_of(points, members, floors)
         scale = _m_scale(shape.distances, cutoff)
-        settled, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
-        weights.append(settled.reshape(num_points, num_starts, num_lanes))
+        converged, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
+        weights.append(converged.reshape(num_points, num_starts, num_lanes))
         scales.append(scale.reshape(num_starts, num_lanes))
     scale = torch.cat(scales)
     best = scale.argmin(dim=0)
@@ -222,13 +222,13 @@ def _reweight(
     *,
     adapt_scale: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Reweight until the weights settle, and return them and the scale.
+    """Reweight until the weights converge, and return them and the scale.
 
-    Lanes that have settled leave the batch. With ``adapt_scale`` the scale takes one step to the
+    Lanes that have converged leave the batch. With ``adapt_scale`` the scale takes one step to the
     M-scale before each reweighting: solving for it fully can lead to another local minimum.
     """
     eps = machine_epsilon(scale.dtype)
-    enough = _SETTLED[scale.dtype] * eps
+    enough = _CONVERGED[scale.dtype] * eps
     weights, scales = start.weights.clone(), scale.clone()
     places = torch.arange(len(scale), device=scale.device)
     points, floors = columns, floor
@@ -242,10 +242,10 @@ def _reweight(
             previous = current
             continue
         change = sum_points((current - previous).abs())
-        settled = change <= enough * sum_points(current)
+        converged = change <= enough * sum_points(current)
         if step == _MAX_STEPS:
-            settled |= True
-        done, moving = torch.nonzero(settled).squeeze(1), torch.nonzero(~settled).squeeze(1)
+            converged |= True
+        done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
         if len(done):
             weights.index_copy_(1, places[done], current.index_select(1, done))
             scales[places[done]] = scale[done]

@@ -25,7 +25,7 @@ from torchrg.robust.weights import (
 )
 
 _LANES_AT_ONCE = 1024
-"""Sets times patches worked on together: what they need fits the cache."""
+"""Sets times patches that are worked on together, so that what they need fits the cache."""
 
 
 def fit_mve(

@@ -26,10 +26,10 @@ Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
 """Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
 
 PATCHES_IN_CACHE = 4096
-"""Patches worked on together; what they need has to fit the processor's cache."""
+"""Patches that are worked on together, so that what they need fits the processor's cache."""
 
 _LEAST_PATCHES = 64
-"""Patches that are worth a thread's start."""
+"""Fewer patches than this are not worth the start of a thread."""
 
 
 class RobustFit(NamedTuple):

@@ -34,10 +34,10 @@ _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
 """Finite-sample factors of 2 to 12 values."""
 
 _TAU_WEIGHT_CUT = 4.5
-"""Deviation, in medians of the deviations, from which a value has no weight in the centre."""
+"""Medians of the deviations. A value that deviates by more has no weight in the centre."""
 
 _TAU_SCALE_CUT = 3.0
-"""Deviation at which deviations are cut."""
+"""Medians of the deviations at which larger deviations are cut off."""
 
 
 def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -338,15 +338,15 @@ def _with_lags(
 
 
 _NETWORK = 512
-"""Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions.
-
-As integers, whose order is that of non-negative floats, they take two thirds of the time."""
+"""Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions
+them. They are sorted as integers, whose order is that of non-negative floats, in two thirds of the
+time."""
 
 _MOST_LAGS = 8
-"""Lags in one subtraction. They are all as wide as the first of them."""
+"""Lags of one subtraction at most; all become as wide as the first of them."""
 
 _GPU_SHARE = 256
-"""Times as much at once on a GPU, which has memory for it and is slow to start."""
+"""Factor of the work at a time on a GPU, which has the memory for it and is slow to start."""
 
 
 class _Lagged:

@@ -32,19 +32,20 @@ from torchrg.robust.scale import (
 Starts = Literal["paper", "robustbase", "planes", "more"]
 
 _LONG = 1000
-"""Values from which tau takes the place of Qn, as in robustbase: Qn needs all their differences."""
+"""Values from which tau takes the place of Qn, as in robustbase, because Qn needs all
+differences."""
 
 _STARTS_AT_ONCE = 3
-"""Of the six starts, worked on together: what they need fits the cache."""
+"""Of the six starts so many are worked on together, so that what they need fits the cache."""
 
 _NUM_PLANES = 64
-"""Planes of which the best become starts."""
+"""Planes among which the best are chosen."""
 
 _NUM_PLANE_STARTS = 4
 """Planes that become starts."""
 
 _PLANES_AT_ONCE = 8
-"""Planes worked on together: what they need fits the cache."""
+"""Planes that are worked on together, so that what they need fits the cache."""
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:

@@ -53,7 +53,7 @@ def consistency_factor(fraction: float, num_coordinates: int) -> float:
 
 _RAW_SMALL = (2.12777, 2.718898, 1.993509, 2.220433, 1.820585)
 _FINAL_SMALL = (1.73511, 2.06681, 1.545905, 1.659655, 1.456835)
-"""Factors of 6 to 10 points at a support fraction of 0.5, which the formula does not meet."""
+"""Factors of 6 to 10 points at a support fraction of 0.5, which the published formula misses."""
 
 
 def small_sample_factor(

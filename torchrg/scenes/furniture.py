@@ -13,7 +13,7 @@ SIDES = ("left", "right", "front", "back")
 """Left and right are across the first axis of a body, front and back across the second."""
 
 _TABLE_HEIGHT = (0.62, 0.92)
-"""Metres."""
+"""Least and greatest height of a table top, metres."""
 
 
 def block(

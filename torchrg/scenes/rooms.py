@@ -27,28 +27,28 @@ from torchrg.scenes.surfaces import Hole
 T = TypeVar("T")
 
 _ROOM = 100
-"""What random numbers are drawn for: sizes and places in a room."""
+"""Purpose of the random numbers: sizes and places in a room."""
 
 _FLOOR_CELL = (1.85, 1.35)
-"""A table with room to pass around it, metres."""
+"""Metres. A table with room to pass around it."""
 _WALL_CELL = 1.75
-"""A window or a cabinet with wall on both sides, metres."""
+"""Metres. A window or a cabinet with wall on both sides."""
 _CORNER = 0.6
-"""Free at both ends of a wall, for a cabinet on the next one, metres."""
+"""Metres that are free at both ends of a wall, for a cabinet on the next wall."""
 _AISLE = 0.75
-"""Free along the walls, for doors and cabinets, metres."""
+"""Metres that are free along the walls, for doors and cabinets."""
 _DOORWAY_AISLE = 1.6
-"""From the middle of a doorway to what is on walls, metres."""
+"""Metres from the middle of a doorway to whatever is on a wall."""
 _DOORWAY_SPACE = 1.9
-"""From the middle of a doorway to what stands on the floor, for an open door, metres."""
+"""Metres from the middle of a doorway to whatever stands on the floor, for an open door."""
 _TRIES = 1000
-"""Draws of an object until none of its faces lies in the plane of another."""
+"""Times that an object is drawn until none of its faces lies in the plane of another."""
 _PARALLEL = 1 - 0.02**2 / 2
-"""Least cosine between parallel faces: that of about one degree."""
+"""Least cosine between faces that count as parallel, of about one degree."""
 _CLEARANCES = (1.0, 0.6, 0.4, 0.2)
-"""Free space around a scanner, as much as there is, metres."""
+"""Metres of free space around a scanner, the first that there is."""
 _PLACE_TRIES = 50
-"""Draws of a scanner's place with each clearance."""
+"""Times that a place for a scanner is drawn with each clearance."""
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from torchrg.scenes.surfaces import Solid, Surface
 NoiseDirection = Literal["normal", "isotropic"]
 
 PLACES, NOISE = range(2)
-"""What random numbers are drawn for: the same places whatever the noise."""
+"""Purposes of the random numbers. Places are the same whatever the noise is."""
 _CLEARANCE = 1e-7
-"""How far in front of a surface must be free for it to be seen, in sizes of the scene."""
+"""Sizes of the scene. So much in front of a surface must be free for it to be seen."""
 _SPARE = 1.02
-"""How many more points are tried than are expected to be needed: fewer repetitions."""
+"""Points that are tried for one that is expected to be needed, which saves repetitions."""
 
 
 class Scene(NamedTuple):

@@ -35,20 +35,22 @@ def estimate_consensus(
     1. *Noise.* PCA at every point, and the noise ``s`` from small neighbourhoods; see
        :func:`torchrg.normals.consensus.noise.survey_noise`. Nothing is assumed of the sensor.
     2. *Flat.* Where the deviation from the plane is at most 1.05 s, PCA stands.
-    3. *Curved.* The others get a paraboloid. Where its deviation ``J`` is at most 1.2 s, or 0.15
-       of the plane's (that of a symmetric edge is 0.27), its normal stands.
-    4. *Broken.* At what is left, the plane through the point with the most votes starts the fit of
-       two planes that meet, and of three. The point takes its plane of these if they explain the
+    3. *Curved.* The others get a paraboloid. Its normal stands where its deviation ``J`` is at
+       most 1.2 s, or at most 0.15 of the deviation of the plane; a symmetric edge has 0.27.
+    4. *Broken.* At the points that are left, the plane with the most votes starts the fit of two
+       planes that meet, and of three. The point takes its plane of these if they explain the
        neighbours, and significantly better than the paraboloid does. Where they do not, and the
        paraboloid is far off, it takes the plane of the votes. See
        :func:`torchrg.normals.consensus.surfaces.fit_surfaces`. These points are ``sharp``.
-    5. *Smoothing.* Twice, bilateral smoothing of the normals
+    5. *Smoothing.* The normals are smoothed bilaterally
        (:func:`torchrg.normals.consensus.smoothing.smooth_planes`) where their standard error is
-       worth it (0.17 degrees and more), and the points that follow votes choose again among the
-       planes of their neighbours (:func:`torchrg.normals.consensus.smoothing.choose_planes`).
+       0.17 degrees and more, and points that took the plane of the votes choose again among the
+       planes of their neighbours (:func:`torchrg.normals.consensus.smoothing.choose_planes`). Both
+       are done twice.
 
-    With ``config.adaptive_k``, neighbourhoods grow with the noise first: with ``u`` the median of
-    noise by radius, by the factor ``(u / 0.15)^2``, up to that many neighbours.
+    With ``config.adaptive_k`` the neighbourhoods grow with the noise before all this. If ``u`` is
+    the median of noise by radius, they grow by the factor ``(u / 0.15)^2``, up to that many
+    neighbours.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -58,8 +60,8 @@ def estimate_consensus(
 
     Returns:
         The fit, with ``sharp``. At sharp points curvature and residual are those of the neighbours
-        within three times the noise of the plane, the curvature less what the noise explains (in a
-        narrow face the little width would make a large curvature of it); elsewhere they are those
+        within three times the noise of the plane; what the noise explains is taken from the
+        curvature, as the small width of a narrow face would make it large. Elsewhere they are those
         of PCA. ``valid`` is that of PCA; with fewer than 12 neighbours so is all else.
 
     Example:

@@ -1,148 +1,119 @@
 """Every constant of consensus normals: value, unit, meaning and reason, stage by stage.
 
-Each begins with its unit; ``s`` is the noise about a point (standard deviation). All are read when
-the estimator is called. Each ends with what ``scripts/sensitivity.py --quick`` finds when it alone
-is halved or doubled: the largest change of a score, or "free" where F1 and mean best IoU change by
-at most one face, the adjusted Rand index by 1 point, the mean angle by 0.05 degrees, the RMS by
-0.25; where less than that factor was tried, how far it is free. Shares end at 1. Changes of 0.1 to
-0.3 degrees on ``torus, adaptive k`` are near chance: that cloud has 1,500 points.
+Each docstring begins with the unit. There ``s`` is the noise about a point, a standard deviation.
+All constants are read when the estimator is called. What becomes of the scores when one of them is
+halved or doubled is measured by ``scripts/sensitivity.py`` and kept in ``sensitivity.json`` beside
+it.
 """
 
 MIN_NEIGHBORS = 12
-"""Neighbours. Fewer tell no surface from another (a paraboloid alone has 6 parameters): PCA. Half:
-free. Double: +2.9 deg mean, cube, k = 16 (free to x1.25)."""
+"""Neighbours. Fewer do not tell one surface from another, as a paraboloid alone has 6 parameters;
+such points keep the normal of PCA."""
 
 NOISE_QUANTILE = 0.35
-"""Share. Of the neighbours' deviations: low, as most neighbourhoods near an edge are on it. Half:
-+3.6 deg mean, torus, adaptive k. Double: +3.6 deg mean, bracket."""
+"""Share. The noise is this quantile of the deviations that the neighbours find around themselves.
+It is low because most neighbourhoods near an edge contain the edge, and deviate by their shape."""
 NOISE_COUNTS = (8, 16)
-"""Neighbours. Small neighbourhoods, of which enough lie within one face at edges and corners. [0]
-Half: +10 deg mean, torus, adaptive k. Double: +1.5 deg mean, cube, k = 16. [1] Half: +2.3 deg mean,
-torus, adaptive k (free to x0.909). Double: +0.073 deg mean, bracket (free to x1.25)."""
+"""Neighbours. Sizes of the small neighbourhoods whose deviations are taken: at edges and corners
+enough of them lie within one face."""
 NOISE_FACTORS = (1.22, 1.1)
-"""Per deviation. Noise by that quantile of the deviations of noisy planes: of m points, the root of
-``(m - 3)`` by that quantile of chi-square with as many degrees of freedom. [0] Half: +8.8 deg mean,
-torus, adaptive k. Double: +1.3 deg mean, cube, k = 16. [1] Half: +7 deg mean, torus, adaptive k.
-Double: +0.084 deg mean, bracket."""
+"""Per deviation. Turn that quantile of the deviations, for each size of neighbourhood, into noise.
+For planes of m points they are the root of ``m - 3`` by the same quantile of chi-square with m - 3
+degrees of freedom."""
 NOISE_FACTOR_OF_ALL = 1.04
-"""Per deviation. The same for all neighbours. Half: +4.4 deg mean, torus, adaptive k. Double:
-+0.09 deg mean, room (free to x1.1)."""
+"""Per deviation. Turns that quantile into noise where the deviations are those of all neighbours
+together."""
 NOISE_LIMITS = (0.3425, 0.398)
-"""Radii. What noise by these counts tends to as true noise grows, measured on noisy planes. [0]
-Half: -0.36 deg mean, torus, adaptive k. Double: +2.6 deg mean, torus, adaptive k. [1] Half: +0.093
-deg mean, bracket (free to x0.8). Double: +0.21 deg mean, torus, adaptive k."""
+"""Radii. Measured on noisy planes: as the true noise grows, noise from each size of neighbourhood
+tends to this share of the radius, so nothing beyond it can be measured."""
 COMMON_QUANTILE = 0.15
-"""Share. Of the neighbours' noise: what a corner, where no neighbourhood is flat, goes by. Half:
--1.7 deg RMS, plate, exact. Double: +3.2 deg RMS, plate, exact."""
+"""Share. Quantile of the noise of the neighbours that counts as their common noise. A corner goes
+by it, as no neighbourhood is flat there."""
 MAX_ABOVE_COMMON = 3.0
-"""Times. Noise above that common noise is shape. Half: -0.34 deg mean, cube, k = 16 (free to
-x0.8). Double: +0.09 deg mean, room (free to x1.5)."""
+"""Times. Noise that is larger than the common noise by this factor is taken for shape."""
 MAX_LAYERED_KURTOSIS = 2.2
-"""Ratio. Of residuals from one plane, up to which two parallel ones are tried: 1 for both faces of
-a plate without noise, 1.8 for even spread, 3 for noise. Half: +1.67 deg mean, plate, exact. Double:
--0.32 deg RMS, plate, exact (free to x1.1)."""
+"""Ratio. Kurtosis of the residuals from one plane up to which two parallel planes are tried. It is
+1 for both faces of a plate without noise, 1.8 for an even spread, and 3 for noise."""
 MAX_LAYERED_SHARE = 0.35
-"""Deviations of one plane. What two parallel planes leave where they are the faces of a plate; they
-leave 0.5 of even spread, 0.6 of noise. Half: -5.05 pt mIoU, room (free to x0.91). Double: +0.28 deg
-mean, cube, k = 16 (free to x1.2)."""
+"""Deviations of one plane. Two parallel planes are the faces of a plate if they leave no more than
+this. They leave 0.5 of an even spread and 0.6 of noise."""
 MIN_BREADTH = 0.03
-"""Ratio of variances. Neighbours narrower than that lie on a line, as scan lines do. Half, double:
-free."""
+"""Ratio of variances. Neighbours that are narrower than this lie on a line, as a scan line does,
+and say nothing about a plane."""
 ADAPTIVE_NOISE = 0.15
-"""Radii. Noise up to which k neighbours do; with ``adaptive_k`` they grow until it is that. Half:
-+14 deg mean, torus, adaptive k (free to x0.909). Double: free."""
+"""Radii. Up to this noise k neighbours are enough; with ``adaptive_k`` a noisier neighbourhood
+grows until its noise is this share of its radius."""
 
 FLAT_LIMIT = 1.05
-"""s. Deviation up to which a plane stands. Half: +0.068 deg mean, cube, k = 16. Double: +0.64 deg
-mean, torus."""
+"""s. A plane stands if the neighbours deviate from it by no more than this."""
 CURVED_LIMIT = 1.2
-"""s. Deviation up to which a paraboloid stands: of 200 points that have an edge one is missed, of
-those that have none half are spared the fits that follow. Half: +0.39 deg mean, torus, adaptive k.
-Double: +4.9 deg mean, bracket."""
+"""s. A paraboloid stands if the neighbours deviate from it by no more than this. At this value one
+of 200 points that have an edge is missed, and half of the points without an edge are spared the
+fits that come later."""
 CURVED_SHARE = 0.15
-"""Deviations of the plane. The same where noise is nearly nil; a symmetric edge has 0.27. Half:
-free. Double: +6.5 deg RMS, cube, exact (free to x1.25)."""
+"""Deviations of the plane. Where there is next to no noise, a paraboloid stands if it leaves no
+more than this. A symmetric edge has 0.27."""
 FAR_OFF = 2.0
-"""s. Deviation of the paraboloid from which votes are better, though two or three planes fail.
-Half: +1.1 deg mean, torus, adaptive k. Double: +1.6 deg mean, cube, k = 16."""
+"""s. If the neighbours deviate from the paraboloid by more than this, the vote is better even where
+two or three planes fail."""
 
 NUM_CANDIDATES = 32
-"""Planes. Candidates of the vote; each costs a pass over the neighbours. Half: +0.15 deg mean,
-plate, exact (free to x0.8). Double: free."""
+"""Planes. Candidates of the vote; each costs one pass over the neighbours."""
 CANDIDATE_POWER = 1.5
-"""Exponent. Ranks of the candidates' points: above 1 near points come more often. Half: +3 pt ARI,
-office parts. Double: +0.078 deg mean, bracket."""
+"""Exponent. The points of a candidate are drawn by rank to this power: above 1, near points come
+more often."""
 VOTE_REACH = 2.0
-"""s. Residual from which a neighbour votes against a plane. Half: +0.18 deg mean, bracket. Double:
-+0.26 deg mean, coral, exact (free to x1.1)."""
+"""s. A neighbour whose residual is larger than this votes against a plane."""
 VOTE_FALLOFF = 0.9
-"""Share. What the farthest neighbour's vote lacks of the nearest one's. Half: +0.12 deg mean,
-coral, exact. Double: -0.38 deg RMS, plate, exact."""
+"""Share. The vote of the farthest neighbour lacks this part of the vote of the nearest one."""
 FIT_REACH = 3.5
-"""s. Reach of the bisquare weights of the last fit: nearly all the points of a face. Half: +0.13
-deg mean, torus, adaptive k. Double: +0.45 deg mean, bracket."""
+"""s. Reach of the bisquare weights of the last fit, which takes in nearly all points of a face."""
 FIT_FALLOFF = 0.5
-"""Share. What the farthest neighbour's weight in that fit, and in smoothing, lacks. Half: -0.079
-deg mean, bracket. Double: +0.23 deg mean, bracket."""
+"""Share. In the last fit and in smoothing the weight of the farthest neighbour lacks this part of
+the weight of the nearest one."""
 NUM_REFITS = 2
-"""Fits. With each of the two reaches. Half: +0.098 deg mean, bracket. Double: -0.073 deg mean,
-torus, adaptive k."""
+"""Fits. Number of fits with each of the two reaches, that of the vote and that of the last fit, and
+of the two faces of a plate."""
 
 NUM_ALTERNATIONS = 4
-"""Times. Planes that meet, and who belongs to which, are fitted in turn. Half: +0.35 deg mean,
-bracket. Double: +0.68 deg RMS, plate, exact (free to x1.1)."""
+"""Times. Planes that meet and the points that belong to each are found in turn this often."""
 MEETING_GAP = 2.0
-"""s. Points farther from one plane are the first guess of the other. Half: +0.79 deg mean, bracket.
-Double: -0.41 deg mean, torus, adaptive k."""
+"""s. The points that are farther than this from one plane are the first guess of the other one."""
 MIN_PLANE_POINTS = 5
-"""Points. A plane of fewer explains them whatever they are. Half: -0.6 deg mean, cube, k = 16.
-Double: +0.76 deg mean, bracket."""
+"""Points. A plane with fewer points fits them wherever they are, and explains nothing."""
 CORNER_LIMIT = 1.15
-"""s. Deviation of two planes above which three are tried. Half: -0.84 deg RMS, plate, exact.
-Double: +0.32 deg mean, bracket (free to x1.1)."""
+"""s. Three planes are tried where two planes leave a deviation above this."""
 CORNER_SHARE = 0.9
-"""Deviations of two planes. Three replace the two below that. Half: +0.22 deg mean, bracket.
-Double: free."""
+"""Deviations of two planes. Three planes replace two if they leave less than this."""
 MEETING_LIMIT = 1.3
-"""s. Deviation up to which two or three planes explain the neighbours. Half: +2.9 deg mean,
-bracket. Double: +2.6 pt ARI, office parts."""
+"""s. Two or three planes explain the neighbours if these deviate by no more than this."""
 MIN_GAIN = 8.0
-"""Chi-square. Gain of the planes over the paraboloid that a point needs. Half: free. Double: -0.051
-deg mean, torus, adaptive k."""
+"""Chi-square. A point takes the planes that meet only if they gain this much on the paraboloid."""
 MIN_POOLED_GAIN = 20.0
-"""Chi-square. The same on average over its nearest: noise breaks single points, edges all. Half:
-+0.33 deg mean, torus, adaptive k. Double: +2.9 deg mean, bracket."""
+"""Chi-square. The gain on the paraboloid, averaged over the nearest neighbours, must be this much
+too. Noise gives single points a gain; an edge gives it to all of them."""
 MAX_GAIN = 40.0
-"""Chi-square. A single point gives that average no more. Half: +2.9 deg mean, bracket. Double:
--0.056 deg mean, rounded box."""
+"""Chi-square. In that average a single point counts with no more than this."""
 NUM_POOLED = 16
-"""Neighbours. Those averaged. Half: +0.17 deg mean, torus, adaptive k. Double: -0.26 deg mean,
-torus, adaptive k."""
+"""Neighbours. Number of the nearest neighbours whose gains are averaged."""
 
 NUM_PASSES = 2
-"""Times. Normals are smoothed and planes chosen among the neighbours'. Half: +0.21 deg mean, cube,
-k = 16. Double: +0.31 deg mean, torus, adaptive k."""
+"""Times. Normals are smoothed, and planes are chosen among those of the neighbours, this often."""
 MIN_ERROR = 0.003
-"""Radians. Standard error of a normal (0.17 degrees) from which smoothing is worth its time. Half:
-free. Double: +0.095 deg mean, room."""
+"""Radians. Standard error of a normal, 0.17 degrees, from which smoothing is worth its time."""
 INLIER_REACH = 3.0
-"""s. What is farther from a plane is not on it: neighbours have no part in the error and curvature
-of a sharp point, and points do not choose that plane. Half: free. Double: +2.7 pt ARI, office
-parts."""
+"""s. A point that is farther than this from a plane is not on it. Such a neighbour has no part in
+the error and the curvature of a sharp point, and such a point does not choose that plane."""
 SMOOTHING_REACH = 2.5
-"""s. Residual of the point from a neighbour's plane from which that has no say. Half: +0.42 deg
-mean, torus, adaptive k. Double: free."""
+"""s. A neighbour has no say in smoothing if the point is farther than this from its plane."""
 SMOOTHING_AGREEMENT = 4.2
-"""Standard errors. Chord between two normals from which they are different. Half: +0.29 deg mean,
-cube, k = 16. Double: -0.14 deg mean, cylinder."""
+"""Standard errors. Two normals are different if the chord between them is longer than this."""
 MAX_TILT = 0.95
-"""Share. Of a weight that the balance of positions may take away, or add. Half: +0.35 deg mean,
-torus, adaptive k. Double: free."""
+"""Share. The balance of positions may take away, or add, at most this part of a weight."""
 TILT_RIDGE = 0.01
-"""Share of the trace. Keeps that balance solvable for points on a line. Half, double: free."""
+"""Share of the trace. Added to the diagonal so that the balance of positions can be solved for
+points on a line."""
 CHOICE_STEP = 3
-"""Ranks. Every third neighbour's plane is tried: others add time only. Half: free. Double: +0.08
-deg mean, plate, exact (free to x1.5)."""
+"""Ranks. Every third neighbour offers its plane; the others would only take time."""
 CHOICE_COST = 0.1
-"""Score. Price of a residual of the point of one s, growing with its square. Half: -1.2 pt ARI,
-office parts. Double: free."""
+"""Score. Price of a residual of one s; it grows with the square of the residual."""

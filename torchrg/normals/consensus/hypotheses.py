@@ -179,8 +179,9 @@ def fit_meeting_planes(
 ) -> MeetingPlanes:
     """Fit two planes that meet, and three where two do not explain the neighbours.
 
-    They start from one plane of each neighbourhood, normal ``(n, 3)`` and offset ``(n,)``; three
-    from the wedge and the points off it, and from that plane and votes.
+    Two planes start from one plane of each neighbourhood, normal ``(n, 3)`` and offset ``(n,)``.
+    Three start once from the two planes and the points off them, and once from that one plane and
+    the planes with the most votes of what it leaves.
     """
     wedge = fit_wedges(columns, normals, offsets, noise)
     two = wedge.planes
@@ -251,11 +252,11 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
     r"""Fit three half-spaces, from a first guess which points ``(n, K)``, 0 or 1, lie on which.
 
-    Corners where three faces meet; rims of plates, where both faces of the plate are among the
-    neighbours; steps and reveals. The first two planes are a wedge, as in :func:`fit_wedges`. If
-    the third group begins inside of it, its half-space cuts the wedge, ``min(e_1, e_2, e_3)``;
-    otherwise it is added, ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of
-    the first two groups.
+    These are corners where three faces meet, rims of plates, where both faces of the plate are
+    among the neighbours, steps and reveals. The first two planes are a wedge, as in
+    :func:`fit_wedges`. If the third group begins inside of it, its half-space cuts the wedge,
+    ``min(e_1, e_2, e_3)``; otherwise it is added, ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is
+    positive on the side of the first two groups.
     """
     first, second, third = groups
     present = torch.ones_like(first[:, 0], dtype=torch.bool)

@@ -48,17 +48,18 @@ def survey_noise(
     r"""Estimate the noise about each point, at edges and on curved surfaces too.
 
     The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
-    points lie on one smooth face, and more elsewhere. Small neighbourhoods do so more often, so the
-    estimate is the least of three, for m = 8, 16 and all neighbours, of
-    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``, where ``q`` is the 35th percentile
-    over the neighbours, ``c_m`` the factor that makes it unbiased for a plane, and the root undoes
-    that a plane of few points turns with their noise (``R_m = R (m / K)^(1/2)``: their radius, from
-    that of all; ``a_m``: measured on noisy planes). A place counts once, however many points are
-    there; neighbourhoods almost on one line, as on scan lines, do not count. At corners, where none
-    of the three finds a face, the noise is at most 3 times the 15th percentile of that of the
-    neighbours. Where points are so few that even the nearest are of both faces of a plate, two
-    parallel planes take the place of the one of all neighbours, if they leave 0.35 of its deviation
-    or less.
+    points lie on one smooth face, and more elsewhere. Small neighbourhoods lie on one face more
+    often, so the estimate is the least of three, for m = 8, 16 and all neighbours, of
+    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``. Here ``q`` is the 35th percentile
+    over the neighbours, and ``c_m`` the factor that makes it unbiased for a plane. A plane of few
+    points turns with their noise, which the root makes good: ``R_m = R (m / K)^(1/2)`` is their
+    radius, from that of all, and ``a_m`` was measured on noisy planes.
+
+    A place counts once, however many points are there, and neighbourhoods that lie almost on one
+    line, as on scan lines, do not count. At corners, where none of the three finds a face, the
+    noise is at most 3 times the 15th percentile of the noise of the neighbours. Where points are so
+    few that even the nearest are of both faces of a plate, two parallel planes take the place of
+    the one of all neighbours, if they leave 0.35 of its deviation or less.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -135,7 +136,7 @@ def _deviations(
 
 
 def _layered_deviations(columns: Columns, counted: Tensor, rests: Tensor, whole: Tensor) -> Tensor:
-    """Return deviations from two parallel planes, as the faces of a plate are; inf without these.
+    """Return deviations from two parallel planes, the faces of a plate; inf where there are none.
 
     ``rests`` are the residuals from one plane and ``whole`` their deviation. Those of two planes
     have low kurtosis, which spares most points the fits.

@@ -133,8 +133,8 @@ def standard_errors(
 ) -> Tensor:
     """Return the standard error of the normals in radians, shape ``(N,)``.
 
-    Of a plane through ``n`` points that is the noise by ``(n l_1)^(1/2)``, with the middle
-    eigenvalue ``l_1`` of their covariance: a quarter of the squared radius where they fill a disc.
+    For a plane through ``n`` points it is the noise divided by ``(n l_1)^(1/2)``, where ``l_1`` is
+    the middle eigenvalue of their covariance, a quarter of the squared radius if they fill a disc.
     """
     radius = torch.where(survey.radius > 0, survey.radius, 1.0)
     num_points: Tensor | int = neighbors.indices.shape[1]

@@ -35,7 +35,7 @@ class Surfaces(NamedTuple):
     Attributes:
         planes: Tangent planes at the points.
         sharp: Points whose neighbourhood is broken, shape ``(N,)``, bool.
-        voted: Sharp points that follow votes alone, shape ``(N,)``, bool.
+        voted: Sharp points that took the plane of the votes, shape ``(N,)``, bool.
     """
 
     planes: TangentPlanes
@@ -57,9 +57,10 @@ def fit_surfaces(
 
     .. math:: (K - 6) (J^2 - W^2) / \max(s, W)^2,
 
-    is above 8, and above 20 on average over the point's 16 nearest (0 where nothing is broken):
-    noise makes single points look broken, an edge all of them. Points left over with ``J > 2 s``
-    take the plane of the votes. ``fit`` and ``survey`` are those of all neighbours by PCA.
+    is above 8, and above 20 on average over the point's 16 nearest, where a neighbourhood that is
+    not broken counts as 0. Noise makes single points look broken; an edge does so to all of them.
+    Points that are left with ``J > 2 s`` take the plane of the votes. ``fit`` and ``survey`` are
+    those of all neighbours by PCA.
     """
     noise = survey.noise
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
@@ -107,7 +108,7 @@ def fit_surfaces(
 
 
 def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns, Tensor]:
-    """Return columns of the neighbours and which count, as 0 or 1."""
+    """Return columns of the neighbours, and which of these count, as 0 or 1."""
     columns = split_columns(gather_patches(points, neighbors.indices[rows]))
     return columns, neighbors.counted(rows).to(points.dtype)
 
@@ -134,7 +135,7 @@ def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Colum
 def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
     """Return the points whose gain can make that of some point large enough on average.
 
-    Noise makes single points look broken: most of them are spared the fits.
+    Most of the points that look broken by noise alone are spared the fits.
     """
     most = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
     open_points = broken & (most > constants.MIN_POOLED_GAIN)

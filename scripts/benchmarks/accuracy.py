@@ -1,0 +1,216 @@
+"""torchrg beside PCL's region growing and Open3D's planar patches by three known protocols.
+
+Clouds with exact truth: made rooms at four levels of noise and at three densities, rendered depth
+frames without noise and with a Kinect's, and a scan of SynPEB's test set if its file is given.
+FOLDER holds the program ``pclrg`` (PCL's normals and region growing), PYTHON has Open3D; what is
+missing is left out. Open3D finds boxes: a point goes to the nearest within 5 cm. ``depth`` sees a
+frame as an image, all others as a cloud. Published figures stand below the table, and are of other
+data.
+
+    python scripts/bench.py accuracy --programs FOLDER --open3d-python PYTHON --synpeb FILE.pcd
+    python scripts/bench.py accuracy --scale 0.1 --only classic consensus
+"""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchrg
+from benchmarks.harness import Benchmark, Figures, Results, run_program, table
+from benchmarks.peers import MIN_SIZE, pcl_command
+from tests.made import DepthFrame, cameras_around, render_depth
+from torchrg.depth import segment_depth
+from torchrg.depth.camera import depth_to_points
+from torchrg.metrics import score_labels, score_voxels
+from torchrg.scenes import build_room, make_room
+
+PRESETS = ("classic", "paper", "consensus")
+NOISES = (0.0005, 0.001, 0.003, 0.006)
+"""Standard deviations of the points of made rooms, in metres."""
+POINTS = 300_000
+"""Points of each of the rooms with these."""
+DENSITIES = (100_000, 200_000, 1_000_000)
+"""Points of the same room at 3 mm."""
+NUM_FRAMES = 4
+FRAME_SEED = 21
+SYNPEB_MIN_SIZE = 10
+"""Points of the smallest region, and of the smallest face, as smaller ones are void there."""
+SYNPEB_VOID = 3
+"""Label of SynPEB's points of no plane."""
+EVOPS = ("precision", "recall", "mean_iou")
+"""Indices of its protocol."""
+VOXEL_SIZE = 0.05
+"""Side of the voxels, in metres."""
+
+PUBLISHED = """Correct to noise: SynPEB's at 80 %, of the true faces. Published, of other data:
+
+| by | data | measure |
+|---|---|---|
+| RSPD | 2D-3D-S, 148 rooms | voxel precision .85, recall .90, F1 .87 |
+| OPS | 2D-3D-S | .89, .70, .78 |
+| 3D-KHT | 2D-3D-S | .71, .78, .75 |
+| OBRG | 2D-3D-S | .81, .67, .71 |
+| Polylidar3D | SynPEB, noise 1 to 4 | correct .57, .55, .50, .45 |
+| PCL region growing | EVOPS | precision .21, recall .67, mean IoU .25 |
+| CAPE | EVOPS | precision about .5, recall about .2, mean IoU .67 |"""
+
+OPEN3D = """
+import sys, numpy as np, open3d
+points = np.load(sys.argv[1]).astype(np.float64)
+cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
+boxes = cloud.detect_planar_patches(search_param=open3d.geometry.KDTreeSearchParamKNN(30))
+labels, least = np.full(len(points), -1), np.full(len(points), 0.05)
+for number, box in enumerate(boxes):
+    away = np.abs((points - box.center) @ box.R) - np.asarray(box.extent) / 2
+    distance = np.linalg.norm(np.maximum(away, 0), axis=1)
+    nearer = distance < least
+    labels[nearer], least[nearer] = number, distance[nearer]
+np.save(sys.argv[2], labels)
+"""
+
+
+class Labelled(NamedTuple):
+    """A cloud with its truth."""
+
+    points: Tensor  # shape ``(N, 3)``
+    truth: Tensor  # shape ``(N,)``, -1 for points of no plane
+    min_size: int = MIN_SIZE  # points of the smallest region
+    # The depth image that the points are of, in the order of its pixels with depth.
+    frame: DepthFrame | None = None
+
+
+Clouds = Sequence[Labelled]
+"""What a row of the table is of: indices are means."""
+
+
+@dataclass(frozen=True)
+class Case(Benchmark):
+    programs: Path | None = None
+    """Folder of the program pclrg."""
+    open3d_python: str | None = None
+    """A Python that has Open3D."""
+    synpeb: Path | None = None
+    """A scan with labels in the field intensity."""
+    scale: float = 1.0
+    """Share of the points."""
+
+    def clouds(self) -> Mapping[str, Callable[[], Clouds]]:
+        rooms = {f"room, {1000 * noise:g} mm": (POINTS, noise) for noise in NOISES}
+        rooms |= {f"room, {number:,} points": (number, 0.003) for number in DENSITIES}
+        makers: dict[str, Callable[[], Clouds]] = {
+            name: partial(_made_room, round(self.scale * number), noise)
+            for name, (number, noise) in rooms.items()
+        }
+        for sensor in ("exact", "kinect"):
+            makers[f"{NUM_FRAMES} frames, {sensor}"] = partial(_frames, sensor, self.scale)
+        if self.synpeb is not None:
+            makers["SynPEB, test 100"] = partial(_read_synpeb, self.synpeb)
+        return makers
+
+    def contenders(self) -> Mapping[str, Callable[[Clouds], Figures | None]]:
+        runs: dict[str, Callable[[Labelled], Tensor]] = {
+            name: partial(_run_preset, name) for name in PRESETS
+        }
+        runs["depth"] = _run_depth
+        if self.programs is not None and (self.programs / "pclrg").exists():
+            runs["PCL"] = partial(_run_pcl, self.programs / "pclrg")
+        if self.open3d_python is not None:
+            runs["Open3D"] = partial(_run_open3d, self.open3d_python)
+        return {name: partial(_mean_scores, run) for name, run in runs.items()}
+
+    def report(self, results: Results) -> str:
+        """Return a row for each cloud and contender, and published figures."""
+        return f"{table(results)}\n\n{PUBLISHED}"
+
+
+def _made_room(num_points: int, noise: float) -> Clouds:
+    """Return a room with all its faces."""
+    room = make_room(num_points, noise=noise, seed=0)
+    return [Labelled(room.points, room.labels)]
+
+
+def _frames(sensor: str, scale: float) -> Clouds:
+    """Return what a depth camera sees of a made room."""
+    model = build_room(FRAME_SEED)
+    height = max(round(480 * scale**0.5), 60)
+    size = {"width": height * 4 // 3, "height": height}
+    clouds = []
+    for number, camera in enumerate(cameras_around(model, NUM_FRAMES, seed=FRAME_SEED, **size)):
+        frame = render_depth(model, camera, sensor=sensor, seed=number)
+        seen = frame.depth.flatten() > 0
+        points = depth_to_points(frame.depth[None], camera.intrinsics[None])[0].view(-1, 3)
+        # Columns and balls are no planes.
+        planar = torch.cat([frame.planar, torch.tensor([False])])
+        truth = torch.where(planar[frame.labels], frame.labels, -1).flatten()
+        clouds.append(Labelled(points[seen].float(), truth[seen], frame=frame))
+    return clouds
+
+
+def _read_synpeb(path: Path) -> Clouds:
+    """Return a scan of SynPEB: its labels are in the field ``intensity``."""
+    cloud = torchrg.read_cloud(path)
+    labels = torch.as_tensor(cloud.fields["intensity"]).long()
+    known = (labels != SYNPEB_VOID) & (torch.bincount(labels)[labels] >= SYNPEB_MIN_SIZE)
+    return [Labelled(torch.as_tensor(cloud.points)[known], labels[known], SYNPEB_MIN_SIZE)]
+
+
+def _run_preset(name: str, cloud: Labelled) -> Tensor:
+    """Return the labels of a preset."""
+    config = torchrg.load_config(name)
+    growing = dataclasses.replace(config.growing, min_size=cloud.min_size)
+    return torchrg.segment_planes(cloud.points, dataclasses.replace(config, growing=growing)).labels
+
+
+def _run_depth(cloud: Labelled) -> Tensor:
+    """Return the labels of the image's pixels with depth."""
+    depth = cloud.frame.depth
+    return segment_depth(depth, cloud.frame.camera.intrinsics).labels.flatten()[depth.flatten() > 0]
+
+
+def _run_pcl(program: Path, cloud: Labelled) -> Tensor:
+    """Return the labels of PCL's region growing."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, result = Path(folder) / "cloud.f32", Path(folder) / "labels.i32"
+        cloud.points.float().numpy().tofile(source)
+        run_program(pcl_command(program, source, result, cloud.min_size))
+        return torch.from_numpy(np.fromfile(result, dtype=np.int32)).long()
+
+
+def _run_open3d(python: str, cloud: Labelled) -> Tensor:
+    """Return the box of Open3D's planar patches that is nearest to each point."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, result = Path(folder) / "cloud.npy", Path(folder) / "labels.npy"
+        np.save(source, cloud.points.numpy())
+        run_program([python, "-c", OPEN3D, source, result])
+        return torch.from_numpy(np.load(result)).long()
+
+
+def _mean_scores(run: Callable[[Labelled], Tensor], clouds: Clouds) -> Figures | None:
+    """Return the means of all indices over clouds, None for images where there are none."""
+    if run is _run_depth and clouds[0].frame is None:
+        return None
+    rows = [_score(cloud, run(cloud)) for cloud in clouds]
+    return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def _score(cloud: Labelled, labels: Tensor) -> Figures:
+    """Return the indices of all protocols."""
+    found = score_labels(labels, cloud.truth)
+    voxels = score_voxels(cloud.points, labels, cloud.truth, voxel_size=VOXEL_SIZE)
+    shares = ("correct", "over_segmented", "under_segmented", "missed", "noise")
+    return {
+        **{name: getattr(found, name) for name in ("regions", "faces", "mean_best_iou")},
+        "recall_iou50": found.recall_iou50,
+        **{f"voxel {name}": getattr(voxels, name) for name in ("precision", "recall", "f1")},
+        **{name: getattr(found, name) / max(found.faces, 1) for name in shares},
+        **{f"EVOPS {name}": getattr(found, f"evops_{name}") for name in EVOPS},
+    }

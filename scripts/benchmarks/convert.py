@@ -1,0 +1,133 @@
+"""``torchrg convert s3dis`` on a made S3DIS: workers, stages, memory, and equal bytes.
+
+Makes a tree of rooms in the raw layout of S3DIS (100,000 to 1,000,000 points, geometrically), and
+converts it with one worker, with two, and on Ray. Shows points a second, of the whole and of each
+stage, what S3DIS with its 273 million points would take, the peak memory of a worker against 2 GB +
+1.2 GB per million points, and whether all runs wrote the same bytes.
+
+    python scripts/bench.py convert
+    python scripts/bench.py convert --rooms 6 --smallest 20000 --largest 50000 --only 1 2
+    python scripts/bench.py convert --folder /data/made --out figures.json
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import Benchmark, Figures, Results, table
+from torchrg.scenes import make_room
+
+S3DIS_POINTS = 273_000_000
+CLASSES = ("wall", "table", "chair", "bookcase", "board", "door", "window", "clutter")
+REPORTED = ("points", "seconds", "points_per_second", "points_per_second_of_a_worker")
+"""Fields of the command's own report."""
+PROMISED_BYTES, PROMISED_BYTES_A_POINT = 2e9, 1200.0
+"""What a worker may take at most."""
+
+
+@dataclass(frozen=True)
+class Case(Benchmark):
+    rooms: int = 24
+    smallest: int = 100_000
+    """Points of the first room."""
+    largest: int = 1_000_000
+    """Points of the last room."""
+    noise: float = 0.003
+    """Metres."""
+    preset: str = "consensus"
+    folder: Path | None = None
+    """Keeps the tree and the results."""
+
+    def clouds(self) -> Mapping[str, Callable[[], object]]:
+        return {f"{self.rooms} rooms, {self.preset}": self._make_tree}
+
+    def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
+        return {
+            "1": partial(self._convert, ["--workers", "1"]),
+            "2": partial(self._convert, ["--workers", "2"]),
+            "ray": partial(self._convert, ["--engine", "ray", "--workers", "2"]),
+        }
+
+    def report(self, results: Results) -> str:
+        """Return a table, and whether the bytes are equal.
+
+        Raises:
+            SystemExit: If they are not.
+        """
+        runs = [figures for by in results.values() for rows in by.values() for figures in rows]
+        if len({figures["sha256"] for figures in runs}) > 1:
+            raise SystemExit(f"{table(results)}\nRUNS WROTE DIFFERENT BYTES")
+        return f"{table(results)}\n\nall runs wrote the same bytes"
+
+    @contextlib.contextmanager
+    def _make_tree(self) -> Iterator[Path]:
+        """Write rooms as ``Area_i/room_j/Annotations/*.txt``; what is there already is kept."""
+        sizes = np.geomspace(self.smallest, self.largest, self.rooms).astype(int)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = self.folder or Path(temporary)
+            for index, num_points in enumerate(sizes):
+                room = folder / "raw" / f"Area_{index % 6 + 1}" / f"room_{index + 1}"
+                if not (room / "done").exists():
+                    _write_room(room / "Annotations", index, int(num_points), self.noise)
+                    (room / "done").touch()
+            yield folder
+
+    def _convert(self, options: list[str], folder: Path) -> Figures:
+        """Convert the tree, and return what the report says."""
+        out = folder / options[-1] if "ray" not in options else folder / "ray"
+        command = [sys.executable, "-m", "torchrg", "convert", "s3dis", folder / "raw", out]
+        begin = time.perf_counter()
+        subprocess.run(
+            [*map(str, command), "--preset", self.preset, "--force", *options],
+            check=True,
+            env=os.environ | {"PYTHONWARNINGS": "ignore"},
+            stdout=subprocess.DEVNULL,
+        )
+        seconds = time.perf_counter() - begin
+        report = json.loads((out / "report.json").read_text())
+        promised = [
+            PROMISED_BYTES + PROMISED_BYTES_A_POINT * scan["num_points"] for scan in report["scans"]
+        ]
+        shares = [s["peak_memory"] / p for s, p in zip(report["scans"], promised, strict=True)]
+        return {
+            **{name: report[name] for name in REPORTED},
+            "with start and checks": seconds,
+            "minutes for S3DIS": S3DIS_POINTS / report["points_per_second"] / 60,
+            "GB": report["peak_memory"] / 1e9,
+            "of what is promised": max(shares),
+            "sha256": _digest(out),
+        }
+
+
+def _write_room(folder: Path, seed: int, num_points: int, noise: float) -> None:
+    """Write the faces of a room, each as an object."""
+    folder.mkdir(parents=True, exist_ok=True)
+    made = make_room(num_points=num_points, noise=noise, seed=seed)
+    points, labels = np.asarray(made.points), np.asarray(made.labels)
+    order = np.argsort(labels, kind="stable")
+    bounds = np.searchsorted(labels[order], np.unique(labels)[1:])
+    colors = np.random.default_rng(seed).integers(0, 256, (len(points), 3))
+    for face, rows in enumerate(np.split(order, bounds)):
+        name = f"{CLASSES[face % len(CLASSES)]}_{face + 1}.txt"
+        values = np.hstack([points[rows], colors[rows]])
+        np.savetxt(folder / name, values, fmt="%.3f %.3f %.3f %d %d %d")
+
+
+def _digest(out: Path) -> str:
+    """Return a hash over all results, the records among them."""
+    total = hashlib.sha256()
+    for path in sorted(out.rglob("*.*")):
+        if path.name not in ("report.json", ".torchrg.lock"):
+            total.update(str(path.relative_to(out)).encode() + path.read_bytes())
+    return total.hexdigest()

@@ -1,0 +1,263 @@
+"""What all benchmarks share: clouds, contenders that run on each, rounds, a file and a table."""
+
+import contextlib
+import importlib
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import surroundings
+from tqdm import tqdm
+
+BENCH = Path(__file__).parents[1] / "bench.py"
+
+Figures = dict[str, Any]
+"""What one run of a contender on a cloud gives."""
+Results = dict[str, dict[str, list[Figures]]]
+"""The figures of each round, by cloud and contender."""
+Column = Callable[[Figures], object]
+"""What a column of a table shows of figures; None leaves a cell empty."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """The settings that all benchmarks have; each adds its own."""
+
+    only: tuple[str, ...] = ()
+    """Contenders that run. Default: all there are."""
+    rounds: int = 1
+    """Times that each contender runs on each cloud, in turn with all others; medians are shown."""
+    threads: int = os.cpu_count() or 1
+    """Threads of torch."""
+    minutes: float = math.inf
+    """Begin nothing after so many."""
+    out: Path | None = None
+    """JSON file of all figures. What it has is not measured again."""
+
+    def clouds(self) -> Mapping[str, Callable[[], Any]]:
+        """Return what makes each cloud, perhaps a context that removes it again."""
+        raise NotImplementedError
+
+    def contenders(self) -> Mapping[str, Callable[[Any], Figures | None]]:
+        """Return what runs on a cloud, and returns None where it is not meant for it."""
+        raise NotImplementedError
+
+    def report(self, results: Results) -> str:
+        """Return tables of all figures."""
+        return table(results)
+
+
+def run(benchmark: Benchmark) -> None:
+    """Measure what is asked for and not known yet, and print the tables."""
+    os.environ["OMP_NUM_THREADS"] = str(benchmark.threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(benchmark.threads)
+    results, is_complete = measure(benchmark)
+    print(", ".join(f"{k} {v}" for k, v in surroundings.describe(benchmark.threads).items()), "\n")
+    print(benchmark.report(results))
+    if not is_complete:
+        print("\nNot all is measured: run it again.")
+
+
+def measure(benchmark: Benchmark) -> tuple[Results, bool]:
+    """Return all figures, those of the file included, and whether none is left to measure."""
+    contenders = benchmark.contenders()
+    unknown = set(benchmark.only) - set(contenders)
+    if unknown:
+        listed = f"{', '.join(contenders)}, got {', '.join(sorted(unknown))}"
+        raise SystemExit(f"bench: expected --only among {listed}.")
+    names = [name for name in contenders if not benchmark.only or name in benchmark.only]
+    results, begin = _load(benchmark.out), time.perf_counter()
+    for cloud, make in tqdm(benchmark.clouds().items(), disable=None):
+        rows = results.setdefault(cloud, {})
+        if all(len(rows.get(name, ())) >= benchmark.rounds for name in names):
+            continue
+        with contextlib.ExitStack() as stack:
+            made = make()
+            if hasattr(made, "__enter__"):
+                made = stack.enter_context(made)
+            left = [name for _ in range(benchmark.rounds) for name in names]
+            for number, name in enumerate(left):
+                if len(rows.get(name, ())) > number // len(names):
+                    continue
+                if time.perf_counter() - begin > 60 * benchmark.minutes:
+                    return results, False
+                figures = contenders[name](made)
+                if figures is not None:
+                    rows.setdefault(name, []).append(figures)
+                    _save(benchmark, results)
+    return results, True
+
+
+def _load(path: Path | None) -> Results:
+    if path is None or not path.exists():
+        return {}
+    results: Results = json.loads(path.read_text(encoding="utf-8"))["results"]
+    return results
+
+
+def _save(benchmark: Benchmark, results: Results) -> None:
+    if benchmark.out is not None:
+        benchmark.out.parent.mkdir(parents=True, exist_ok=True)
+        record = {"made_with": surroundings.describe(benchmark.threads), "results": results}
+        benchmark.out.write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def medians(rows: Sequence[Figures]) -> Figures:
+    """Return the medians of figures over rounds; what is no number is that of the first round."""
+    found = {}
+    for name, value in rows[0].items():
+        if isinstance(value, dict):
+            found[name] = medians([row[name] for row in rows])
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            found[name] = median(row[name] for row in rows)
+        else:
+            found[name] = value
+    return found
+
+
+def ratio(rows: Iterable[Figures], others: Iterable[Figures], name: str) -> float | None:
+    """Return the median of the ratios of one figure within each round, None without any."""
+    ratios = [mine[name] / other[name] for mine, other in zip(rows, others, strict=False)]
+    return median(ratios) if ratios else None
+
+
+def table(results: Results, columns: Mapping[str, Column] | None = None) -> str:
+    """Return a row of medians for each cloud and contender, by default of all that are numbers."""
+    rows = [
+        (cloud, name, medians(runs)) for cloud, by in results.items() for name, runs in by.items()
+    ]
+    if columns is None:
+        names = dict.fromkeys(key for _, _, figures in rows for key in figures)
+        columns = {name: lambda figures, name=name: figures.get(name) for name in names}
+    return markdown(
+        ["cloud", "by", *columns],
+        [
+            [cloud, name, *(show(figures) for show in columns.values())]
+            for cloud, name, figures in rows
+        ],
+    )
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table in Markdown."""
+    lines = [" | ".join(["", *map(_shown, cells), ""]).strip() for cells in (head, *rows)]
+    return "\n".join([lines[0], "|" + " --- |" * len(head), *lines[1:]])
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_shown(part)}" for name, part in value.items())
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return "" if value is None else f"{value:,}" if type(value) is int else str(value)
+
+
+class Finished(NamedTuple):
+    """A program that has ended: what it printed, its time, and its largest resident memory."""
+
+    text: str
+    seconds: float
+    peak_bytes: int
+
+
+def run_program(command: Sequence[object], stdin: str = "") -> Finished:
+    """Run a program to its end.
+
+    What the system says that it needed at most includes what its parent had when it started it: a
+    benchmark that measures memory so must not load torch itself.
+
+    Raises:
+        RuntimeError: If it fails.
+    """
+    begin = time.perf_counter()
+    process = subprocess.Popen(
+        [str(part) for part in command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None  # noqa: S101
+    assert process.stdout is not None  # noqa: S101
+    with contextlib.suppress(BrokenPipeError), process.stdin:
+        process.stdin.write(stdin)
+    with process.stdout:
+        text = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - begin
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RuntimeError(f"{command[0]}: exit code {process.returncode}: {text}")
+    return Finished(text, seconds, usage.ru_maxrss * 1024)
+
+
+def serve_command(target: str, *arguments: object) -> list[str]:
+    """Return the command that serves a function; see :func:`serve`."""
+    return [sys.executable, str(BENCH), "--serve", target, json.dumps(arguments)]
+
+
+def serve(target: str, arguments: Sequence[Any]) -> None:
+    """Call ``module:function``, then for each line of input what it returned, and print figures."""
+    module, _, name = target.partition(":")
+    work = getattr(importlib.import_module(module), name)(*arguments)
+    # The memory of a process of another library must not have torch in it.
+    memory = importlib.import_module("torchrg.batch.memory") if "torchrg" in sys.modules else None
+    print("{}", flush=True)
+    for _ in sys.stdin:
+        if memory:
+            memory.reset_peak_memory()
+        begin, cpu = time.perf_counter(), _cpu_seconds()
+        found = work()
+        taken = {"seconds": time.perf_counter() - begin, "cpu": _cpu_seconds() - cpu}
+        if memory:
+            taken["peak_gb"] = memory.peak_memory() / 1e9
+        print(json.dumps(taken | (found if isinstance(found, dict) else {})), flush=True)
+
+
+def _cpu_seconds() -> float:
+    """Return the CPU time of this process and of those it has waited for."""
+    return sum(os.times()[:4])
+
+
+class Worker:
+    """A process that does one kind of work whenever it is told to; see :func:`serve`."""
+
+    def __init__(self, target: str, *arguments: object, threads: int | None = None) -> None:
+        environment = {} if threads is None else {"OMP_NUM_THREADS": str(threads)}
+        self._process = subprocess.Popen(
+            serve_command(target, *arguments),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | environment,
+        )
+        self.wait()
+
+    def begin(self) -> None:
+        """Let it work once."""
+        print(file=self._process.stdin, flush=True)
+
+    def wait(self) -> Figures:
+        """Return the figures of what it did last."""
+        line = self._process.stdout.readline() if self._process.stdout else ""
+        if not line:
+            raise SystemExit("bench: a contender died; its error is above.")
+        result: Figures = json.loads(line)
+        return result
+
+    def run(self) -> Figures:
+        """Work once, and return what :meth:`wait` does."""
+        self.begin()
+        return self.wait()
+
+    def __enter__(self) -> "Worker":
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._process.kill()
+        self._process.communicate()

@@ -1,0 +1,217 @@
+"""torchrg beside PCL, CGAL and Open3D on the same clouds: seconds of stages, memory, ratios.
+
+FOLDER of ``--programs`` holds ``pclrg`` (PCL's normals and region growing) and ``cgaln`` (CGAL's
+PCA and jet normals); what is missing there, or not installed, is left out. ``torchrg-*`` and
+``open3d-*`` are warm calls in one process, ``*-command`` the whole command, which is compared with
+PCL's whole process. Contenders run one after the other, round by round; ratios are those within a
+round.
+
+    python scripts/bench.py peers --programs FOLDER --out peers.json
+    python scripts/bench.py peers --programs FOLDER --sizes 100000 --only pclrg torchrg-classic
+"""
+
+import contextlib
+import json
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+
+from benchmarks.harness import (
+    Benchmark,
+    Figures,
+    Results,
+    markdown,
+    medians,
+    ratio,
+    run_program,
+    serve_command,
+)
+
+K, MAX_ANGLE_DEG, CURVATURE_PERCENTILE, MIN_SIZE = 50, 5, 95, 50
+"""Settings of PCL's region growing: those of ``classic``."""
+PRESETS = ("classic", "paper", "consensus")
+SEED, NOISE = 7, 0.003
+WARM_UP = 5000
+"""Points, about, on which a contender runs once before it is timed."""
+
+
+def pcl_command(program: Path, cloud: Path, labels: Path, min_size: int = MIN_SIZE) -> list[object]:
+    """Return the command for PCL's normals and region growing."""
+    return [program, cloud, K, MAX_ANGLE_DEG, CURVATURE_PERCENTILE, min_size, labels]
+
+
+@dataclass(frozen=True)
+class Case(Benchmark):
+    rounds: int = 3
+    programs: Path | None = None
+    """Folder of the programs pclrg and cgaln."""
+    scans: tuple[Path, ...] = ()
+    """Scans to run on too."""
+    sizes: tuple[int, ...] = (100_000, 1_000_000, 4_000_000)
+    """Points of made rooms, in random order and in that of a space-filling curve."""
+
+    def clouds(self) -> Mapping[str, Callable[[], object]]:
+        rooms = [f"room {size} {order}" for size in self.sizes for order in ("random", "sorted")]
+        names = [*map(str, self.scans), *rooms]
+        return {Path(name).stem: partial(cloud_files, name) for name in names}
+
+    def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
+        runs: dict[str, Callable[[Path], Figures]] = {
+            f"torchrg-{preset}": partial(_run_warm, f"preset {preset}") for preset in PRESETS
+        }
+        runs["torchrg-pca"] = partial(_run_warm, "normals")
+        if find_spec("open3d"):
+            runs["open3d-pca"] = partial(_run_warm, "open3d normals")
+            runs["open3d-planes"] = partial(_run_warm, "open3d planes")
+        runs |= {f"torchrg-{preset}-command": partial(_run_command, preset) for preset in PRESETS}
+        for name in ("pclrg", "cgaln"):
+            if self.programs is not None and (self.programs / name).exists():
+                runs[name] = partial(_run_peer, self.programs / name)
+        return runs
+
+    def report(self, results: Results) -> str:
+        """Return seconds, memory, and ratios of like to like; above 1 torchrg is slower."""
+        rows = []
+        for cloud, by_name in results.items():
+            for name, runs in by_name.items():
+                found, kind = medians(runs), "whole" if name.endswith("-command") else "total"
+                is_normals = name.endswith("-pca") or name == "cgaln"
+                ratios = [
+                    ratio(runs, by_name.get(other, []), kind)
+                    if name != other and is_normals == other.endswith("-pca")
+                    else None
+                    for other in ("pclrg", "open3d-pca")
+                ]
+                rows.append([cloud, name, *(found[key] for key in FIELDS), *ratios])
+        return markdown(["cloud", "what", *FIELDS.values(), "to PCL", "to Open3D"], rows)
+
+
+FIELDS = {
+    "total": "seconds",
+    "seconds": "stages",
+    "whole": "whole process, s",
+    "peak_mib": "peak MiB",
+}
+"""Figures of a run, and their columns."""
+
+
+@contextlib.contextmanager
+def cloud_files(cloud: str) -> Iterator[Path]:
+    """Write a cloud as ``cloud.npy`` and ``cloud.f32``, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        run_program(serve_command("benchmarks.peers:write_cloud", cloud, folder))
+        yield Path(folder)
+
+
+def write_cloud(cloud: str, folder: str) -> None:
+    """Read a scan or make a room, and write its points for all contenders."""
+    import numpy as np
+    import torch
+
+    import torchrg
+    from torchrg.neighbors import canonical_order
+
+    if cloud.startswith("room "):
+        _, size, order = cloud.split()
+        points = torchrg.scenes.make_room(int(size), NOISE, SEED).points
+        points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(SEED))]
+        points = points[canonical_order(points)] if order == "sorted" else points
+    else:
+        points = torchrg.read_cloud(cloud).points
+        points = points[points.isfinite().all(dim=1)].float()
+    np.save(Path(folder) / "cloud.npy", points.numpy())
+    points.numpy().tofile(Path(folder) / "cloud.f32")
+
+
+def _figures(seconds: dict[str, float], whole: float, peak_bytes: int) -> Figures:
+    return {
+        "seconds": seconds,
+        "total": sum(seconds.values()),
+        "whole": whole,
+        "peak_mib": peak_bytes / 2**20,
+    }
+
+
+def _run_warm(work: str, folder: Path) -> Figures:
+    """Run a call of a Python library, warm, in a process of its own."""
+    command = serve_command("benchmarks.peers:prepare", work, str(folder / "cloud.npy"))
+    text, whole, peak = run_program(command, stdin="\n")
+    return _figures(json.loads(text.splitlines()[-1])["stages"], whole, peak)
+
+
+def _run_command(preset: str, folder: Path) -> Figures:
+    """Run ``torchrg segment``."""
+    files = [folder / "cloud.npy", "--out", folder / f"{preset}.npz"]
+    _, whole, peak = run_program(
+        [sys.executable, "-m", "torchrg", "segment", *files, "--preset", preset]
+    )
+    return _figures({"command": whole}, whole, peak)
+
+
+def _run_peer(program: Path, folder: Path) -> Figures:
+    """Run a program, which prints the seconds of its stages."""
+    cloud = folder / "cloud.f32"
+    # CGAL adds the point itself.
+    command = [program, cloud, K - 1]
+    if program.name == "pclrg":
+        command = pcl_command(program, cloud, folder / "labels.i32")
+    text, whole, peak = run_program(command)
+    stages = re.findall(r"([a-z][a-z ]*?) (\d+\.\d+) s", text)
+    seconds = {stage.replace("region growing", "regions"): float(value) for stage, value in stages}
+    return _figures(seconds, whole, peak)
+
+
+def prepare(work: str, file: str) -> Callable[[], Figures]:
+    """Return what times a library on a file of points, run once already on few of them."""
+    import numpy as np
+
+    points = np.load(file)
+    kind, _, name = work.partition(" ")
+    marks: list[tuple[str, float]] = []
+
+    def note(stage: str) -> None:
+        marks.append((stage, time.perf_counter()))
+
+    if kind == "open3d":
+        import open3d
+
+        search = open3d.geometry.KDTreeSearchParamKNN(K)
+
+        def run(points: np.ndarray) -> None:
+            vectors = open3d.utility.Vector3dVector(points.astype(np.float64))
+            cloud = open3d.geometry.PointCloud(vectors)
+            note("normals")
+            cloud.estimate_normals(search)
+            if name == "planes":
+                note("regions")
+                cloud.detect_planar_patches(search_param=search)
+            note("done")
+    else:
+        import torch
+
+        import torchrg
+
+        config = torchrg.load_config(name if kind == "preset" else "classic")
+
+        def run(points: np.ndarray) -> None:
+            if kind == "preset":
+                torchrg.segment_planes(torch.from_numpy(points), config, on_stage=note)
+            else:
+                note("normals")
+                torchrg.estimate_normals(torch.from_numpy(points), method="pca", k=K)
+                note("done")
+
+    def timed() -> Figures:
+        marks.clear()
+        run(points)
+        return {"stages": {stage: end - begin for (stage, begin), (_, end) in pairwise(marks)}}
+
+    run(points[:: max(1, len(points) // WARM_UP)])
+    return timed

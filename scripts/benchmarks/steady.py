@@ -1,0 +1,129 @@
+"""Times on a machine that is not idle, on one thread and on larger clouds, as ratios in one run.
+
+Each contender is a process of its own that is warm, and takes turns with all others: alone, twice
+at once, beside one and two processes that only count, and on one thread. ``depth`` is a noise-free
+rendered frame of 640 x 480 pixels, ``depth-kinect`` one with a Kinect's noise, ``depth-large`` one
+of 1280 x 960; the others are presets, on a made room.
+
+    python scripts/bench.py steady --out steady.json --minutes 8     # again, until nothing is left
+    python scripts/bench.py steady --work consensus --sizes 100000 1000000 --only alone
+"""
+
+import contextlib
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+
+import torchrg
+from benchmarks.harness import Benchmark, Figures, Results, Worker, markdown, medians, ratio
+from tests.made import cameras_around, render_depth
+
+PRESETS = ("classic", "paper", "consensus")
+FRAMES = {"depth": (480, "exact"), "depth-kinect": (480, "kinect"), "depth-large": (960, "exact")}
+"""Rows of a frame, and the sensor that sees it."""
+BUSY = [sys.executable, "-c", "while True: pass"]
+NOISE, SEED = 0.003, 7
+WARM_UP = 5000
+"""Points, about, that a preset segments before it is timed."""
+
+
+@dataclass(frozen=True)
+class Case(Benchmark):
+    rounds: int = 5
+    work: tuple[str, ...] = (*FRAMES, *PRESETS)
+    """Presets, and kinds of depth frames."""
+    sizes: tuple[int, ...] = (200_000,)
+    """Points of the room."""
+
+    def clouds(self) -> Mapping[str, Callable[[], object]]:
+        keys = [(name, size) for name in self.work for size in (self.sizes, (0,))[name in FRAMES]]
+        return {
+            f"{name}, {size:,} points" if size else name: partial(Workers, name, size, self.threads)
+            for name, size in keys
+        }
+
+    def contenders(self) -> Mapping[str, Callable[["Workers"], Figures]]:
+        return {
+            "alone": lambda workers: workers.get().run() | {"points": workers.size},
+            "twice": _run_both,
+            "beside one": lambda workers: _run_beside(workers, 1),
+            "beside two": lambda workers: _run_beside(workers, 2),
+            "one thread": lambda workers: workers.get(threads=1).run(),
+        }
+
+    def report(self, results: Results) -> str:
+        """Return times as ratios to those alone, and the cost of a point."""
+        rows = []
+        for cloud, by in results.items():
+            if "alone" in by:
+                alone = medians(by["alone"])
+                million = alone["points"] / 1e6 or None
+                cost = [alone["seconds"] / million, alone["peak_gb"] / million] if million else []
+                ratios = [ratio(by.get(name, []), by["alone"], "seconds") for name in CONDITIONS]
+                rows.append([cloud, alone["seconds"], *ratios, *(cost or [None, None])])
+        head = ["times the time alone", "alone, s", *CONDITIONS]
+        return markdown([*head, "us a point", "GB a million points"], rows)
+
+
+CONDITIONS = ("twice", "beside one", "beside two", "one thread")
+
+
+class Workers(contextlib.ExitStack):
+    """Processes that do the same work, each started when it is first asked for."""
+
+    def __init__(self, name: str, size: int, threads: int) -> None:
+        super().__init__()
+        self.name, self.size, self.threads = name, size, threads
+        self._found: dict[tuple[int, int], Worker] = {}
+
+    def get(self, number: int = 0, threads: int | None = None) -> Worker:
+        """Return one of several with so many threads."""
+        key = (number, threads or self.threads)
+        if key not in self._found:
+            worker = Worker("benchmarks.steady:prepare", self.name, self.size, threads=key[1])
+            self._found[key] = self.enter_context(worker)
+        return self._found[key]
+
+
+def _run_both(workers: Workers) -> Figures:
+    pair = (workers.get(0), workers.get(1))
+    for worker in pair:
+        worker.begin()
+    return max((worker.wait() for worker in pair), key=lambda figures: figures["seconds"])
+
+
+def _run_beside(workers: Workers, number: int) -> Figures:
+    first = workers.get()
+    with _busy(number):
+        return first.run()
+
+
+@contextlib.contextmanager
+def _busy(number: int) -> Iterator[None]:
+    """Keep processes busy that only count."""
+    others = [subprocess.Popen(BUSY) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+def prepare(name: str, size: int) -> Callable[[], None]:
+    """Return the work of a process, done once already on little."""
+    if name in FRAMES:
+        height, sensor = FRAMES[name]
+        model = torchrg.scenes.build_room(SEED)
+        camera = cameras_around(model, 1, width=height * 4 // 3, height=height)[0]
+        depth = render_depth(model, camera, sensor=sensor).depth
+        torchrg.depth.segment_depth(depth, camera.intrinsics)
+        return lambda: torchrg.depth.segment_depth(depth, camera.intrinsics) and None
+    config = torchrg.load_config(name)
+    points: torch.Tensor = torchrg.scenes.make_room(size, noise=NOISE, seed=SEED).points
+    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config)
+    return lambda: torchrg.segment_planes(points, config) and None

@@ -1,0 +1,181 @@
+"""Superpoints beside those of cut pursuit: accuracy over their number, and seconds.
+
+Clouds: real rooms with labelled parts (``--parts``, label 0 is none), and made ones with objects: a
+room on voxels of 3 cm, one put together from pieces of equally many points, so that its density
+jumps, one scanned from few places, near and far, and depth frames fused. The cloud of pieces is
+also voxelled first. The peer's file has ``partition(points, strength)``, which returns labels and
+seconds, and runs in a Python of its own (numpy below 2, pgeof, pycut-pursuit); without it only
+torchrg is measured. Seconds are from points to superpoints, planes included, for all levels.
+
+    python scripts/bench.py superpoints --parts office_parts.pcd --peer cutpursuit.py
+        --peer-python VENV/bin/python --out superpoints.json
+"""
+
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.harness import Benchmark, Figures, Results, markdown
+from tests.made import in_pieces, make_kinect_room, objects_of, on_voxels, scan_scene
+from torchrg import make_superpoints, read_cloud, segment_planes
+from torchrg.config import SuperpointsConfig
+from torchrg.metrics import score_partition
+from torchrg.scenes import RoomLayout, Scene, build_room, make_room
+from torchrg.structures import UNLABELED
+
+VOXEL = 0.03
+"""Side of voxels, metres."""
+STRENGTHS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 7.0, 12.0, 20.0, 35.0)
+PEER_STRENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+LAYOUT = RoomLayout(
+    size=(9.0, 7.0, 2.8), num_tables=5, num_columns=1, num_round_tables=1, num_balls=1, num_lamps=1
+)
+NOISE = 0.003
+"""Metres."""
+SPARE = 8
+"""Points that a room has before pieces are thinned, for one that is left."""
+SHOWN = ("asa", "oracle_miou", "boundary_recall")
+"""Scores in the table."""
+OURS, VOXELLED, PEER = "torchrg", "torchrg, voxels first", "cut pursuit"
+PIECES = "pieces of equally many points"
+
+PEER_SCRIPT = """
+import json, sys, numpy as np
+sys.path.insert(0, sys.argv[1])
+partition = __import__(sys.argv[2]).partition
+points = np.load("points.npy").astype(np.float32)
+seconds = {}
+for strength in json.loads(sys.argv[3]):
+    labels, seconds[strength] = partition(points, strength)
+    np.save(f"{strength}.npy", labels)
+print(json.dumps(list(seconds.values())))
+"""
+
+Labelled = tuple[Tensor, Tensor, str]
+"""Points ``(N, 3)``, the object of each, ``(N,)``, -1 for none, and the name of the cloud."""
+
+
+@dataclass(frozen=True)
+class Case(Benchmark):
+    parts: tuple[Path, ...] = ()
+    """Rooms with parts."""
+    points: int = 300_000
+    """Points of each made cloud."""
+    made: tuple[str, ...] = ("voxels", "pieces", "scan", "frames")
+    """Made clouds."""
+    peer: Path | None = None
+    """File of the peer."""
+    peer_python: str = "python"
+    """Python that the peer runs in."""
+
+    def clouds(self) -> Mapping[str, Callable[[], Labelled]]:
+        makers: dict[str, Callable[[], Labelled]] = {
+            path.stem: partial(_read_parts, path) for path in self.parts
+        }
+        return makers | {CLOUDS[key][0]: partial(_make, key, self.points) for key in self.made}
+
+    def contenders(self) -> Mapping[str, Callable[[Labelled], Figures | None]]:
+        runs: dict[str, Callable[[Labelled], Figures | None]] = {
+            OURS: lambda cloud: _score(cloud, *_run_ours(cloud[0], None)),
+            VOXELLED: lambda cloud: (
+                _score(cloud, *_run_ours(cloud[0], VOXEL)) if cloud[2] == PIECES else None
+            ),
+        }
+        if self.peer is not None:
+            runs[PEER] = lambda cloud: _score(cloud, *self._run_peer(cloud[0]))
+        return runs
+
+    def _run_peer(self, points: Tensor) -> tuple[list[Tensor], list[float]]:
+        """Return the peer's partitions for its strengths, and the seconds of each."""
+        with tempfile.TemporaryDirectory() as folder:
+            np.save(Path(folder) / "points.npy", points.numpy())
+            file = (self.peer or Path()).resolve()
+            arguments = [str(file.parent), file.stem, json.dumps(PEER_STRENGTHS)]
+            command = [self.peer_python, "-c", PEER_SCRIPT, *arguments]
+            done = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+            labels = [
+                torch.from_numpy(np.load(Path(folder) / f"{strength}.npy").astype(np.int64))
+                for strength in PEER_STRENGTHS
+            ]
+        return labels, json.loads(done.stdout.splitlines()[-1])
+
+    def report(self, results: Results) -> str:
+        """Return ours at the numbers of superpoints of others, or at our own without any."""
+        rows, taken = [], []
+        for cloud, by in results.items():
+            levels = {name: runs[0]["levels"] for name, runs in by.items()}
+            for rival in [name for name in levels if name != OURS] or [OURS]:
+                for row in sorted(levels[rival], key=lambda row: row["count"]):
+                    ours = [f"{_at_count(levels[OURS], row['count'], name):.3f}" for name in SHOWN]
+                    theirs = [f" ({rival} {row[name]:.3f})" * (rival != OURS) for name in SHOWN]
+                    cells = [a + b for a, b in zip(ours, theirs, strict=True)]
+                    rows.append([cloud, row["count"], *cells])
+            for name, runs in by.items():
+                seconds = ", ".join(f"{value:.1f}" for value in dict.fromkeys(runs[0]["seconds"]))
+                taken.append([cloud, runs[0]["points"], name, seconds])
+        head = ["cloud", "points", "by", "seconds for all levels, or of each strength"]
+        return f"{markdown(['cloud', 'superpoints', *SHOWN], rows)}\n\n{markdown(head, taken)}"
+
+
+CLOUDS: dict[str, tuple[str, Callable[[int], Scene]]] = {
+    "voxels": (
+        "room on voxels of 3 cm",
+        lambda size: on_voxels(make_room(2 * size, NOISE, 11, layout=LAYOUT), VOXEL),
+    ),
+    "pieces": (
+        PIECES,
+        lambda size: in_pieces(make_room(SPARE * size, NOISE, 12, layout=LAYOUT), size),
+    ),
+    "scan": (
+        "scan near and far",
+        lambda size: scan_scene(build_room(13, layout=LAYOUT), size, noise=NOISE, seed=13),
+    ),
+    "frames": ("depth frames fused", lambda size: make_kinect_room(size, num_frames=8, seed=14)),
+}
+"""What the made clouds are, and what makes them."""
+
+
+def _make(key: str, num_points: int) -> Labelled:
+    """Return a made cloud with its objects."""
+    name, make = CLOUDS[key]
+    scene = make(num_points)
+    return scene.points, objects_of(scene), name
+
+
+def _read_parts(path: Path) -> Labelled:
+    """Return a scanned room with its parts."""
+    cloud = read_cloud(path)
+    labels = torch.from_numpy(cloud.fields["labels"])
+    return cloud.points, torch.where(labels == 0, UNLABELED, labels), path.stem
+
+
+def _run_ours(points: Tensor, voxel: float | None) -> tuple[list[Tensor], list[float]]:
+    """Return partitions for all strengths, and the seconds that they took together."""
+    config = SuperpointsConfig(strengths=STRENGTHS)
+    begin = time.perf_counter()
+    seg = segment_planes(points, voxel=voxel)
+    found = make_superpoints(points, seg, config, voxel=voxel)
+    return [found.labels, *found.levels], [time.perf_counter() - begin]
+
+
+def _score(cloud: Labelled, partitions: Sequence[Tensor], seconds: list[float]) -> Figures:
+    """Return the scores of each partition."""
+    points, truth, _ = cloud
+    levels = [score_partition(partition, truth, points)._asdict() for partition in partitions]
+    return {"points": len(points), "seconds": seconds, "levels": levels}
+
+
+def _at_count(rows: Sequence[Figures], count: float, name: str) -> float:
+    """Return a score at so many superpoints, between those measured by their logarithms."""
+    ordered = sorted(rows, key=lambda row: row["count"])
+    counts = np.log([row["count"] for row in ordered])
+    return float(np.interp(np.log(count), counts, [row[name] for row in ordered]))

@@ -1,0 +1,1 @@
+"""Tests of torchrg; ``tests.made`` holds scenes that scripts use too."""

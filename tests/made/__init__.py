@@ -1,0 +1,60 @@
+"""Shapes, halls, storeys, laser scans, depth cameras: scenes that tests and scripts need.
+
+To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
+each a face, and solids that hide what is inside them) and places where a scanner may stand.
+:func:`torchrg.scenes.sample_scene` turns it into a cloud with truth. A new kind of surface has the
+properties and methods of :class:`torchrg.scenes.Surface`, and ``intersect`` (as in ``rays``) if it
+is scanned. A part of the report takes it once it has a key in ``reproduction.clouds``, or in
+``shapes.SHAPES``.
+"""
+
+from tests.made.cameras import (
+    KINECT_LAYOUT,
+    Camera,
+    DepthFrame,
+    cameras_around,
+    fuse_frames,
+    make_kinect_room,
+    render_depth,
+)
+from tests.made.patches import OUTLIERS, contaminated
+from tests.made.rays import cast_rays, scan_scene
+from tests.made.samples import (
+    CURVED_LAYOUT,
+    in_pieces,
+    objects_of,
+    on_voxels,
+    quantised_frame,
+)
+from tests.made.shapes import SHAPES, make_shape
+from tests.made.storeys import (
+    HALL_LAYOUT,
+    StoreyLayout,
+    build_storey,
+    make_storey,
+)
+
+__all__ = [
+    "CURVED_LAYOUT",
+    "HALL_LAYOUT",
+    "KINECT_LAYOUT",
+    "OUTLIERS",
+    "SHAPES",
+    "Camera",
+    "DepthFrame",
+    "StoreyLayout",
+    "build_storey",
+    "cameras_around",
+    "cast_rays",
+    "contaminated",
+    "fuse_frames",
+    "in_pieces",
+    "make_kinect_room",
+    "make_shape",
+    "make_storey",
+    "objects_of",
+    "on_voxels",
+    "quantised_frame",
+    "render_depth",
+    "scan_scene",
+]

@@ -1,0 +1,337 @@
+"""Depth cameras: pinhole geometry, the noise of a Kinect, and frames fused to a cloud."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from tests.made.rays import cast_rays
+from torchrg.errors import ConfigError
+from torchrg.scenes import (
+    Array,
+    Frame,
+    RoomLayout,
+    Scene,
+    SceneModel,
+    build_room,
+    label_points,
+    unit,
+)
+from torchrg.structures import UNLABELED
+
+Sensor = Literal["exact", "kinect"]
+
+_SENSOR_NOISE, _CAMERAS, _FUSION = 200, 300, 400
+"""What random numbers are drawn for."""
+
+_GOLDEN_ANGLE = (3 - np.sqrt(5)) * np.pi
+_STEEPEST = 0.5
+"""Tangent of the steepest look downwards."""
+
+_KINECT_BASELINE = 0.075
+"""Metres."""
+_KINECT_RANGE = (0.4, 8.0)
+"""Metres."""
+_DISPARITY_STEP = 1 / 8
+"""Pixels."""
+_NOISE_FLOOR, _NOISE_GROWTH = 0.0012, 0.0019
+"""Standard deviation at the nearest depth, metres, and its growth with the square beyond it."""
+
+KINECT_LAYOUT = RoomLayout(
+    size=(5.4, 4.4, 2.6),
+    num_doors=1,
+    num_windows=1,
+    num_cabinets=1,
+    num_tables=2,
+    num_boxes=1,
+    num_small_boxes=2,
+    num_pillars=0,
+    num_viewpoints=2,
+)
+"""An office small enough for the range of a Kinect."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in a scene; the default is that of a Kinect.
+
+    Convention:
+        Camera axes are x to the right, y down, z forwards. The middle of the first pixel is at
+        (0, 0).
+
+    Args:
+        frame: Position and axes in the world.
+        width: Pixels in a row.
+        height: Pixels in a column.
+        fx: Focal length in pixels; ``fy``: the same for columns.
+        cx: Column of the optical axis, ``cy`` its row. Default: the middle.
+
+    Example:
+        >>> camera = Camera.looking((1, 1, 1.5), (4, 1, 1.5))
+        >>> camera.pose[:3, 2].tolist()
+        [1.0, 0.0, 0.0]
+    """
+
+    frame: Frame
+    width: int = 640
+    height: int = 480
+    fx: float = 525.0
+    fy: float = 525.0
+    cx: float | None = None
+    cy: float | None = None
+
+    @classmethod
+    def looking(
+        cls,
+        position: ArrayLike,
+        target: ArrayLike,
+        *,
+        width: int = 640,
+        height: int = 480,
+        focal: float | None = None,
+    ) -> "Camera":
+        """Return an upright camera that looks at a place, not straight up or down.
+
+        ``focal`` is the focal length in pixels; by default the view is as wide as a Kinect's.
+
+        Raises:
+            ConfigError: If the view is vertical.
+        """
+        origin = np.asarray(position, dtype=np.float64)
+        forwards = np.asarray(target, dtype=np.float64) - origin
+        if not forwards[:2].any():
+            raise ConfigError("Camera: expected a target not above or below the position.")
+        forwards = unit(forwards)
+        right = unit(np.cross(forwards, np.array([0, 0, 1.0])))
+        frame = Frame(origin, np.stack([right, np.cross(forwards, right), forwards]))
+        focal = 525 * width / 640 if focal is None else focal
+        return cls(frame, width, height, focal, focal)
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Column and row of the optical axis."""
+        cx = (self.width - 1) / 2 if self.cx is None else self.cx
+        cy = (self.height - 1) / 2 if self.cy is None else self.cy
+        return cx, cy
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """Matrix from camera coordinates to pixels, shape ``(3, 3)``, float64."""
+        cx, cy = self.principal_point
+        rows = [[self.fx, 0, cx], [0, self.fy, cy], [0, 0, 1]]
+        return torch.tensor(rows, dtype=torch.float64)
+
+    @property
+    def pose(self) -> Tensor:
+        """Matrix from camera to world coordinates, shape ``(4, 4)``, float64."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.frame.axes.T, self.frame.origin
+        return torch.from_numpy(pose)
+
+    def rays(self) -> Array:
+        """Return what each pixel sees, in camera coordinates with depth 1, ``(H, W, 3)``."""
+        cx, cy = self.principal_point
+        rays = np.ones((self.height, self.width, 3))
+        rays[..., 0] = (np.arange(self.width) - cx) / self.fx
+        rays[..., 1] = ((np.arange(self.height) - cy) / self.fy)[:, None]
+        return rays
+
+
+def cameras_around(
+    model: SceneModel, num_cameras: int, *, seed: int = 0, width: int = 640, height: int = 480
+) -> list[Camera]:
+    """Return cameras at the viewpoints of a scene, as of someone who turns around and looks down.
+
+    They take turns at the viewpoints, in directions apart by the golden angle; the seed is that of
+    the first direction and of how far down they look.
+
+    Example:
+        >>> from torchrg.scenes import build_room
+        >>> len(cameras_around(build_room(), 5))
+        5
+    """
+    rng = np.random.default_rng([seed, _CAMERAS])
+    headings = rng.random() * 2 * np.pi + _GOLDEN_ANGLE * np.arange(num_cameras)
+    drops = rng.random(num_cameras) * _STEEPEST
+    cameras = []
+    for number, (heading, drop) in enumerate(zip(headings, drops, strict=True)):
+        position = model.viewpoints[number % len(model.viewpoints)]
+        target = position + np.array([np.cos(heading), np.sin(heading), -drop])
+        cameras.append(Camera.looking(position, target, width=width, height=height))
+    return cameras
+
+
+class DepthFrame(NamedTuple):
+    """A depth image with its exact truth.
+
+    Attributes:
+        depth: Distance along the optical axis in metres, shape ``(H, W)``, float32; 0 where there
+            is none.
+        labels: Faces of the scene, shape ``(H, W)``, int64; ``torchrg.UNLABELED`` where there is no
+            depth. Not every face is seen.
+        normals: Unit normals before noise, towards the camera, in camera coordinates (x right, y
+            down, z forwards), shape ``(H, W, 3)``, float32; zero where there is no depth.
+        planar: Whether each face of the scene lies in a plane, shape ``(M,)``, bool.
+        camera: The camera.
+    """
+
+    depth: Tensor
+    labels: Tensor
+    normals: Tensor
+    planar: Tensor
+    camera: Camera
+
+
+def render_depth(
+    model: SceneModel, camera: Camera | None = None, *, sensor: Sensor = "exact", seed: int = 0
+) -> DepthFrame:
+    """Render what a depth camera sees, by exact ray casting.
+
+    The Kinect's noise is the axial one of [1]: a standard deviation of
+    ``0.0012 + 0.0019 (z - 0.4)^2`` metres along the optical axis; then the disparity, for a
+    baseline of 7.5 cm, is rounded to an eighth of a pixel, and depth outside of 0.4 to 8 m is
+    dropped.
+
+    Args:
+        model: The scene.
+        camera: Default: the first of :func:`cameras_around`.
+        sensor: ``"exact"`` or ``"kinect"``.
+        seed: Of the noise, and of the default camera.
+
+    Raises:
+        ConfigError: If there is no such sensor.
+
+    References:
+        [1] C. V. Nguyen, S. Izadi, D. Lovell. Modeling Kinect sensor noise for improved 3D
+        reconstruction and tracking. 3DIMPVT, 2012.
+
+    Example:
+        >>> from torchrg.scenes import build_room
+        >>> camera = Camera.looking((1, 1, 1.5), (4, 3, 1), width=64, height=48)
+        >>> render_depth(build_room(), camera).depth.shape
+        torch.Size([48, 64])
+    """
+    if sensor not in get_args(Sensor):
+        options = ", ".join(get_args(Sensor))
+        raise ConfigError(f"render_depth: expected sensor to be one of {options}, got {sensor!r}.")
+    camera = cameras_around(model, 1, seed=seed)[0] if camera is None else camera
+    rays = camera.rays()
+    steps = camera.frame.vectors_to_world(rays.reshape(-1, 3))
+    exact, faces = cast_rays(model, camera.frame.origin, steps.reshape(rays.shape))
+    normals = np.zeros_like(steps)
+    for face, surface in enumerate(model.surfaces):
+        rows = np.flatnonzero(faces == face)
+        points = camera.frame.origin + exact.ravel()[rows, None] * steps[rows]
+        normals[rows] = camera.frame.vectors_to_local(surface.normals_at(points))
+    depth = np.where(faces == UNLABELED, 0, exact)
+    if sensor == "kinect":
+        depth = _as_kinect(depth, camera.fx, np.random.default_rng([seed, _SENSOR_NOISE]))
+    seen = depth > 0
+    return DepthFrame(
+        depth=torch.from_numpy(depth.astype(np.float32)),
+        labels=torch.from_numpy(np.where(seen, faces, UNLABELED)),
+        normals=torch.from_numpy(
+            (normals.reshape(rays.shape) * seen[..., None]).astype(np.float32)
+        ),
+        planar=torch.tensor([surface.plane is not None for surface in model.surfaces]),
+        camera=camera,
+    )
+
+
+def _as_kinect(depth: Array, focal: float, rng: np.random.Generator) -> Array:
+    """Return depth with the noise and the steps of a Kinect; 0 where out of its range."""
+    nearest, furthest = _KINECT_RANGE
+    beyond = depth - nearest
+    noisy = depth + (_NOISE_FLOOR + _NOISE_GROWTH * beyond * beyond) * rng.standard_normal(
+        depth.shape
+    )
+    scale = focal * _KINECT_BASELINE / _DISPARITY_STEP
+    valid = (depth > 0) & (noisy >= nearest) & (noisy <= furthest)
+    steps = np.rint(scale / np.where(valid, noisy, 1))
+    return np.where(valid, scale / steps, 0)
+
+
+def make_kinect_room(
+    num_points: int = 968_520,
+    seed: int = 0,
+    *,
+    num_frames: int = 16,
+    sensor: Sensor = "kinect",
+) -> Scene:
+    """Make a cloud of a room from simulated depth frames, placed by their true poses.
+
+    The points are a random subset of the pixels with depth, in random order; normals are those of
+    the faces, towards free space.
+
+    Raises:
+        ConfigError: If a setting is not allowed, or the frames have too few pixels with depth.
+
+    Example:
+        >>> make_kinect_room(1000, num_frames=1).points.shape
+        torch.Size([1000, 3])
+    """
+    model = build_room(seed, layout=KINECT_LAYOUT)
+    frames = [
+        render_depth(model, camera, sensor=sensor, seed=seed * num_frames + number)
+        for number, camera in enumerate(cameras_around(model, num_frames, seed=seed))
+    ]
+    return fuse_frames(model, frames, num_points, seed=seed)
+
+
+def fuse_frames(
+    model: SceneModel, frames: Sequence[DepthFrame], num_points: int, *, seed: int = 0
+) -> Scene:
+    """Return a random subset of the pixels with depth of frames of one scene, in random order.
+
+    Raises:
+        ConfigError: If the frames have too few pixels with depth.
+
+    Example:
+        >>> model = build_room()
+        >>> frame = render_depth(model, cameras_around(model, 1, width=64, height=48)[0])
+        >>> fuse_frames(model, [frame], 500).normals.shape
+        torch.Size([500, 3])
+    """
+    seen = [np.flatnonzero(frame.depth.numpy().ravel() > 0) for frame in frames]
+    counts = [len(pixels) for pixels in seen]
+    if not 0 < num_points <= sum(counts):
+        raise ConfigError(
+            f"fuse_frames: expected num_points in [1, {sum(counts)}], the pixels with depth, "
+            f"got {num_points}; take fewer points or more frames."
+        )
+    chosen = np.sort(np.random.default_rng([seed, _FUSION]).permutation(sum(counts))[:num_points])
+    ends = np.cumsum([0, *counts])
+    rows = [
+        pixels[chosen[(chosen >= start) & (chosen < end)] - start]
+        for pixels, start, end in zip(seen, ends[:-1], ends[1:], strict=True)
+    ]
+    fused = [_to_world(frame, pixels) for frame, pixels in zip(frames, rows, strict=True)]
+    points = np.concatenate([places for places, _, _ in fused])
+    normals = np.concatenate([outwards for _, outwards, _ in fused])
+    labels = np.concatenate([faces for _, _, faces in fused])
+    order = np.random.default_rng([seed, _FUSION + 1]).permutation(num_points)
+    return label_points(
+        model,
+        points[order].astype(np.float32),
+        labels[order],
+        normals[order].astype(np.float32),
+    )
+
+
+def _to_world(
+    frame: DepthFrame, pixels: NDArray[np.int64]
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Return points, normals and faces of some pixels of a frame, in the world."""
+    depth = frame.depth.numpy().reshape(-1, 1)[pixels].astype(np.float64)
+    rays = frame.camera.rays().reshape(-1, 3)[pixels]
+    normals = frame.normals.numpy().reshape(-1, 3)[pixels].astype(np.float64)
+    place = frame.camera.frame
+    return (
+        place.to_world(depth * rays),
+        place.vectors_to_world(normals),
+        frame.labels.numpy().ravel()[pixels],
+    )

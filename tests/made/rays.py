@@ -1,0 +1,283 @@
+"""Where rays meet a scene, and what a laser scanner sees of it."""
+
+from functools import singledispatch
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrg.errors import ConfigError
+from torchrg.scenes import Array, Cone, Flat, Ring, Scene, SceneModel, label_points, unit
+from torchrg.structures import UNLABELED
+
+_PLACES, _NOISE = range(2)
+"""What random numbers are drawn for: the same places whatever the noise."""
+
+_FLAT_SLACK = 1e-9
+"""Rays through the seam of two faces must not slip between them; metres."""
+_SLACK = 1e-9
+"""The same for curved faces, relative."""
+_GRAZING = 1e-7
+"""A double root has an imaginary part of the root of the rounding error."""
+
+_TILE = 32
+"""Rays on a side of the blocks that are tested against a face as one."""
+_MARGIN = 1e-3
+"""Added to the angle of a block, radians."""
+
+_LOWEST, _HIGHEST = -65.0, 90.0
+"""Elevations of a scan, degrees: a tripod hides what is below."""
+_MORE = 1.02
+"""How many more rays are cast than are expected to be needed."""
+
+
+class Hits(NamedTuple):
+    """Where rays first meet a scene.
+
+    Attributes:
+        distances: In lengths of the directions, shape ``(H, W)``; infinite where never.
+        faces: The faces met, shape ``(H, W)``; ``UNLABELED`` where none.
+    """
+
+    distances: Array
+    faces: NDArray[np.int64]
+
+
+def cast_rays(model: SceneModel, origin: Array, directions: Array) -> Hits:
+    """Return where rays from one place first meet a scene.
+
+    Args:
+        model: The scene.
+        origin: Where the rays start, shape ``(3,)``.
+        directions: A grid of rays, of any length, shape ``(H, W, 3)``. Neighbours should be
+            similar: whole blocks of rays skip the faces they cannot meet.
+
+    Example:
+        >>> from torchrg.scenes import build_room
+        >>> down = np.array([[[0.0, 0, -1]]])
+        >>> hits = cast_rays(build_room(), np.array([0.5, 0.5, 1.25]), down)
+        >>> hits.distances.tolist(), hits.faces.tolist()
+        ([[1.25]], [[0]])
+    """
+    height, width, _ = directions.shape
+    rows, columns = np.arange(height) // _TILE, np.arange(width) // _TILE
+    tile_of = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
+    order = np.argsort(tile_of, kind="stable")
+    tiles, steps = tile_of[order], directions.reshape(-1, 3)[order]
+    cones = _cones(tiles, steps)
+    distances, faces = np.full(len(steps), np.inf), np.full(len(steps), UNLABELED)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for face, surface in enumerate(model.surfaces):
+            rows = np.flatnonzero(_may_meet(cones, surface.bounds - origin)[tiles])
+            found = intersect(surface, origin[None], steps[rows])
+            nearer = found < distances[rows]
+            distances[rows[nearer]], faces[rows[nearer]] = found[nearer], face
+    back = np.argsort(order, kind="stable")
+    return Hits(distances[back].reshape(height, width), faces[back].reshape(height, width))
+
+
+def _cones(tiles: NDArray[np.int64], steps: Array) -> tuple[Array, Array]:
+    """Return axis ``(T, 3)`` and half angle ``(T,)`` of a cone around each block of rays."""
+    starts = np.flatnonzero(np.diff(tiles, prepend=-1))
+    towards = unit(steps)
+    sums = np.add.reduceat(towards, starts)
+    # Opposite rays add up to nothing: then any axis will do, with a half angle as wide as it takes.
+    axes = unit(np.where(np.vecdot(sums, sums)[:, None] > 0, sums, towards[starts]))
+    cosines = np.minimum.reduceat(np.vecdot(towards, axes[tiles]), starts)
+    return axes, np.arccos(np.clip(cosines, -1, 1)) + _MARGIN
+
+
+def _may_meet(cones: tuple[Array, Array], bounds: Array) -> NDArray[np.bool_]:
+    """Return which cones touch the ball around a box, given relative to their tip."""
+    axes, half_angles = cones
+    middle, radius = bounds.mean(axis=0), np.linalg.norm(bounds[1] - bounds[0]) / 2
+    distance = np.linalg.norm(middle)
+    if distance <= radius:
+        return np.ones(len(axes), dtype=bool)
+    angles = np.arccos(np.clip(np.vecdot(axes, middle) / distance, -1, 1))
+    return angles <= half_angles + np.arcsin(radius / distance)
+
+
+def scan_scene(model: SceneModel, num_points: int, *, noise: float = 0.0, seed: int = 0) -> Scene:
+    """Return what a laser scanner at each viewpoint sees, in equal steps of azimuth and elevation.
+
+    Args:
+        model: The scene.
+        num_points: Number of points, the same for each viewpoint up to one; a few of the rays are
+            dropped at random to meet it.
+        noise: Standard deviation along the normals, in metres.
+        seed: Of the first azimuth, of what is dropped, and of the noise.
+
+    Returns:
+        The cloud and its truth, in the order of viewpoint, azimuth, elevation.
+
+    Raises:
+        ConfigError: If nothing can be seen.
+    """
+    rng = np.random.default_rng([seed, _PLACES])
+    shares = np.diff(np.arange(len(model.viewpoints) + 1) * num_points // len(model.viewpoints))
+    scans = [
+        _scan(model, viewpoint, int(share), rng)
+        for viewpoint, share in zip(model.viewpoints, shares, strict=True)
+    ]
+    places, labels = (np.concatenate(parts) for parts in zip(*scans, strict=True))
+    outwards = np.empty_like(places)
+    for face, surface in enumerate(model.surfaces):
+        rows = np.flatnonzero(labels == face)
+        outwards[rows] = surface.normals_at(places[rows])
+    points, normals = places.astype(np.float32), outwards.astype(np.float32)
+    if noise > 0:
+        shake = np.random.default_rng([seed, _NOISE]).standard_normal(
+            (num_points, 1), dtype=np.float32
+        )
+        points += np.float32(noise) * (shake * normals)
+    return label_points(model, points, labels, normals)
+
+
+def _scan(
+    model: SceneModel, viewpoint: Array, num_points: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return exactly ``num_points`` points and faces seen from one place."""
+    num_rays = num_points
+    while True:
+        directions = _angular_grid(num_rays, 2 * np.pi * rng.random())
+        hits = cast_rays(model, viewpoint, directions)
+        met = np.flatnonzero(hits.faces != UNLABELED)
+        if len(met) >= num_points:
+            break
+        if len(met) == 0 and num_rays > 10_000:
+            raise ConfigError("scan_scene: expected a scene around its viewpoints, got no hit.")
+        num_rays = int(num_rays * min(num_points / max(len(met), 1) * _MORE, 100)) + 1
+    kept = met[np.sort(rng.permutation(len(met))[:num_points])]
+    steps = directions.reshape(-1, 3)[kept]
+    return viewpoint + hits.distances.ravel()[kept, None] * steps, hits.faces.ravel()[kept]
+
+
+def _angular_grid(num_rays: int, first_azimuth: float) -> Array:
+    """Return at least ``num_rays`` directions in equal steps, shape ``(columns, rows, 3)``."""
+    span = _HIGHEST - _LOWEST
+    rows = int(np.ceil(np.sqrt(num_rays * span / 360)))
+    columns = int(np.ceil(num_rays / rows))
+    elevation = np.deg2rad(_LOWEST + span * (np.arange(rows) + 0.5) / rows)
+    azimuth = (first_azimuth + 2 * np.pi * np.arange(columns) / columns)[:, None]
+    level = np.cos(elevation)
+    sides = (np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation))
+    return np.stack(np.broadcast_arrays(*sides), axis=-1)
+
+
+class Intersectable(Protocol):
+    """A surface that knows itself where rays meet it."""
+
+    def intersect(self, origins: Array, directions: Array) -> Array:
+        """As the function :func:`intersect`."""
+
+
+@singledispatch
+def intersect(surface: Intersectable, origins: Array, directions: Array) -> Array:
+    """Return how far along each ray a surface is first met, shape ``(N,)``; infinite where never.
+
+    ``origins`` have shape ``(N, 3)`` or ``(1, 3)``, ``directions`` ``(N, 3)``; distances are in
+    lengths of the directions, and only positive ones count.
+    """
+    return surface.intersect(origins, directions)
+
+
+@intersect.register
+def _meet_flat(surface: Flat, origins: Array, directions: Array) -> Array:
+    start = surface.frame.to_local(origins)
+    step = surface.frame.vectors_to_local(directions)
+    distance = -start[:, 2] / np.where(step[:, 2] == 0, np.nan, step[:, 2])
+    x, y = start[:, 0] + distance * step[:, 0], start[:, 1] + distance * step[:, 1]
+    hit = np.zeros(len(distance), dtype=bool)
+    for corner, edge, other in surface.cells:
+        u, v = x - corner[0], y - corner[1]
+        cross = edge[0] * other[1] - edge[1] * other[0]
+        a, b = (u * other[1] - v * other[0]) / cross, (v * edge[0] - u * edge[1]) / cross
+        slack = _FLAT_SLACK / np.sqrt(np.abs(cross))
+        beyond = a + b if surface.triangular else np.maximum(a, b)
+        hit |= (np.minimum(a, b) >= -slack) & (beyond <= 1 + slack)
+    return np.where(hit & (distance > 0), distance, np.inf)
+
+
+@intersect.register
+def _meet_cone(surface: Cone, origins: Array, directions: Array) -> Array:
+    start = surface.frame.to_local(origins)
+    step = surface.frame.vectors_to_local(directions)
+    (r0, z0), (r1, z1) = surface.start, surface.end
+    if surface.planar:
+        crossings = [(z0 - start[:, 2]) / np.where(step[:, 2] == 0, np.nan, step[:, 2])]
+    else:
+        # On the cone the radius is r0 + slope (z - z0).
+        slope = (r1 - r0) / (z1 - z0)
+        radius, rise = r0 + slope * (start[:, 2] - z0), slope * step[:, 2]
+        a = step[:, 0] ** 2 + step[:, 1] ** 2 - rise**2
+        b = start[:, 0] * step[:, 0] + start[:, 1] * step[:, 1] - radius * rise
+        c = start[:, 0] ** 2 + start[:, 1] ** 2 - radius**2
+        crossings = solve_quadratic(a, b, c)
+    nearest = np.full(len(step), np.inf)
+    for distance in crossings:
+        x, y, z = (start + distance[:, None] * step).T
+        along = (np.hypot(x, y) - r0) / (r1 - r0) if surface.planar else (z - z0) / (z1 - z0)
+        hit = (along >= -_SLACK) & (along <= 1 + _SLACK) & _is_within(x, y, surface.sector)
+        nearest = np.where(hit & (distance > 0), np.fmin(nearest, distance), nearest)
+    return nearest
+
+
+@intersect.register
+def _meet_ring(surface: Ring, origins: Array, directions: Array) -> Array:
+    start = surface.frame.to_local(origins)
+    step = surface.frame.vectors_to_local(directions)
+    if surface.center == 0:
+        b, c = np.vecdot(start, step), np.vecdot(start, start) - surface.radius**2
+        crossings = solve_quadratic(np.vecdot(step, step), b, c)
+    else:
+        crossings = _torus_crossings(start, step, surface.center, surface.radius)
+    nearest = np.full(len(step), np.inf)
+    for distance in crossings:
+        x, y, z = (start + distance[:, None] * step).T
+        outwards = np.hypot(x, y) - surface.center
+        on_arc = _is_within(outwards, z, surface.arc) & _is_within(x, y, surface.sector)
+        nearest = np.where(on_arc & (distance > 0), np.fmin(nearest, distance), nearest)
+    return nearest
+
+
+def _torus_crossings(start: Array, step: Array, center: float, radius: float) -> list[Array]:
+    """Return where rays meet a whole torus, four of shape ``(N,)``; NaN where they do not."""
+    # From the point nearest to the middle, in lengths of the torus, all coefficients are small.
+    size, length = center + radius, np.linalg.norm(step, axis=-1)
+    towards = step / length[:, None]
+    shift = -np.vecdot(start, towards)
+    near = (start + shift[:, None] * towards) / size
+    meets = np.vecdot(near, near) <= 1
+    flat, flat_step = near[meets, :2], towards[meets, :2]
+    ring, tube = center / size, radius / size
+    k = np.vecdot(near[meets], near[meets]) + ring**2 - tube**2
+    companion = np.zeros((len(k), 4, 4))
+    companion[:, 1, 0] = companion[:, 2, 1] = companion[:, 3, 2] = 1
+    companion[:, 0, 3] = 4 * ring**2 * np.vecdot(flat, flat) - k * k
+    companion[:, 1, 3] = 8 * ring**2 * np.vecdot(flat, flat_step)
+    companion[:, 2, 3] = 4 * ring**2 * np.vecdot(flat_step, flat_step) - 2 * k
+    solutions = np.linalg.eigvals(companion)
+    roots = np.full((len(step), 4), np.nan)
+    roots[meets] = np.where(np.abs(solutions.imag) < _GRAZING, solutions.real, np.nan)
+    return list(((roots * size + shift[:, None]) / length[:, None]).T)
+
+
+def solve_quadratic(a: Array, b: Array, c: Array) -> list[Array]:
+    """Return both solutions of ``a t^2 + 2 b t + c = 0``, shape ``(N,)`` each; NaN for none.
+
+    Example:
+        >>> [float(t[0]) for t in solve_quadratic(*np.array([[1.0], [-3], [5]]))]
+        [5.0, 1.0]
+    """
+    discriminant = b * b - a * c
+    root = np.sqrt(np.where(discriminant >= 0, discriminant, np.nan))
+    far = -(b + np.where(b < 0, -root, root))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return [far / a, c / far]
+
+
+def _is_within(x: Array, y: Array, angles: tuple[float, float]) -> NDArray[np.bool_]:
+    """Return which directions are in a range of angles, both ends included."""
+    beyond = np.mod(np.arctan2(y, x) - angles[0] + _SLACK, 2 * np.pi)
+    return beyond <= angles[1] - angles[0] + 2 * _SLACK

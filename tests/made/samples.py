@@ -1,0 +1,82 @@
+"""Other samples of scenes: voxels, pieces of unlike density, depth in steps, objects as truth."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.made.cameras import cameras_around, fuse_frames, render_depth
+from torchrg.neighbors import sample_voxels
+from torchrg.scenes import RoomLayout, Scene, SceneModel
+from torchrg.structures import UNLABELED
+
+CURVED_LAYOUT = RoomLayout(
+    size=(8.0, 6.0, 2.6),
+    num_doors=1,
+    num_windows=0,
+    num_cabinets=0,
+    num_shelves=0,
+    num_tables=0,
+    num_boxes=0,
+    num_small_boxes=0,
+    num_pillars=0,
+    num_columns=3,
+    num_round_tables=1,
+    num_balls=3,
+    num_lamps=1,
+    num_bent_walls=2,
+)
+"""A small room in which most is round."""
+
+
+def take_rows(scene: Scene, rows: Tensor) -> Scene:
+    """Return some points of a scene.
+
+    Example:
+        >>> from torchrg.scenes import make_room
+        >>> len(take_rows(make_room(100), torch.arange(7)).labels)
+        7
+    """
+    points, labels, normals = (values[rows] for values in scene[:3])
+    return scene._replace(points=points, labels=labels, normals=normals)
+
+
+def on_voxels(scene: Scene, size: float) -> Scene:
+    """Return one point of each voxel of a side, in metres."""
+    return take_rows(scene, sample_voxels(scene.points, size).rows)
+
+
+def in_pieces(scene: Scene, num_points: int, *, num_pieces: int = 40, seed: int = 12) -> Scene:
+    """Return a scene cut into boxes that keep equally many points each, as S3DIS is put together.
+
+    Example:
+        >>> from torchrg.scenes import make_room
+        >>> len(in_pieces(make_room(4000), 400).points)
+        400
+    """
+    rng = np.random.default_rng(seed)
+    places, pieces = scene.points.numpy(), [np.arange(len(scene.points))]
+    while len(pieces) < num_pieces:
+        longest = int(np.argmax([np.ptp(places[rows], axis=0).max() for rows in pieces]))
+        rows = pieces.pop(longest)
+        column = places[rows, int(np.argmax(np.ptp(places[rows], axis=0)))]
+        below = column <= column.min() + np.ptp(column) * rng.uniform(0.25, 0.75)
+        pieces += [rows[below], rows[~below]]
+    share = num_points // num_pieces
+    kept = np.concatenate([rng.permutation(rows)[:share] for rows in pieces])
+    return take_rows(scene, torch.from_numpy(kept))
+
+
+def quantised_frame(
+    model: SceneModel, quantise: Callable[[Tensor], Tensor], num_points: int
+) -> Scene:
+    """Return points of one depth frame without noise, whose depth goes through a function."""
+    frame = render_depth(model, cameras_around(model, 1)[0])
+    depth = quantise(frame.depth).where(frame.depth > 0, 0)
+    return fuse_frames(model, [frame._replace(depth=depth)], num_points)
+
+
+def objects_of(scene: Scene) -> Tensor:
+    """Return the object of each point, shape ``(N,)``, -1 for none."""
+    return torch.cat([scene.objects, torch.tensor([UNLABELED])])[scene.labels]

@@ -1,0 +1,247 @@
+"""Hallways, and storeys: a hallway and furnished rooms along it, joined by open doors."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchrg.errors import ConfigError
+from torchrg.scenes import (
+    Flat,
+    Frame,
+    Part,
+    RoomLayout,
+    Scene,
+    SceneModel,
+    block,
+    free_places,
+    furnish,
+    passage,
+    room_walls,
+    sample_scene,
+)
+
+HALL_LAYOUT = RoomLayout(
+    size=(24.0, 2.4, 2.7),
+    num_doors=14,
+    num_windows=1,
+    num_cabinets=2,
+    num_shelves=0,
+    num_panels=5,
+    num_tables=0,
+    num_boxes=0,
+    num_small_boxes=0,
+    num_pillars=0,
+    min_plane_gap=0.001,
+    num_viewpoints=3,
+)
+"""A hallway with doors on both sides."""
+
+
+HALL_WALLS = (0, 2)
+"""The long walls of the hallway."""
+_DOOR_HEIGHT = (1.98, 2.15)
+"""Metres."""
+_DOOR_LEAF = 0.04
+"""Thickness, metres."""
+_FIRST_WALL = 0
+"""Of a room: the one along the hallway."""
+_STOREY = 500
+"""What random numbers are drawn for: rooms and what is in them."""
+
+_HALL = replace(HALL_LAYOUT, size=(24.0, 2.4, 2.5), num_doors=2, num_cabinets=1, num_panels=2)
+_ROOM = RoomLayout(
+    num_doors=0,
+    num_windows=1,
+    num_cabinets=1,
+    num_shelves=1,
+    num_tables=2,
+    num_boxes=0,
+    num_small_boxes=1,
+    num_pillars=0,
+)
+
+
+@dataclass(frozen=True)
+class StoreyLayout:
+    """Rooms on both sides of a hallway, with open doors; lengths in metres."""
+
+    rooms_per_side: int = 4
+    room_width: tuple[float, float] = (4.6, 6.2)
+    """Least and greatest width, along the hallway."""
+    room_depth: tuple[float, float] = (4.3, 5.1)
+    room_height: tuple[float, float] = (2.6, 2.9)
+    wall_thickness: tuple[float, float] = (0.33, 0.42)
+    hall: RoomLayout = _HALL
+    """The hallway; its length is that of the rooms. A short one has place for less."""
+    room: RoomLayout = _ROOM
+    """What is in each room; its size is drawn."""
+
+    def __post_init__(self) -> None:
+        if self.rooms_per_side < 1:
+            raise ConfigError(
+                f"StoreyLayout: expected rooms_per_side >= 1, got {self.rooms_per_side}."
+            )
+        for name in ("room_width", "room_depth", "room_height", "wall_thickness"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise ConfigError(
+                    f"StoreyLayout: expected {name} as (least, greatest), got {(low, high)}."
+                )
+
+
+@dataclass(frozen=True)
+class StoreyRoom:
+    """A room along the hallway; lengths along it are those of the world's first axis."""
+
+    size: tuple[float, float, float]
+    left: float
+    hall_wall: int
+    hall_width: float
+    thickness: float
+    door: tuple[float, float, float]  # left, right and upper end in the room's own axes
+
+    @property
+    def frame(self) -> Frame:
+        """The room's own axes: the second leads away from the hallway."""
+        if self.hall_wall == HALL_WALLS[0]:
+            corner = (self.left + self.size[0], -self.thickness, 0)
+            return Frame.upright(np.array(corner), heading_deg=180)
+        return Frame.upright(np.array([self.left, self.hall_width + self.thickness, 0]))
+
+    @property
+    def doorway(self) -> tuple[float, float, float, float]:
+        """Hole in the room's first wall, which starts at its right end."""
+        left, right, top = self.door
+        return self.size[0] - right, self.size[0] - left, 0.0, top
+
+    def span(self) -> tuple[float, float]:
+        """Return left and right end of the doorway in the world."""
+        ends = self.frame.to_world(np.array([(x, 0, 0) for x in self.door[:2]]))[:, 0]
+        return float(ends.min()), float(ends.max())
+
+    def hall_doorway(self, length: float) -> tuple[float, float, float, float]:
+        """Return the hole in the hallway's wall; its first wall starts at the far end."""
+        left, right = self.span()
+        if self.hall_wall == HALL_WALLS[0]:
+            left, right = length - right, length - left
+        return left, right, 0.0, self.door[2]
+
+
+def draw_rooms(
+    layout: StoreyLayout, hall_width: float, rng: np.random.Generator
+) -> list[StoreyRoom]:
+    """Return the rooms on both sides, with walls, ceilings and doors in planes of their own."""
+    count = 2 * layout.rooms_per_side
+    depths = _spread(rng, count, layout.room_depth)
+    heights = _spread(rng, count, layout.room_height)
+    thicknesses = _spread(rng, count, layout.wall_thickness)
+    tops = _spread(rng, count, _DOOR_HEIGHT)
+    rooms: list[StoreyRoom] = []
+    for number in range(count):
+        side, first = HALL_WALLS[number % 2], number < 2
+        left = rng.uniform(0.1, 0.4) if first else rooms[-2].left + rooms[-2].size[0]
+        left += 0 if first else rng.uniform(*layout.wall_thickness)
+        width, door_width = rng.uniform(*layout.room_width), rng.uniform(0.85, 1.0)
+        door_left = rng.uniform(0.35, 0.5)
+        if rng.random() < 0.5:
+            door_left = width - door_left - door_width
+        rooms.append(
+            StoreyRoom(
+                size=(width, depths[number], heights[number]),
+                left=left,
+                hall_wall=side,
+                hall_width=hall_width,
+                thickness=thicknesses[number],
+                door=(door_left, door_left + door_width, tops[number]),
+            )
+        )
+    return rooms
+
+
+def _spread(rng: np.random.Generator, count: int, ends: tuple[float, float]) -> list[float]:
+    """Return random numbers in random order, one in the middle half of each of equal steps."""
+    steps = rng.permutation(count) + 0.25 + rng.random(count) / 2
+    low, high = ends
+    return [float(value) for value in low + (high - low) * steps / count]
+
+
+def make_storey(
+    num_points: int = 1_097_901,
+    noise: float = 0.003,
+    seed: int = 0,
+    *,
+    layout: StoreyLayout | None = None,
+) -> Scene:
+    """Make a cloud of a hallway and the furnished rooms along it; see :func:`build_storey`.
+
+    The floor runs through the open doors and is one face; every ceiling is at a height of its own.
+    Within each room no face lies in the plane of another.
+
+    Example:
+        >>> make_storey(1000).kinds.count("ceiling")
+        9
+    """
+    return sample_scene(build_storey(seed, layout=layout), num_points, noise=noise, seed=seed)
+
+
+def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneModel:
+    """Build the description of a hallway and the rooms along it.
+
+    Args:
+        seed: Of sizes and places.
+        layout: Number and sizes of the rooms, and what is in them. Default: ``StoreyLayout()``.
+
+    Returns:
+        The scene. Its first face is the floor.
+
+    Raises:
+        ConfigError: If a room is too small for its furniture.
+
+    Example:
+        >>> build_storey().surfaces[0].kind
+        'floor'
+    """
+    layout, rng = layout or StoreyLayout(), np.random.default_rng([seed, _STOREY])
+    width = layout.hall.size[1]
+    rooms = draw_rooms(layout, width, rng)
+    length = max(room.left + room.size[0] for room in rooms) + rng.uniform(0.2, 0.5)
+    hall_layout = replace(layout.hall, size=(length, width, layout.hall.size[2]))
+    hall = Frame.upright(np.zeros(3))
+    walls = room_walls(hall, hall_layout.size)
+    doorways = [(room.hall_wall, room.hall_doorway(length)) for room in rooms]
+    hall_parts = furnish(hall_layout, hall, rng, doorways=doorways, with_floor=False)
+    parts: list[Part] = [Part((_floor(rooms, length, width),)), *hall_parts]
+    viewpoints = [free_places(hall_layout, hall, hall_parts, rng)]
+    for room, (wall, doorway) in zip(rooms, doorways, strict=True):
+        room_layout = replace(layout.room, size=room.size)
+        contents = furnish(
+            room_layout, room.frame, rng, doorways=[(_FIRST_WALL, room.doorway)], with_floor=False
+        )
+        parts += [passage("door frame", walls[wall], doorway, room.thickness), *contents]
+        parts.append(_open_door(room, rng))
+        viewpoints.append(free_places(room_layout, room.frame, parts, rng))
+    return SceneModel(tuple(parts), np.concatenate(viewpoints))
+
+
+def _floor(rooms: list[StoreyRoom], length: float, width: float) -> Flat:
+    """Return the floor of the hallway, the rooms and the doorways between them."""
+    cells = [[(0.0, 0.0), (length, 0.0), (0.0, width)]]
+    for room in rooms:
+        corners = np.array([(0, 0, 0), (room.size[0], room.size[1], 0)])
+        (left, low), (right, high) = np.sort(room.frame.to_world(corners)[:, :2], axis=0)
+        cells.append([(left, low), (right - left, 0), (0, high - low)])
+        start, end = room.span()
+        below = -room.thickness if room.hall_wall == HALL_WALLS[0] else width
+        cells.append([(start, below), (end - start, 0), (0, room.thickness)])
+    return Flat("floor", Frame.upright(np.zeros(3)), np.array(cells))
+
+
+def _open_door(room: StoreyRoom, rng: np.random.Generator) -> Part:
+    """Return the leaf of an open door, inside the room beside the doorway."""
+    left, right, top = room.door
+    hinge = left - 0.1 if left < room.size[0] / 2 else right + 0.1
+    frame = room.frame.moved(hinge, 0.05 + (right - left) / 2, rng.uniform(0.01, 0.03))
+    ajar = Frame.upright(np.zeros(3), rng.uniform(-6, 6)).inside(frame)
+    size = (_DOOR_LEAF, right - left, top - 0.04)
+    names = dict.fromkeys(("front", "back", "bottom", "top"), "door edge")
+    return block("door", ajar, size, kinds=names)

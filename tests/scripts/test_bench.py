@@ -1,0 +1,268 @@
+"""Each benchmark runs on little, and the harness keeps what it has measured."""
+
+import ast
+import contextlib
+import json
+import stat
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import bench
+import numpy as np
+import pytest
+import torch
+from benchmarks import (
+    accuracy,
+    breakdown,
+    convert,
+    harness,
+    loader,
+    page,
+    peers,
+    robust,
+    steady,
+    superpoints,
+    tiling,
+)
+
+from torchrg.scenes import make_room
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Counting(harness.Benchmark):
+    """Two clouds, and two contenders of which one is meant for the first cloud alone."""
+
+    made: list = ()
+
+    def clouds(self):
+        return {"small": lambda: 1, "large": lambda: 10}
+
+    def contenders(self):
+        def run(name, cloud):
+            self.made.append((name, cloud))
+            return {"seconds": cloud * len(self.made), "by": name}
+
+        return {
+            "a": lambda cloud: run("a", cloud),
+            "b": lambda cloud: run("b", cloud) if cloud == 1 else None,
+        }
+
+
+def test_contenders_take_turns_and_what_is_known_is_not_measured_again(tmp_path):
+    out, made = tmp_path / "figures" / "found.json", []
+    results, is_complete = harness.measure(Counting(rounds=2, out=out, made=made))
+    assert is_complete
+    assert made == [("a", 1), ("b", 1), ("a", 1), ("b", 1), ("a", 10), ("a", 10)]
+    assert json.loads(out.read_text())["results"] == results
+    more, _ = harness.measure(Counting(rounds=3, out=out, made=made))
+    assert made[6:] == [("a", 1), ("b", 1), ("a", 10)]
+    assert more["large"]["a"][:2] == results["large"]["a"]
+    assert list(more["large"]) == ["a"]
+
+
+def test_time_that_is_up_ends_between_two_runs(tmp_path):
+    made = []
+    results, is_complete = harness.measure(Counting(minutes=-1, made=made))
+    assert not is_complete
+    assert not made
+    assert not any(results.values())
+
+
+def test_unknown_contenders_are_refused():
+    with pytest.raises(SystemExit, match="expected --only among a, b, got c"):
+        harness.measure(Counting(only=("c", "a"), made=[]))
+
+
+def test_figures_are_medians_and_ratios_are_those_within_a_round():
+    mine = [{"s": 2.0, "by": {"x": 1}}, {"s": 30.0, "by": {"x": 5}}, {"s": 4.0, "by": {"x": 3}}]
+    others = [{"s": 1.0}, {"s": 10.0}, {"s": 8.0}]
+    assert harness.medians(mine) == {"s": 4.0, "by": {"x": 3}}
+    assert harness.ratio(mine, others, "s") == 2.0
+    assert harness.ratio(mine, [], "s") is None
+    text = harness.table({"room": {"a": mine}})
+    assert text.splitlines() == [
+        "| cloud | by | s | by |",
+        "|" + " --- |" * 4,
+        "| room | a | 4 | x 3 |",
+    ]
+
+
+def test_every_benchmark_is_listed_by_its_title(capsys):
+    assert bench.main([]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in shown] == bench.NAMES
+    assert bench.main(["nothing"]) == 2
+    for name in bench.NAMES:
+        source = (bench.FOLDER / f"{name}.py").read_text()
+        assert f"scripts/bench.py {name}" in ast.get_docstring(ast.parse(source))
+
+
+def run(case):
+    """Return the figures of a case, and its tables."""
+    results, is_complete = harness.measure(case)
+    assert is_complete
+    return results, case.report(results)
+
+
+def test_accuracy_scores_clouds_and_images():
+    results, text = run(accuracy.Case(scale=0.004, only=("classic", "depth")))
+    assert [len(by) for by in results.values()] == [1] * 7 + [2] * 2
+    (room,) = results["room, 3 mm"]["classic"]
+    scene = make_room(1200, noise=0.003, seed=0)
+    assert room["faces"] == (scene.labels.bincount() >= 1).sum()
+    assert results["4 frames, exact"]["depth"][0]["mean_best_iou"] > 0.2
+    assert "| RSPD |" in text
+
+
+def test_breakdown_is_that_of_contaminated_neighborhoods():
+    results, text = run(breakdown.Case(patches=20, only=("PCA", "planes")))
+    assert results["cluster 30%"]["PCA"][0]["median"] > 10
+    assert results["cluster 30%"]["planes"][0]["p90"] < 3
+    assert text.splitlines()[2] == "| outliers | PCA | planes |"
+
+
+def test_crops_are_loaded_by_any_worker():
+    results, text = run(loader.Case(crops=2, num_points=300, workers=(0,)))
+    ((cloud, by),) = results.items()
+    assert cloud == "2 crops of 300 points, classic"
+    assert by["0 workers"][0]["planes"] >= 2
+    assert list(loader.Case().contenders())[-1] == "2 workers, spawn"
+    assert text.endswith("| 1 |")
+
+
+def test_pages_are_written():
+    results, _ = run(page.Case(sizes=(2000,), only=("written",)))
+    assert results["2,000 points"]["written"][0]["MB"] > 0.01
+
+
+def test_robust_estimators_are_timed_on_shares_of_the_neighborhoods():
+    names = ("Qn, a row of 50", "DetS", "MVE, 500 starts")
+    results, _ = run(robust.Case(patches=100, rounds=1, only=names))
+    counts = [by[name][0]["of"] for by in results.values() for name in names]
+    assert counts == [300, 10, 1, 75, 2, 1, 75, 2, 1]
+
+
+def test_superpoints_are_scored_at_the_numbers_of_others(tmp_path):
+    peer = tmp_path / "halves.py"
+    peer.write_text(
+        "import numpy as np\n"
+        "def partition(points, strength):\n"
+        "    return (np.arange(len(points)) % round(1 / strength)), strength\n"
+    )
+    case = superpoints.Case(points=2000, made=("pieces",), peer=peer, peer_python=sys.executable)
+    results, text = run(case)
+    (by,) = results.values()
+    assert list(by) == ["torchrg", "torchrg, voxels first", "cut pursuit"]
+    assert [row["count"] for row in by["cut pursuit"][0]["levels"]] == [200, 100, 50, 20, 10, 5]
+    assert by["cut pursuit"][0]["seconds"] == list(superpoints.PEER_STRENGTHS)
+    assert len(by["torchrg"][0]["levels"]) == len(superpoints.STRENGTHS)
+    assert "(cut pursuit 0." in text
+
+
+def test_tiles_give_what_memory_gives(tmp_path):
+    case = tiling.Case(points=1500, work=tmp_path)
+    path = case.clouds()["1,500 points"]()
+    assert tiling.prepare_tiles(path, "classic", 500, 3.0)()["differs"] == "unknown"
+    found = tiling.prepare_memory(path, "classic")()
+    tiles = tiling.prepare_tiles(path, "classic", 500, 3.0)()
+    assert tiles["differs"] == "nowhere"
+    assert tiles["planes"] == found["planes"] > 0
+    assert tiles["peak_gb"] == max(tiles["peaks"].values())
+    wrong = tmp_path / "classic_building_1500" / "labels.npy"
+    np.save(wrong, np.load(wrong) + 1)
+    assert tiling.prepare_tiles(path, "classic", 500, 3.0)()["differs"] == "labels"
+
+
+@pytest.fixture
+def programs(tmp_path):
+    """Stand-ins for the programs, which print what these do."""
+    folder = tmp_path / "programs"
+    folder.mkdir()
+    for name, text in {
+        "pclrg": "n=5 normals 1.500 s, region growing 2.250 s, clusters 3, sigma_th 0.1",
+        "cgaln": "pca 0.250 s\\njet 0.500 s",
+    }.items():
+        (folder / name).write_text(f"#!/bin/sh\nprintf '{text}\\n'\n")
+        (folder / name).chmod((folder / name).stat().st_mode | stat.S_IXUSR)
+    return folder
+
+
+def test_programs_are_read_and_compared_like_to_like(programs):
+    case = peers.Case(programs=programs, sizes=(10,), only=("pclrg", "cgaln"))
+    clouds = {"room": lambda: contextlib.nullcontext(programs)}
+    object.__setattr__(case, "clouds", lambda: clouds)
+    results, text = run(case)
+    by = results["room"]
+    assert by["pclrg"][0]["seconds"] == {"normals": 1.5, "regions": 2.25}
+    assert by["cgaln"][0]["total"] == 0.75
+    results["room"]["torchrg-classic"] = [{**row, "total": 7.5} for row in by["pclrg"]]
+    last = case.report(results).splitlines()[-1]
+    assert last.startswith("| room | torchrg-classic | 7.5 |")
+    assert last.endswith("| 2 |  |")
+    assert text.count("\n") == 3
+
+
+def test_libraries_are_timed_by_stage(tmp_path):
+    peers.write_cloud("room 1500 sorted", str(tmp_path))
+    points = np.load(tmp_path / "cloud.npy")
+    assert np.array_equal(np.fromfile(tmp_path / "cloud.f32", np.float32).reshape(-1, 3), points)
+    assert len(points) == 1500
+    file = str(tmp_path / "cloud.npy")
+    stages = peers.prepare("preset classic", file)()["stages"]
+    assert list(stages) == ["neighbors", "normals", "regions", "planes"]
+    assert list(peers.prepare("normals", file)()["stages"]) == ["normals"]
+
+
+@pytest.mark.slow
+def test_processes_take_turns(capsys):
+    arguments = ["--work", "classic", "--sizes", "1500", "--rounds", "1", "--threads", "1"]
+    assert bench.main(["steady", *arguments]) == 0
+    *_, row = capsys.readouterr().out.splitlines()
+    cells = row.strip("| ").split(" | ")
+    assert cells[0] == "classic, 1,500 points"
+    assert all(float(cell) > 0 for cell in cells[1:])
+
+
+@pytest.mark.slow
+def test_runs_of_other_processes_are_measured(tmp_path, capsys):
+    sizes = ["--sizes", "1500", "--rounds", "1", "--only", "torchrg-classic"]
+    assert bench.main(["peers", *sizes, "torchrg-classic-command"]) == 0
+    assert capsys.readouterr().out.count("| torchrg-classic-command |") == 2
+    tiles = ["--points", "1500", "--tile-size", "500", "--work", str(tmp_path)]
+    assert bench.main(["tiling", *tiles]) == 0
+    assert "| nowhere |" in capsys.readouterr().out
+
+
+def test_frames_and_rooms_are_prepared():
+    assert steady.prepare("classic", 1500)() is None
+    assert set(steady.Case().clouds()) >= {"depth", "depth-large", "consensus, 200,000 points"}
+
+
+@pytest.mark.slow
+def test_a_made_data_set_is_converted(capsys):
+    rooms = ["--rooms", "2", "--smallest", "600", "--largest", "900", "--preset", "classic"]
+    assert bench.main(["convert", *rooms, "--only", "1", "2"]) == 0
+    assert "all runs wrote the same bytes" in capsys.readouterr().out
+
+
+def test_runs_that_wrote_other_bytes_are_an_error():
+    results = {"rooms": {"1": [{"sha256": "a"}], "2": [{"sha256": "b"}]}}
+    with pytest.raises(SystemExit, match="DIFFERENT BYTES"):
+        convert.Case().report(results)
+
+
+def test_surroundings_name_the_commit():
+    import surroundings
+
+    found = surroundings.describe(3)
+    assert found["threads"] == 3
+    assert found["torch"] == torch.__version__
+    assert Path(surroundings.__file__).name == "surroundings.py"
