@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.scans import Scan
 from torchrg.cli import main
 from torchrg.cli.depth import FrameJob
@@ -226,7 +227,7 @@ def test_a_killed_sequence_goes_on_and_leaves_nothing_unfinished(tmp_path, depth
     begin = time.monotonic()
     subprocess.run([*command, "--out", str(tmp_path / "whole")], check=True)
     seconds, expected = time.monotonic() - begin, contents(tmp_path / "whole")
-    for _ in range(8):
+    for _ in range(3):
         process = subprocess.Popen([*command, "--out", str(out)], start_new_session=True)
         time.sleep(chance.uniform(0.3, 1) * seconds)
         with contextlib.suppress(ProcessLookupError):
@@ -266,6 +267,17 @@ def test_what_a_killed_process_was_writing_goes_and_nothing_else(tmp_path):
         (tmp_path / name).touch()
     frame.clean()
     assert sorted(contents(tmp_path)) == sorted(theirs)
+
+
+def test_what_a_killed_sequence_was_writing_goes_when_it_goes_on(tmp_path, sequence):
+    out = tmp_path / "out"
+    out.mkdir()
+    with DirectoryLock(out) as lock:
+        left = out / f".10_planes.{lock.mark_of('10.png')}01234567.png"
+    for path in (left, out / ".10_planes.0123abcd.png"):
+        path.touch()
+    assert main(["depth", str(sequence), *CAMERA, "--out", str(out)]) == 3
+    assert [name for name in contents(out) if name[0] == "."] == [".10_planes.0123abcd.png"]
 
 
 def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
