@@ -199,9 +199,11 @@ def _without(vectors: Tensor, normals: Tensor) -> Tensor:
 
 def _direction(up: Sequence[float] | str, points: Tensor) -> Tensor:
     """Return a direction beside the points, or say what is wrong with it."""
-    length = -1.0 if up[:1] == "-" else 1.0
-    numbers = [length * (up[-1:] == axis) for axis in "xyz"] if isinstance(up, str) else list(up)
-    direction = torch.tensor(numbers, dtype=points.dtype, device=points.device)
+    numbers = up
+    if isinstance(up, str):
+        length, name = (-1.0 if up.startswith("-") else 1.0), up.removeprefix("-")
+        numbers = [length * (name == axis) for axis in "xyz"]
+    direction = torch.tensor(list(numbers), dtype=points.dtype, device=points.device)
     if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
         raise ConfigError(
             "summarize_planes: expected up to be three numbers, not all zero, or the name of an "
