@@ -506,8 +506,12 @@ class FileRows:
             self._read(found, start)
             return found
         found = np.empty((len(rows), *self.shape[1:]), self.dtype)
-        for some in chunks_of(len(rows), ROWS_IN_CACHE):
-            self._gather(rows[some], found[some])
+        for chunk in chunks_of(len(rows), ROWS_IN_CACHE):
+            some = rows[chunk]
+            if some[-1] - some[0] == len(some) - 1 and bool((np.diff(some) == 1).all()):
+                self._read(found[chunk], int(some[0]))
+            else:
+                self._gather(some, found[chunk])
         return found
 
     def _gather(self, rows: NDArray[np.integer], found: NDArray[Any]) -> None:
