@@ -4,11 +4,12 @@ import ast
 from pathlib import Path
 
 LAYERS = [
-    {"errors"},
+    {"errors", "version", "_display"},
     {"_checks", "_optional", "_parallel", "structures"},
     {"linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},
+    {"result"},
     {"store"},
     {"tiles"},
     {"pipeline"},

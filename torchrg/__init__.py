@@ -1,7 +1,12 @@
 """Robust normals, curvature and plane labels for indoor point clouds."""
 
+from torchrg import _display
+from torchrg.version import __version__ as __version__
+
 TYPE_CHECKING = False  # As that of typing, without loading it.
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from torchrg import datasets, depth, metrics, nn, normals, robust, scenes, transforms
     from torchrg.config import load_config
     from torchrg.errors import TorchrgError
@@ -10,6 +15,7 @@ if TYPE_CHECKING:
     from torchrg.normals import estimate_normals
     from torchrg.pipeline import make_superpoints, segment_planes
     from torchrg.regions import align_axes, grow_regions
+    from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud
 else:
     _MODULES = {
@@ -22,6 +28,7 @@ else:
         "load_config": "config",
         "make_superpoints": "pipeline",
         "read_cloud": "io",
+        "read_result": "result",
         "search_knn": "neighbors",
         "segment_planes": "pipeline",
         "write_cloud": "io",
@@ -48,7 +55,14 @@ else:
         return sorted({*globals(), *__all__})
 
 
-__version__ = "0.1.0"
+def _load_display() -> "ModuleType":
+    """Load what shows results in a notebook."""
+    from torchrg.render import notebook
+
+    return notebook
+
+
+_display.register(_load_display)
 
 __all__ = [
     "UNLABELED",
@@ -65,6 +79,7 @@ __all__ = [
     "nn",
     "normals",
     "read_cloud",
+    "read_result",
     "robust",
     "scenes",
     "search_knn",

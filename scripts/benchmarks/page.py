@@ -21,6 +21,7 @@ import numpy as np
 
 from benchmarks.harness import Benchmark, Figures
 from torchrg.render import make_page, write_page
+from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -63,7 +64,7 @@ class Case(Benchmark):
         flags = ["--no-sandbox", *(() if self.gpu else SOFTWARE)]
         with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "page.html"
-            write_page(path, make_page(cloud))
+            write_page(path, make_page(Result(cloud)))
             browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
             tab = browser.new_page(viewport={"width": 1280, "height": 800})
             begin = time.perf_counter()
@@ -99,6 +100,6 @@ def _write(cloud: Cloud) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "page.html"
         begin = time.process_time()
-        write_page(path, make_page(cloud))
+        write_page(path, make_page(Result(cloud)))
         seconds = time.process_time() - begin
         return {"CPU seconds": seconds, "MB": path.stat().st_size / 1e6}

@@ -15,6 +15,7 @@ from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
 from torchrg.render import color_planes, make_page, render_cloud, write_page
 from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.result import Result
 from torchrg.structures import Cloud
 
 SETTINGS = {
@@ -124,13 +125,13 @@ def write_pair(folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[s
     elif first != last:
         pair[first] = labelings[first]
     normals = {} if cloud.normals is None else {"normals": cloud.normals.numpy()}
-    clouds = [
-        Cloud(cloud.points.numpy(), {"labels": labels.numpy(), **normals}, source=title)
+    results = [
+        Result(Cloud(cloud.points.numpy(), {"labels": labels.numpy(), **normals}, source=title))
         for title, labels in pair.items()
     ]
-    truth = None if cloud.labels is None else clouds[-1]
+    truth = None if cloud.labels is None else results[-1].cloud
     file = f"figures/{name}.html"
-    page = make_page(clouds[0], beside=clouds[1] if len(clouds) > 1 else None, truth=truth)
+    page = make_page(results[0], beside=results[1] if len(results) > 1 else None, truth=truth)
     write_page(folder.place(file), page)
     return file
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-import torchrg
+from torchrg import version
 from torchrg.batch.convert import convert_scan
 from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import list_jobs, make_plan
@@ -46,7 +46,7 @@ def test_another_input_is_noticed_even_at_the_same_size_and_time(job):
 
 
 def test_another_version_is_noticed(job, monkeypatch):
-    monkeypatch.setattr(torchrg, "__version__", "99.0")
+    monkeypatch.setattr(version, "__version__", "99.0")
     assert reason_to_convert(job) == "version changed"
 
 

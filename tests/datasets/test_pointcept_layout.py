@@ -11,9 +11,10 @@ import torch
 
 from tests.datasets.s3dis_tree import digest
 from torchrg.config import load_config
-from torchrg.datasets import describe_planes, read_pointcept_scene, write_pointcept_scene
+from torchrg.datasets import read_pointcept_scene, write_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.result import describe_planes
 from torchrg.scenes import make_room
 
 CLASSIC = load_config("classic")

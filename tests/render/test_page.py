@@ -17,6 +17,7 @@ from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.render.channels import decode_directions, encode_directions
 from torchrg.render.content import NUM_STRATA
 from torchrg.render.page import make_page, write_page
+from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -39,7 +40,7 @@ def room(num_points=1600, **changes):
 
 @functools.cache
 def page_of_room():
-    return make_page(room())
+    return make_page(Result(room()))
 
 
 def described(page):
@@ -103,7 +104,7 @@ def test_pages_do_not_depend_on_the_order_of_the_points():
     order = np.random.default_rng(2).permutation(len(cloud))
     fields = {name: values[order] for name, values in cloud.fields.items()}
     mixed = Cloud(cloud.coordinates[order], fields, source=cloud.source)
-    assert make_page(mixed).html == page_of_room().html
+    assert make_page(Result(mixed)).html == page_of_room().html
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e3])
@@ -114,7 +115,7 @@ def test_pages_do_not_depend_on_unit_and_origin(factor):
         cloud.fields,
         source=cloud.source,
     )
-    page = make_page(moved)
+    page = make_page(Result(moved))
     middle = moved.coordinates.mean(axis=0)
     found, given = (torch.from_numpy(where - middle) for where in (places(page), moved.coordinates))
     assert float(torch.cdist(found, given).amin(dim=1).max()) < 1e-3 * factor
@@ -144,13 +145,13 @@ def test_planes_are_those_of_the_labels():
 
 
 def test_a_sample_is_stated_and_strata_are_spread_evenly():
-    page = make_page(room(4000), max_points=800)
+    page = make_page(Result(room(4000)), max_points=800)
     cloud = described(page)["clouds"][0]
     assert page.num_points == (800,)
     assert (cloud["count"], cloud["shown"], cloud["levels"][-1]) == (4000, 800, 800)
     assert cloud["levels"][0] == 800 / NUM_STRATA
     assert sum(plane["count"] for plane in cloud["planes"]) == 4000
-    whole = places(make_page(room(4000)))
+    whole = places(make_page(Result(room(4000))))
     first = whole[: 4000 // NUM_STRATA]
     error = whole.std(axis=0) / np.sqrt(len(first))
     assert (np.abs(first.mean(axis=0) - whole.mean(axis=0)) < 4 * error).all()
@@ -159,7 +160,7 @@ def test_a_sample_is_stated_and_strata_are_spread_evenly():
 def test_what_the_same_planes_have_beside_each_other_is_one_colour():
     cloud = room()
     other = room(labels=cloud.fields["labels"].max() - cloud.fields["labels"])
-    page = make_page(cloud, beside=other)
+    page = make_page(Result(cloud), beside=Result(other))
     first, second = (unpacked(page, place)["plane colors"] for place in (0, 1))
     assert (first[:-1] == second[:-1][::-1]).all()
 
@@ -168,7 +169,7 @@ def test_errors_are_shown_against_a_truth():
     cloud = room()
     wrong = cloud.fields["labels"].copy()
     wrong[:100] = -1
-    page = make_page(room(labels=wrong), truth=cloud, color="error")
+    page = make_page(Result(room(labels=wrong)), truth=cloud, color="error")
     assert described(page)["mode"] == "error"
     assert (unpacked(page)["error"] == 3).sum() == 100
     assert (unpacked(page)["normal-error"] == 0).all()
@@ -176,7 +177,7 @@ def test_errors_are_shown_against_a_truth():
 
 def test_nothing_from_a_file_is_markup():
     cloud = Cloud(np.eye(3), {"labels": np.array([0, 0, -1])}, source=f"/tmp/{EVIL}.npz")
-    html = make_page(cloud, title=EVIL).html
+    html = make_page(Result(cloud), title=EVIL).html
     assert EVIL not in html
     assert html.count("<script") == html.count("</script>") == 1 + 2 + 1
     assert "onerror=alert" not in re.sub(r"&lt;.*?&gt;", "", re.sub(r"\\u003c.*?\\u003e", "", html))
@@ -217,7 +218,7 @@ def test_the_policy_allows_no_network_and_only_our_scripts():
     ],
 )
 def test_odd_clouds_give_a_page(cloud):
-    page = make_page(cloud)
+    page = make_page(Result(cloud))
     assert page.num_points == (int(cloud.finite.sum()),)
     assert described(page)["clouds"][0]["count"] == len(cloud)
 
@@ -243,13 +244,13 @@ def test_directions_survive_two_bytes():
 )
 def test_wrong_settings_are_refused_in_one_line(settings, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        make_page(room(), **settings)
+        make_page(Result(room()), **settings)
 
 
 def test_missing_package_is_told_with_its_repair(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pydeck", None)
     with pytest.raises(MissingDependencyError, match=re.escape("pip install 'torchrg[view]'")):
-        make_page(room())
+        make_page(Result(room()))
 
 
 def test_view_writes_a_page(tmp_path, capsys):
@@ -285,7 +286,7 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments, mess
 
 
 def test_equal_input_gives_equal_bytes(tmp_path):
-    write_page(tmp_path / "room.html", make_page(room()))
+    write_page(tmp_path / "room.html", make_page(Result(room())))
     assert (tmp_path / "room.html").read_text() == page_of_room().html
 
 
@@ -298,7 +299,7 @@ def test_walls_of_an_open_scan_are_cut_away_from_outside_alone():
     west = np.stack([zero, flat[1, :, 0], flat[1, :, 1] / 2], axis=1)
     middle = np.stack([zero + 2, flat[2, :, 0], flat[2, :, 1] / 2], axis=1)
     cloud = Cloud(np.concatenate([floor, west, middle]), {"labels": np.repeat([0, 1, 2], 900)})
-    what = described(make_page(cloud))["clouds"][0]
+    what = described(make_page(Result(cloud)))["clouds"][0]
     outward = [
         [where for bit, where in enumerate(what["surfaces"]) if plane["sides"] >> bit & 1]
         for plane in what["planes"]
@@ -312,7 +313,7 @@ def test_points_are_as_large_as_the_space_around_them():
     rng = np.random.default_rng(0)
     dense, sparse = rng.random((4000, 3)), rng.random((4000, 3)) * 2 + 5
     dense[:, 2] = sparse[:, 2] = 0
-    page = make_page(Cloud(np.concatenate([dense, sparse])))
+    page = make_page(Result(Cloud(np.concatenate([dense, sparse]))))
     radii = unpacked(page)["radii"][:, 0]
     is_sparse = places(page)[:, 0] > 3
     octaves = (np.median(radii[is_sparse]) - np.median(radii[~is_sparse])) / 16

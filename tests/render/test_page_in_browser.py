@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -92,7 +93,7 @@ def tab(browser, room, tmp_path_factory):
         room.fields, labels=np.where(room.fields["labels"] == 0, -1, room.fields["labels"])
     )
     other = Cloud(room.coordinates, fields, source="other.npz")
-    write_page(path, make_page(room, beside=other, title=EVIL))
+    write_page(path, make_page(Result(room), beside=Result(other), title=EVIL))
     return Tab(browser, path)
 
 
@@ -265,7 +266,7 @@ def test_colours_switch_and_outlines_and_normals_appear(tab):
     ids=["all NaN", "one point", "no labels"],
 )
 def test_odd_clouds_open(browser, tmp_path, cloud, words):
-    write_page(tmp_path / "odd.html", make_page(cloud))
+    write_page(tmp_path / "odd.html", make_page(Result(cloud)))
     tab = Tab(browser, tmp_path / "odd.html")
     assert words in tab.run("message.textContent")
     if not words:

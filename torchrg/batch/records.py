@@ -13,13 +13,13 @@ import numpy as np
 import scipy
 import torch
 
+from torchrg import version
 from torchrg.batch.task import Converted
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
+from torchrg.result import RECORD as RECORD
 
-RECORD = "provenance.json"
-"""Written last beside the results of a scan, so that a scan without it is not done."""
 _TEXT = b"tEXttorchrg\0"
 """How the part of a PNG begins that holds a record: a text of the name torchrg."""
 _END_BYTES = 12
@@ -57,10 +57,8 @@ def describe_run(
 
 def describe_versions() -> dict[str, str]:
     """Return the versions of what decides a result."""
-    from torchrg import __version__
-
     return {
-        "torchrg": __version__,
+        "torchrg": version.__version__,
         "torch": str(torch.__version__),
         "numpy": np.__version__,
         "scipy": scipy.__version__,

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.batch.task import Converted
-from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_arrays
+from torchrg.datasets.pointcept import write_arrays
 from torchrg.errors import FormatError
 from torchrg.io import CloudStream
 from torchrg.io.stream import Extent
+from torchrg.result import describe_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation
 
 _LOOKED_AT = 10_000
@@ -21,15 +22,6 @@ _MIDDLE = (0.25, 0.75)
 _FAR_OFF = 1000
 """Extent of a cloud over that of its middle half, along any axis: float32 has seven digits, so that
 beyond it steps are 1e-4 of where most points are."""
-
-_FIELDS = {
-    "plane": "labels",
-    "normal": "normals",
-    "curvature": "curvature",
-    "color": "color",
-    "superpoint": "superpoints",
-}
-"""Fields of a cloud by the arrays of a folder that hold them."""
 
 
 @dataclass(frozen=True)
@@ -141,10 +133,3 @@ def write_results(
     }
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
     return write_arrays(folder, arrays, describe_planes(segmentation.planes, origin=origin))
-
-
-def read_results(folder: Path) -> Cloud:
-    """Return a converted scan, or any folder in Pointcept's layout, as a cloud with its results."""
-    sample = read_pointcept_scene(folder)
-    fields = {_FIELDS[name]: values.numpy() for name, values in sample.items() if name in _FIELDS}
-    return Cloud(sample["coord"].numpy(), fields, source=str(folder))

@@ -77,7 +77,7 @@ def _run(arguments: list[str]) -> int:
         return 0 if arguments else USAGE_ERROR
     name, *rest = arguments
     if name == "--version":
-        from torchrg import __version__
+        from torchrg.version import __version__
 
         print(f"torchrg {__version__}")
         return 0

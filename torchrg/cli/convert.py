@@ -23,7 +23,7 @@ from torchrg.batch.run import (
     make_plan,
     write_report,
 )
-from torchrg.batch.scans import Source, read_results
+from torchrg.batch.scans import Source
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
@@ -35,6 +35,7 @@ from torchrg.io import FORMATS
 from torchrg.io.files import check_place, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
+from torchrg.result import read_result
 
 MOST_ROWS = 300
 """A longer batch is not printed scan by scan."""
@@ -260,8 +261,7 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
         name = job.name
         words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
         try:
-            cloud = read_results(job.folder)
-            entries.append(draw_entry(folder, name, cloud, words=words))
+            entries.append(draw_entry(folder, name, read_result(job.folder), words=words))
         except (TorchrgError, OSError) as error:
             console.warn(f"{name}: no page: {error}")
     print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")

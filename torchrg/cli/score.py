@@ -13,7 +13,6 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.scans import read_results
 from torchrg.cli.console import (
     ColumnNames,
     ColumnsFlag,
@@ -25,7 +24,7 @@ from torchrg.cli.console import (
 )
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import atomic_path, read_cloud
+from torchrg.io import atomic_path
 from torchrg.io.files import check_place
 from torchrg.metrics import (
     differing_rows,
@@ -34,6 +33,7 @@ from torchrg.metrics import (
     score_normals,
     score_partition,
 )
+from torchrg.result import read_result
 from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, Any]]
@@ -154,10 +154,7 @@ def _named(names: Iterable[str]) -> str:
 def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     """Return the scores of whatever two scans of the same points both have."""
     names = ColumnNames.parse(arguments.columns, (predicted, truth))
-    ours, theirs = (
-        read_results(path) if path.is_dir() else read_cloud(path, columns=names.of(path))
-        for path in (predicted, truth)
-    )
+    ours, theirs = (read_result(path, columns=names.of(path)).cloud for path in (predicted, truth))
     for cloud in (ours, theirs):
         for note in cloud.notes:
             warn(f"{cloud.source}: {note}.")

@@ -45,9 +45,9 @@ from torchrg.render.gallery import (
     check_gallery,
     draw_entry,
     draw_planes,
-    with_results,
     write_index,
 )
+from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation
 
 STAGES = ("neighbors", "normals", "regions", "planes")
@@ -335,7 +335,7 @@ def _segment_whole(
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
-        result = with_results(cloud, seg, parts)
+        result = Result.of(cloud, seg, parts)
         if arguments.pages:
             draw_entry(picture.parent, picture.stem, result)
         elif console.is_page(picture):

@@ -18,7 +18,6 @@ from torchrg.cli.console import (
     warn,
 )
 from torchrg.errors import ConfigError
-from torchrg.io import read_cloud
 from torchrg.io.fields import WIDEN
 from torchrg.render import (
     color_curvature,
@@ -32,7 +31,7 @@ from torchrg.render import (
 )
 from torchrg.render.channels import MODES
 from torchrg.render.page import MAX_POINTS
-from torchrg.structures import Cloud
+from torchrg.result import Result, read_result
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]
@@ -84,27 +83,28 @@ def run(argv: list[str]) -> int:
     return 0
 
 
-def _read(path: Path, arguments: Arguments) -> Cloud:
-    """Read a cloud with colours of 8 bits, which is what screens show."""
+def _read(path: Path, arguments: Arguments) -> Result:
+    """Read a cloud or a result with colours of 8 bits, which is what screens show."""
     paths = [given for given in (arguments.file, arguments.beside, arguments.truth) if given]
-    cloud = read_cloud(path, columns=ColumnNames.parse(arguments.columns, paths).of(path))
+    result = read_result(path, columns=ColumnNames.parse(arguments.columns, paths).of(path))
+    cloud = result.cloud
     for note in cloud.notes:
         warn(f"{path}: {note}.")
     color = cloud.fields.get("color")
     if color is None or color.dtype == np.uint8:
-        return cloud
+        return result
     narrow = np.rint(color.astype(np.float64) / WIDEN).astype(np.uint8)
-    return replace(cloud, fields={**cloud.fields, "color": narrow})
+    return replace(result, cloud=replace(cloud, fields={**cloud.fields, "color": narrow}))
 
 
-def _write_picture(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str:
+def _write_picture(arguments: Arguments, result: Result, up: Direction | None) -> str:
     """Write a picture, and return what there is to say about it."""
     if arguments.beside is not None or arguments.truth is not None:
         raise ConfigError("expected --beside and --truth with a page, --out PAGE.html.")
-    normals = cloud.fields.get("normals")
+    cloud, normals = result.cloud, result.cloud.fields.get("normals")
     picture = render_cloud(
         cloud.points,
-        _colors(cloud, arguments.color),
+        _colors(result, arguments.color),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
         view=arguments.view,
         up=up or (0.0, 0.0, 1.0),
@@ -115,12 +115,12 @@ def _write_picture(arguments: Arguments, cloud: Cloud, up: Direction | None) -> 
     return f"{picture.shape[1]} x {picture.shape[0]} pixels"
 
 
-def _write_page(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str:
+def _write_page(arguments: Arguments, result: Result, up: Direction | None) -> str:
     """Write a page, and return what there is to say about it."""
     page = make_page(
-        cloud,
+        result,
         beside=None if arguments.beside is None else _read(arguments.beside, arguments),
-        truth=None if arguments.truth is None else _read(arguments.truth, arguments),
+        truth=None if arguments.truth is None else _read(arguments.truth, arguments).cloud,
         color=arguments.color,
         view=arguments.view,
         up=up,
@@ -132,12 +132,13 @@ def _write_page(arguments: Arguments, cloud: Cloud, up: Direction | None) -> str
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
 
-def _colors(cloud: Cloud, color: PageColorBy | None) -> Tensor:
+def _colors(result: Result, color: PageColorBy | None) -> Tensor:
     """Return the colour of each point.
 
     Raises:
         ConfigError: If the cloud lacks what the colours shall show.
     """
+    cloud = result.cloud
     present = [name for name in get_args(ColorBy) if MODES[name][1] in cloud.fields]
     if color is None:
         color = present[0] if present else None

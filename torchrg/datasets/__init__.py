@@ -41,7 +41,7 @@ here, and a test; a new folder of depth frames is a row of :data:`~torchrg.datas
 
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.folder import FolderOfClouds, Scene, read_pointcept_area
-from torchrg.datasets.pointcept import describe_planes, read_pointcept_scene, write_pointcept_scene
+from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
 from torchrg.datasets.s3dis import S3DIS
@@ -58,7 +58,6 @@ __all__ = [
     "Scene",
     "Skipped",
     "collate_offset",
-    "describe_planes",
     "read_pointcept_area",
     "read_pointcept_scene",
     "read_room",

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 from torch import Tensor
@@ -24,8 +23,9 @@ from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import make_folder
-from torchrg.io.npy import map_array
-from torchrg.structures import PLANE_KINDS, Planes, Segmentation
+from torchrg.io.npy import check_rows, map_array, map_folder
+from torchrg.result import PLANES_FILE, describe_planes
+from torchrg.structures import Segmentation
 
 POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "instance",
@@ -35,7 +35,6 @@ POINT_ARRAYS = (
 _LABELS = ("segment", "instance", "superpoint", "plane")
 _FEATURES = ("strength", "curvature")
 """Arrays of numbers that have two axes in files, whatever they have elsewhere."""
-_TABLE = "planes.json"
 
 
 def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -51,14 +50,10 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
     Raises:
         FormatError: If there are no coordinates, a file is damaged, or lengths differ.
     """
-    paths = {name: Path(folder) / f"{name}.npy" for name in POINT_ARRAYS}
-    if not paths["coord"].is_file():
-        raise FormatError(f"{folder}: expected coord.npy in this folder, got none.")
-    arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
-    if arrays["coord"].ndim != 2 or arrays["coord"].shape[1] != 3:
-        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {arrays['coord'].shape}.")
-    for name, values in arrays.items():
-        _check_rows(paths[name], values, len(arrays["coord"]))
+    arrays = map_folder(Path(folder), POINT_ARRAYS)
+    if arrays["coord"].ndim != 2:
+        shape = arrays["coord"].shape
+        raise FormatError(f"{Path(folder) / 'coord.npy'}: expected shape (N, 3), got {shape}.")
     sample = {name: as_tensor("scene", name, values) for name, values in arrays.items()}
     if "curvature" in sample:
         sample["curvature"] = sample["curvature"].reshape(-1)
@@ -91,7 +86,8 @@ def write_pointcept_scene(
         superpoint: Superpoint of each point, shape ``(N,)``, to be written as ``superpoint`` too,
             which ScanNet's data sets have. Default: none are.
         origin: Where the origin of ``coord`` is, for the plane table; see
-            :func:`describe_planes`. Default: ``coord`` is in the coordinates of the data set.
+            :func:`torchrg.result.describe_planes`. Default: ``coord`` is in the coordinates of the
+            data set.
 
     Returns:
         Names of the files written.
@@ -142,63 +138,9 @@ def write_arrays(
             beside = stack.enter_context(atomic_path(place / f"{name}.npy"))
             with beside.open("wb") as stream:
                 npy_format.write_array(stream, values, allow_pickle=False)
-        claim = stack.enter_context(atomic_path(place / _TABLE))
+        claim = stack.enter_context(atomic_path(place / PLANES_FILE))
         claim.write_text(json.dumps({"written": [*arrays], **planes}, indent=1), encoding="utf-8")
-    return [*(f"{name}.npy" for name in arrays), _TABLE]
-
-
-def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
-    """Return a plane table as JSON can hold it.
-
-    Args:
-        planes: The table.
-        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
-            Default: they are the same.
-
-    Returns:
-        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and ``normal``,
-        ``offset`` (``normal . x = offset``), ``centroid``, ``area``, ``count``, ``rms``,
-        ``extent``, ``axes``, ``center``, ``curved``; ``kind`` and ``outline`` (rings of points)
-        where they are known.
-        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
-
-    Example:
-        >>> from torchrg.pipeline import segment_planes
-        >>> grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
-        >>> plane = describe_planes(segment_planes(grid).planes, origin=[0, 0, 5])["planes"][0]
-        >>> plane["count"], plane["normal"], plane["offset"]
-        (81, [0.0, 0.0, 1.0], 6.0)
-    """
-    shift = torch.as_tensor([0.0] * 3 if origin is None else origin, dtype=torch.float64)
-
-    def exact(values: Tensor) -> Tensor:
-        return values.detach().cpu().double()
-
-    columns = {"id": torch.arange(len(planes.normal)), **planes._asdict()}
-    for name in ("kind", "outline", "adjacency"):
-        del columns[name]
-    columns["offset"] = exact(planes.offset) + exact(planes.normal) @ shift
-    columns["centroid"] = exact(planes.centroid) + shift
-    columns["center"] = exact(planes.center) + shift
-    lists = {name: values.tolist() for name, values in columns.items()}
-    if planes.kind is not None:
-        lists["kind"] = [PLANE_KINDS[kind] for kind in planes.kind.tolist()]
-    if planes.outline is not None:
-        lists["outline"] = [
-            [(exact(ring) + shift).tolist() for ring in rings] for rings in planes.outline
-        ]
-    table: dict[str, Any] = {"planes": _rows(lists)}
-    if planes.adjacency is not None:
-        pairs, lengths, angles = (part.tolist() for part in planes.adjacency)
-        table["adjacency"] = _rows(
-            {"pair": pairs, "boundary_length": lengths, "dihedral_deg": angles}
-        )
-    return table
-
-
-def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    """Turn a table of columns into a list of rows."""
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return [*(f"{name}.npy" for name in arrays), PLANES_FILE]
 
 
 def _arrays_of(
@@ -218,7 +160,7 @@ def _arrays_of(
     arrays = {}
     for name in (name for name in POINT_ARRAYS if name in found):
         values = as_tensor("write_pointcept_scene", name, found[name]).detach().cpu().numpy()
-        _check_rows(place / f"{name}.npy", values, len(segmentation.labels))
+        check_rows(place / f"{name}.npy", values, segmentation.labels.shape)
         if name in ("segment", "instance"):
             arrays[name] = _short(values).reshape(-1, 1)
         elif name in _FEATURES:
@@ -238,14 +180,14 @@ def _short(labels: NDArray[Any]) -> NDArray[Any]:
 def _owned(place: Path) -> set[str]:
     """Return the names of the arrays that torchrg wrote here."""
     try:
-        written = json.loads((place / _TABLE).read_text(encoding="utf-8"))["written"]
+        written = json.loads((place / PLANES_FILE).read_text(encoding="utf-8"))["written"]
         return set(written) & set(POINT_ARRAYS)
     except (FileNotFoundError, NotADirectoryError):
         return set()
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise FormatError(
-            f"{place / _TABLE}: expected a table of planes that torchrg wrote, got another file; "
-            "move it away."
+            f"{place / PLANES_FILE}: expected a table of planes that torchrg wrote, got another "
+            "file; move it away."
         ) from error
 
 
@@ -254,14 +196,8 @@ def _check_kept(place: Path, arrays: Mapping[str, NDArray[Any]], kept: set[str])
     for name in sorted(kept):
         path = place / f"{name}.npy"
         values = map_array(path)
-        _check_rows(path, values, len(arrays[name]))
+        check_rows(path, values, arrays[name].shape[:1])
         if name == "coord" and not np.array_equal(values.astype(np.float32), arrays[name]):
             raise FormatError(
                 f"{path}: expected the points of this scene, got others; write to another folder."
             )
-
-
-def _check_rows(path: Path, values: NDArray[Any], num_points: int) -> None:
-    """Check that an array has a row for each point."""
-    if values.shape[:1] != (num_points,):
-        raise FormatError(f"{path}: expected {num_points} rows, got shape {values.shape}.")

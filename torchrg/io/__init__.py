@@ -216,12 +216,7 @@ def write_cloud(
         ``normals_input`` and so on; where there is such a field already, it is that which stays.
         ``.npz``
         holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the table of
-        :class:`torchrg.structures.Planes` as ``plane_normal``, ``plane_offset``,
-        ``plane_centroid``, ``plane_area``, ``plane_count``, ``plane_rms``, ``plane_extent``,
-        ``plane_axes``, ``plane_center``, ``plane_curved`` and, where it has them, ``plane_kind``
-        (words), ``adjacency_pairs``, ``adjacency_boundary_length``, ``adjacency_dihedral_deg``,
-        ``outline_points``, ``outline_ring_sizes`` and ``outline_ring_planes`` (rings one after the
-        other: their lengths, and the planes they belong to), all in the input's own coordinates,
+        planes as :meth:`torchrg.structures.Planes.to_arrays` gives it in the input's coordinates,
         and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
         identifiers). Superpoints are ``superpoints``, and ``superpoints_1`` and so on for the
         coarser levels; in ``.npz`` also ``plane_of_superpoint``.

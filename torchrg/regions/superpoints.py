@@ -96,7 +96,7 @@ def partition_points(
         restore_rows(level.to(place.device)[place], rows, len(points), fill=UNLABELED)
         for level in (_by_size(level, place.cpu()) for level in partitions)
     )
-    return Superpoints(levels[0], _main_planes(levels[0], labels), levels[1:])
+    return Superpoints(levels[0], main_planes(levels[0], labels), levels[1:])
 
 
 def _partition_places(
@@ -366,7 +366,7 @@ def _by_size(regions: Tensor, place: Tensor) -> Tensor:
     return counts.argsort(descending=True, stable=True).argsort()[regions]
 
 
-def _main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
+def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
     """Return the plane that more than half of the points of each superpoint are on, or -1."""
     has_one = superpoints >= 0
     count = int(superpoints.max()) + 1 if bool(has_one.any()) else 0

@@ -142,7 +142,7 @@ def summarize_planes(
         curved=fit.curved,
     )
     if up is not None:
-        planes = planes._replace(kind=_classify(planes, _direction(up, points)))
+        planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
     if outline:
         planes = planes._replace(outline=sum((part.outline for part in measures), ()))
     if found is not None:
@@ -212,7 +212,7 @@ def _direction(up: Sequence[float] | str, points: Tensor) -> Tensor:
     return direction
 
 
-def _classify(planes: Planes, up: Tensor) -> Tensor:
+def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     """Return a simple class for each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
 
     A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all

@@ -9,23 +9,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg.linalg.moments import Segments
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import finite_rows, search_knn
-from torchrg.regions import summarize_planes
+from torchrg.neighbors import finite_rows
+from torchrg.regions.outline import trace_outline
+from torchrg.regions.table import Rectangles, classify_planes, covered_areas
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import find_outer_surfaces
 from torchrg.render.grid import build_grid, local_spacing, surface_cells
-from torchrg.structures import Cloud, Planes
+from torchrg.result import Result, describe_planes
+from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
 """Random parts of the points, each along a Morton curve. While the page moves on a slow machine it
 draws the first ones; along a curve, positions compress to two thirds."""
 PAGE_EXTENT = 10.0
 """The longest side of a cloud on a page: pages do not depend on the unit."""
-_TABLE_POINTS = 200_000
-"""Points that tell outlines and which planes meet: enough for a picture."""
-_TABLE_NEIGHBORS = 24
-"""Neighbours that bridge the strip without labels along an edge."""
+_OUTLINE_POINTS = 200_000
+"""Points that tell outlines: enough for a picture."""
+_NOT_SHOWN = ("id", "centroid", "axes", "center", "outline")
+"""Columns of the plane table that a page draws or does not need."""
 _MAX_SURFACES = 7
 """Outer surfaces that a page can cut away: bits of a byte, the last of which hides planes."""
 _USUAL_RADIUS = 128
@@ -67,14 +70,12 @@ class Shown(NamedTuple):
     """The points of a cloud that a page shows.
 
     Attributes:
-        finite: All finite rows of the cloud, in canonical order.
         rows: Those that are shown, by strata, shape ``(n,)``.
         levels: Number of points in the first stratum, in the first two, and so on.
         points: In the axes of the page, shape ``(n, 3)``, float32.
         fields: Of those points; normals in the axes of the page, labels numbered without gaps.
     """
 
-    finite: Tensor
     rows: Tensor
     levels: list[int]
     points: Tensor
@@ -97,36 +98,28 @@ def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
     return Frame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
 
 
-def choose_points(cloud: Cloud, frame: Frame, max_points: int) -> Shown:
+def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
     """Choose the points to show: the same whatever their order, and in random strata."""
+    cloud = result.cloud
     finite = finite_rows(cloud.points)
     mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
     strata = [part.sort().values for part in mixed.tensor_split(NUM_STRATA)]
     levels = torch.tensor([len(part) for part in strata]).cumsum(0).tolist()
     rows = finite[torch.cat(strata)]
     fields = {
-        name: torch.from_numpy(np.ascontiguousarray(cloud.fields[name][rows.numpy()]))
-        for _, name in MODES.values()
-        if name in cloud.fields
+        name: result.fields[name][rows] for _, name in MODES.values() if name in result.fields
     }
     for name in ("normals", "curvature"):
         if name in fields:
             fields[name] = fields[name].float().nan_to_num(0, 0, 0)
     if "normals" in fields:
         fields["normals"] = fields["normals"] @ frame.rotation.T.float()
-    for name in ("labels", "superpoints"):
-        if name in fields:
-            distinct = _distinct(cloud, name)
-            places = torch.searchsorted(distinct, fields[name].long())
-            fields[name] = torch.where(fields[name] < 0, -1, places)
-    return Shown(finite, rows, levels, frame.place(cloud.points[rows], cloud.origin), fields)
-
-
-def _distinct(cloud: Cloud, name: str) -> Tensor:
-    """Return the labels that occur at finite points, ascending."""
-    values = torch.from_numpy(np.ascontiguousarray(cloud.fields[name][cloud.finite])).long()
-    distinct: Tensor = torch.unique(values[values >= 0])
-    return distinct
+    if "labels" in fields:
+        fields["labels"] = result.labels[rows]
+    if "superpoints" in fields:
+        parts = result.fields["superpoints"].long()
+        fields["superpoints"] = number_labels(parts.clamp(min=-1))[1][rows]
+    return Shown(rows, levels, frame.place(cloud.points[rows], cloud.origin), fields)
 
 
 class Surfaces(NamedTuple):
@@ -166,89 +159,59 @@ def outer_surfaces(points: Tensor) -> Surfaces:
     return Surfaces(directions, covered, usual, radii)
 
 
-def describe_planes(cloud: Cloud, shown: Shown, frame: Frame) -> list[dict[str, Any]]:
-    """Return what a page says about each plane, by the number that its points have there."""
-    if "labels" not in shown.fields:
-        return []
-    names = _distinct(cloud, "labels")
-    if len(names) == 0:
-        return []
-    kept = shown.finite
-    labels = torch.from_numpy(np.ascontiguousarray(cloud.fields["labels"])).long()[kept]
-    labels = torch.where(labels < 0, -1, torch.searchsorted(names, labels))
-    points = cloud.points[kept]
-    has_normals = "normals" in cloud.fields
-    normals = torch.zeros_like(points)
-    if has_normals:
-        given = torch.from_numpy(np.ascontiguousarray(cloud.fields["normals"]))[kept]
-        normals = given.to(points.dtype).nan_to_num(0, 0, 0)
-    table = summarize_planes(points, normals, labels, up=frame.rotation[2].tolist())
-    drawn = _planes_to_draw(shown, len(names))
-    offset = table.offset.double() + table.normal.double() @ torch.from_numpy(cloud.origin)
-    kinds = table.kind if table.kind is not None else torch.zeros_like(table.count)
-    rows = zip(
-        names.tolist(),
-        table.count.tolist(),
-        table.area.tolist(),
-        table.rms.tolist(),
-        table.extent.tolist(),
-        table.normal.tolist(),
-        offset.tolist(),
-        kinds.tolist(),
-        (table.curved & has_normals).tolist(),
-        _rectangles(table, frame, cloud.origin),
-        strict=True,
-    )
-    planes = []
-    for number, row in enumerate(rows):
-        name, count, area, rms, extent, normal, height, kind, curved, corners = row
-        rings, met = drawn.get(number, ([], []))
-        planes.append(
-            {
-                "name": name,
-                "count": count,
-                "area": area,
-                "rms": rms,
-                "extent": extent,
-                "normal": normal,
-                "offset": height,
-                "kind": kind,
-                "curved": curved,
-                "rings": rings or [corners],
-                "meets": met,
-            }
-        )
-    return planes
+def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, Any]]:
+    """Return what a page says about each plane, by the number that its points have there.
 
-
-def _planes_to_draw(
-    shown: Shown, num_planes: int
-) -> dict[int, tuple[list[Any], list[tuple[int, float, float]]]]:
-    """Return outlines in the axes of the page, and which planes meet at which angle and length.
-
-    A sample of the points tells both; without shapely there are no outlines.
+    It is the table of the result: the columns of :func:`torchrg.result.describe_planes` but for
+    those that are drawn, ``rings`` in the axes of the page, and which planes it ``meets``, at which
+    angle and along which length. Kinds go by the upward direction of the page where the result has
+    none.
     """
-    rows = shown.fields["labels"][:_TABLE_POINTS]
-    points = shown.points[:_TABLE_POINTS]
-    normals = shown.fields.get("normals", torch.zeros_like(points))[:_TABLE_POINTS]
-    numbers, labels = number_labels(rows)
-    neighbors = search_knn(points, min(_TABLE_NEIGHBORS, len(points)))
-    can_trace = find_spec("shapely") is not None
-    table = summarize_planes(points, normals, labels, neighbors=neighbors, outline=can_trace)
-    found: dict[int, tuple[list[Any], list[tuple[int, float, float]]]] = {
-        number: ([], []) for number in range(num_planes)
-    }
-    if table.outline is not None:
-        for number, rings in zip(numbers.tolist(), table.outline, strict=True):
-            found[number][0].extend(rounded(ring) for ring in rings)
-    if table.adjacency is not None:
-        pairs = numbers[table.adjacency.pairs].tolist()
-        angles = table.adjacency.dihedral_deg.tolist()
-        lengths = table.adjacency.boundary_length.tolist()
-        for (first, second), angle, length in zip(pairs, angles, lengths, strict=True):
-            for own, other in ((first, second), (second, first)):
-                found[own][1].append((other, round(angle, 1), length))
-    return found
+    planes, origin = result.planes, result.cloud.origin
+    if planes is None or len(planes.count) == 0:
+        return []
+    if planes.kind is None:
+        planes = planes._replace(kind=classify_planes(planes, frame.rotation[2]))
+    table = describe_planes(planes, origin=origin.tolist())
+    meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
+    for found in table.get("adjacency", []):
+        for own, other in (found["pair"], found["pair"][::-1]):
+            meets[own].append((other, round(found["dihedral_deg"], 1), found["boundary_length"]))
+    rings = planes.outline or _trace(planes, shown.rows, result)
+    corners = _rectangles(planes)
+    return [
+        {name: value for name, value in row.items() if name not in _NOT_SHOWN}
+        | {
+            "name": label,
+            "kind": PLANE_KINDS.index(row["kind"]),
+            "rings": [rounded(frame.place(ring, origin)) for ring in own or (rectangle,)],
+            "meets": met,
+        }
+        for row, label, own, rectangle, met in zip(
+            table["planes"], result.names.tolist(), rings, corners, meets, strict=True
+        )
+    ]
+
+
+def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:
+    """Trace the outlines of planes through a sample of their points; none without shapely."""
+    outlines: list[tuple[Tensor, ...]] = [() for _ in planes.count]
+    if find_spec("shapely") is None:
+        return outlines
+    rows = rows[:_OUTLINE_POINTS]
+    numbers, labels = number_labels(result.labels[rows])
+    segments = Segments(labels)
+    axes, center = planes.axes[numbers].double(), planes.center[numbers].double()
+    centered = torch.stack(segments.take_about(result.cloud.points[rows], center), dim=1)
+    u, v = ((centered * segments.spread(axis)).sum(dim=1) for axis in axes.unbind(dim=1))
+    along = torch.eye(2, dtype=torch.float64).expand(len(numbers), 2, 2)
+    boxes = Rectangles(planes.extent[numbers].double(), along, torch.zeros_like(center[:, :2]))
+    width = covered_areas(segments, u, v, boxes)[1]
+    parts = torch.split(torch.stack([u, v], dim=1), segments.counts.tolist())
+    for place, (own, part) in enumerate(zip(numbers.tolist(), parts, strict=True)):
+        rings = (torch.from_numpy(r) for r in trace_outline(part.numpy(), float(width[place])))
+        outlines[own] = tuple(center[place] + ring @ axes[place] for ring in rings)
+    return outlines
 
 
 def sides_of_planes(
@@ -292,12 +255,11 @@ def sides_of_planes(
     return torch.stack([shown.points.new_zeros(3), *directions])[1:], sides
 
 
-def _rectangles(table: Planes, frame: Frame, origin: NDArray[np.float64]) -> list[Any]:
-    """Return the corners of the rectangle around each plane, in the axes of the page."""
-    half = (table.axes * table.extent[:, :, None] / 2).double()
+def _rectangles(planes: Planes) -> Tensor:
+    """Return the corners of the rectangle around each plane, shape ``(M, 4, 3)``."""
+    half = (planes.axes * planes.extent[:, :, None] / 2).double()
     signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
-    corners = table.center.double()[:, None] + signs @ half
-    return [rounded(frame.place(each, origin)) for each in corners]
+    return planes.center.double()[:, None] + signs @ half
 
 
 def rounded(values: Tensor) -> Any:  # noqa: ANN401

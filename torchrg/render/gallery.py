@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
-from torchrg.errors import FormatError, ShapeError
+from torchrg.errors import FormatError
 from torchrg.io.files import atomic_path, check_place
 from torchrg.render.colors import color_planes
 from torchrg.render.page import check_library, make_page, template_of, write_page
 from torchrg.render.pictures import render_cloud, write_png
-from torchrg.structures import Cloud, Segmentation, Superpoints
+from torchrg.result import Result
 
 INDEX = "index.html"
 """Name of the index in its folder."""
@@ -34,31 +32,16 @@ class Entry(NamedTuple):
     words: str = ""
 
 
-def with_results(
-    cloud: Cloud, segmentation: Segmentation, superpoints: Superpoints | None = None
-) -> Cloud:
-    """Return a cloud with what was found about its points as fields.
-
-    Raises:
-        ShapeError: If the segmentation is not of its points.
-    """
-    if len(segmentation.labels) != len(cloud):
-        raise ShapeError(
-            f"with_results: expected a segmentation of {len(cloud):,} points, got "
-            f"{len(segmentation.labels):,}; pass the points that were segmented."
-        )
-    names = ("labels", "normals", "curvature", "sharp")
-    found = {name: getattr(segmentation, name).numpy(force=True) for name in names}
-    parts = {} if superpoints is None else superpoints.by_level()
-    return Cloud(cloud.coordinates, {**cloud.fields, **found, **parts}, source=cloud.source)
-
-
-def draw_planes(path: str | os.PathLike[str], cloud: Cloud) -> None:
-    """Write a picture of the superpoints or, without any, of the planes of a cloud with normals."""
-    shown = "superpoints" if "superpoints" in cloud.fields else "labels"
-    labels, normals = (torch.from_numpy(cloud.fields[name]) for name in (shown, "normals"))
-    colors = color_planes(labels, cloud.points)
-    write_png(path, render_cloud(cloud.points, colors, normals=normals.to(cloud.points.dtype)))
+def draw_planes(path: str | os.PathLike[str], result: Result) -> None:
+    """Write a picture of the superpoints of a result or, without any, of its planes."""
+    fields, points = result.fields, result.cloud.points
+    normals = fields.get("normals")
+    picture = render_cloud(
+        points,
+        color_planes(fields.get("superpoints", result.labels), points),
+        normals=None if normals is None else normals.to(points.dtype),
+    )
+    write_png(path, picture)
 
 
 def check_gallery(folder: Path, names: Sequence[str]) -> None:
@@ -80,8 +63,8 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
             check_place(page)
 
 
-def draw_entry(folder: Path, name: str, cloud: Cloud, *, words: str = "") -> Entry:
-    """Write picture and page of a cloud under its name, and return its entry of the index.
+def draw_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:
+    """Write picture and page of a result under its name, and return its entry of the index.
 
     Raises:
         FormatError: If a file cannot be written.
@@ -89,8 +72,8 @@ def draw_entry(folder: Path, name: str, cloud: Cloud, *, words: str = "") -> Ent
     """
     entry = Entry(name, f"{name}.png", f"{name}.html", words)
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    draw_planes(folder / entry.picture, cloud)
-    write_page(folder / entry.page, make_page(cloud, title=name))
+    draw_planes(folder / entry.picture, result)
+    write_page(folder / entry.page, make_page(result, title=name))
     return entry
 
 

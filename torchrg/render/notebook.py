@@ -5,41 +5,34 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from torchrg.errors import ConfigError
-from torchrg.render.gallery import draw_planes, with_results
+from torchrg.render.gallery import draw_planes
 from torchrg.render.page import Page, make_page
+from torchrg.result import Result, describe_planes
 from torchrg.structures import PLANE_KINDS, Cloud, Segmentation
 
 MOST_ROWS = 12
 """Planes in the table, the largest ones."""
 
 
-def as_cloud(segmentation: Segmentation) -> Cloud:
-    """Return the points of a segmentation with what was found about them as fields.
+def show(segmentation: Segmentation, **settings: Any) -> Page:  # noqa: ANN401
+    """Return the page of a segmentation; ``settings`` are those of :func:`make_page`.
 
     Raises:
         ConfigError: If it does not know its points.
     """
+    return make_page(_result_of(segmentation), **settings)
+
+
+def _result_of(segmentation: Segmentation) -> Result:
+    """Return a segmentation with its points."""
     if segmentation.points is None:
         raise ConfigError(
             "Segmentation: expected its points to show them, got none; "
             "use seg._replace(points=points)."
         )
-    points = segmentation.points.detach().reshape(-1, 3).numpy(force=True)
-    flat = segmentation._replace(
-        labels=segmentation.labels.reshape(-1),
-        normals=segmentation.normals.reshape(-1, 3),
-        curvature=segmentation.curvature.reshape(-1),
-        sharp=segmentation.sharp.reshape(-1),
-    )
-    return with_results(Cloud(points, source="segmentation"), flat)
-
-
-def show(segmentation: Segmentation, **settings: Any) -> Page:  # noqa: ANN401
-    """Return the page of a segmentation; ``settings`` are those of :func:`make_page`."""
-    return make_page(as_cloud(segmentation), **settings)
+    points = segmentation.points.numpy(force=True).reshape(-1, 3)
+    return Result.of(Cloud(points, source="segmentation"), segmentation)
 
 
 def as_html(segmentation: Segmentation) -> str:
@@ -48,29 +41,27 @@ def as_html(segmentation: Segmentation) -> str:
     if segmentation.points is not None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "planes.png"
-            draw_planes(path, as_cloud(segmentation))
+            draw_planes(path, _result_of(segmentation))
             content = base64.b64encode(path.read_bytes()).decode("ascii")
         picture = f'<img src="data:image/png;base64,{content}" style="max-width: 640px" alt="">'
-    planes = segmentation.planes
-    num_planes, labels = len(planes.count), segmentation.labels
+    planes, labels = describe_planes(segmentation.planes)["planes"], segmentation.labels
     share = 100 * float((labels >= 0).double().mean()) if labels.numel() else 0.0
-    head = f"{labels.numel():,} points, {num_planes:,} planes, {share:.1f} % of the points labelled"
-    kinds = torch.zeros_like(planes.count) if planes.kind is None else planes.kind
+    counts = f"{labels.numel():,} points, {len(planes):,} planes"
     rows = [
-        [
-            f"{number}",
-            PLANE_KINDS[int(kinds[number])],
-            f"{int(planes.count[number]):,}",
-            f"{float(planes.area[number]):.4g}",
-            f"{float(planes.rms[number]):.3g}",
-            " ".join(f"{value:.3f}" for value in planes.normal[number].tolist()),
-            f"{float(planes.offset[number]):.5g}",
-        ]
-        for number in range(min(num_planes, MOST_ROWS))
+        (
+            f"{plane['id']}",
+            plane.get("kind", PLANE_KINDS[0]),
+            f"{plane['count']:,}",
+            f"{plane['area']:.4g}",
+            f"{plane['rms']:.3g}",
+            " ".join(f"{value:.3f}" for value in plane["normal"]),
+            f"{plane['offset']:.5g}",
+        )
+        for plane in planes[:MOST_ROWS]
     ]
     names = ("plane", "kind", "points", "area", "rms", "normal", "offset")
     cells = "".join(f"<th>{name}</th>" for name in names)
     lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    more = f"<p>and {num_planes - MOST_ROWS:,} more</p>" if num_planes > MOST_ROWS else ""
+    more = f"<p>and {len(planes) - MOST_ROWS:,} more</p>" if len(planes) > MOST_ROWS else ""
     table = f"<table><tr>{cells}</tr>{lines}</table>{more}" if rows else ""
-    return f"<div><p>{head}</p>{picture}{table}</div>"
+    return f"<div><p>{counts}, {share:.1f} % of the points labelled</p>{picture}{table}</div>"

@@ -463,6 +463,9 @@ function element(tag, text, properties = {}) {
   return made;
 }
 
+// What is said of a plane in words of its own, or drawn; other columns of the table go by their names.
+const SAID = ["name", "kind", "curved", "normal", "offset", "area", "extent", "rms", "count", "rings", "meets", "sides"];
+
 function describePicked() {
   const box = $("picked");
   box.replaceChildren();
@@ -486,6 +489,9 @@ function describePicked() {
     add("extent", plane.extent.map((side) => number(side)).join(" × "));
     add("rms", number(plane.rms, 3));
     add("points", plane.count.toLocaleString("en"));
+    for (const [name, value] of Object.entries(plane)) {
+      if (!SAID.includes(name)) add(name, typeof value === "number" ? number(value) : `${value}`);
+    }
     const met = plane.meets.slice().sort((first, second) => second[2] - first[2]).slice(0, 12).map(([other, angle]) =>
       element("button", `${cloud.planes[other].name}: ${angle}°`, {
         title: `plane ${cloud.planes[other].name}, at ${angle} degrees`,

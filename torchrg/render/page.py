@@ -16,7 +16,6 @@ import math
 import os
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -35,9 +34,9 @@ from torchrg.render.content import (
     Frame,
     Shown,
     choose_points,
-    describe_planes,
     frame_of,
     outer_surfaces,
+    planes_of_page,
     rounded,
     sides_of_planes,
 )
@@ -47,6 +46,7 @@ from torchrg.render.cutaway import (
     choose_viewpoint,
 )
 from torchrg.render.grid import build_grid, surface_cells
+from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
 
 MAX_POINTS = 1_000_000
@@ -76,9 +76,9 @@ class Page(NamedTuple):
 
 
 def make_page(
-    cloud: Cloud,
+    result: Result,
     *,
-    beside: Cloud | None = None,
+    beside: Result | None = None,
     truth: Cloud | None = None,
     title: str | None = None,
     color: str | None = None,
@@ -87,15 +87,15 @@ def make_page(
     azimuth_deg: float | None = None,
     max_points: int = MAX_POINTS,
 ) -> Page:
-    """Make a page that shows a cloud, or two of them with one camera.
+    """Make a page that shows a result, or two of them with one camera.
 
-    What can be seen depends on the fields of the cloud: ``labels`` (planes, with their table),
-    ``superpoints``, ``color``, ``normals``, ``curvature``, ``sharp``. The page holds no time and
-    no path: equal input gives equal bytes.
+    What can be seen depends on the fields of its cloud: ``labels`` (planes, with the table of the
+    result), ``superpoints``, ``color``, ``normals``, ``curvature``, ``sharp``. The page holds no
+    time and no path: equal input gives equal bytes.
 
     Args:
-        cloud: What to show. Points with NaN or Inf are left out, and counted.
-        beside: Another cloud in the same coordinates, for the right half. If it has the same
+        result: What to show. Points with NaN or Inf are left out, and counted.
+        beside: Another result in the same coordinates, for the right half. If it has the same
             points, planes that are the same in both have the same colour.
         truth: A cloud of the same points, with the true ``labels`` or ``normals``, to show errors.
         title: Of the page. Default: the names of the files.
@@ -113,21 +113,22 @@ def make_page(
         ConfigError: If a setting is not as above, or the cloud lacks what the colours shall show.
         MissingDependencyError: If pydeck is not installed.
     """
+    cloud = result.cloud
     up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
     frame = frame_of(cloud, up)
-    clouds = [_with_usable_fields(each) for each in (cloud, beside) if each is not None]
-    truth = None if truth is None else _with_usable_fields(truth)
-    shown = [choose_points(each, frame, max_points) for each in clouds]
-    truths: list[Cloud | None] = [truth]
+    results = [each for each in (result, beside) if each is not None]
+    shown = [choose_points(each, frame, max_points) for each in results]
+    true_fields = {} if truth is None else Result(truth).fields
+    truths: list[Mapping[str, Tensor]] = [true_fields]
     references: list[Tensor | None] = [None]
     if beside is not None:
-        is_same = np.array_equal(cloud.coordinates, beside.coordinates, equal_nan=True)
-        truths.append(truth if is_same else None)
-        references.append(shown[0].fields.get("labels") if is_same else None)
+        same = np.array_equal(cloud.coordinates, beside.cloud.coordinates, equal_nan=True)
+        truths.append(true_fields if same else {})
+        references.append(shown[0].fields.get("labels") if same else None)
     scenes: list[dict[str, Any]] = []
     blobs: list[str] = []
-    for parts in zip(clouds, shown, truths, references, strict=True):
+    for parts in zip(results, shown, truths, references, strict=True):
         scene, blob = _describe_cloud(*parts, frame)
         scenes.append(scene)
         blobs.append(blob)
@@ -156,30 +157,6 @@ def make_page(
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)
     return Page(text, tuple(scene["shown"] for scene in scenes))
-
-
-_FIELDS = {
-    "labels": ("iu", ()),
-    "superpoints": ("iu", ()),
-    "color": ("u", (3,)),
-    "normals": ("f", (3,)),
-    "curvature": ("f", ()),
-    "sharp": ("b", ()),
-}
-"""Kinds of numbers and shapes of the fields that can be shown."""
-
-
-def _with_usable_fields(cloud: Cloud) -> Cloud:
-    """Return a cloud with those fields that are what their names say: files may hold others."""
-    fields = {
-        name: values
-        for name, values in cloud.fields.items()
-        if name in _FIELDS
-        and values.dtype.kind in _FIELDS[name][0]
-        and values.shape[1:] == _FIELDS[name][1]
-        and (name != "color" or values.dtype == np.uint8)
-    }
-    return replace(cloud, fields=fields)
 
 
 def _check_settings(
@@ -233,19 +210,20 @@ def _read_library() -> str:
 
 
 def _describe_cloud(
-    cloud: Cloud, shown: Shown, truth: Cloud | None, reference: Tensor | None, frame: Frame
+    result: Result,
+    shown: Shown,
+    truth: Mapping[str, Tensor],
+    reference: Tensor | None,
+    frame: Frame,
 ) -> tuple[dict[str, Any], str]:
-    """Return what a page says about a cloud, and the packed arrays of its points."""
-    true_fields = {
-        name: torch.from_numpy(np.ascontiguousarray(truth.fields[name][shown.rows.numpy()]))
-        for name in ("labels", "normals")
-        if truth is not None and name in truth.fields
-    }
+    """Return what a page says about a result, and the packed arrays of its points."""
+    cloud = result.cloud
+    true_fields = {name: truth[name][shown.rows] for name in ("labels", "normals") if name in truth}
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     channels = list(channels_of(shown.points, shown.fields, true_fields, reference=reference))
     surfaces = outer_surfaces(shown.points)
-    planes = describe_planes(cloud, shown, frame)
+    planes = planes_of_page(result, shown, frame)
     directions, covered = surfaces.directions, surfaces.covered
     if planes:
         labels = shown.fields["labels"]

@@ -1,0 +1,391 @@
+"""A cloud and what was found about it: what files, folders, pages and notebooks hold.
+
+:func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth`` write results, and
+:func:`read_result` reads them again. The plane table has one form in all of them, that of
+:meth:`torchrg.structures.Planes.to_arrays`; :func:`describe_planes` is the same as JSON.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg.errors import ShapeError
+from torchrg.io import read_cloud
+from torchrg.io.fields import are_whole, put_results
+from torchrg.io.npy import map_folder, read_beside
+from torchrg.metrics.contingency import number_labels
+from torchrg.neighbors import finite_rows, search_knn
+from torchrg.regions import summarize_planes
+from torchrg.regions.adjacency import find_adjacency
+from torchrg.regions.superpoints import main_planes
+from torchrg.structures import (
+    PLANE_COLUMNS,
+    UNLABELED,
+    Cloud,
+    PlaneAdjacency,
+    Planes,
+    Segmentation,
+    Superpoints,
+)
+
+PLANES_FILE, RECORD = "planes.json", "provenance.json"
+"""Table of planes, and record of how they were made, in a folder of arrays. The record is written
+last, so that a scan without it is not done."""
+_FOLDER_FIELDS = {
+    "plane": "labels",
+    "normal": "normals",
+    "curvature": "curvature",
+    "color": "color",
+    "superpoint": "superpoints",
+}
+"""Fields of a cloud by the arrays of a folder that hold them."""
+_KINDS = {
+    "labels": ("iu", ()),
+    "superpoints": ("iu", ()),
+    "color": ("u", (3,)),
+    "normals": ("f", (3,)),
+    "curvature": ("f", ()),
+    "sharp": ("b", ()),
+    "valid": ("b", ()),
+}
+"""NumPy's kinds of numbers of a field, and shape of a row."""
+_FOUND = ("labels", "normals", "curvature", "sharp", "valid")
+"""What a segmentation says of each point."""
+_MOST_SEARCHED = 100_000
+"""Points of a random sample that tell which planes meet where no result says it."""
+_NEIGHBORS = 50
+"""As many neighbours as normals are estimated from by default: of a cloud that is not sampled the
+same planes meet as in its result."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A cloud, what was found about each of its points, and the table of its planes.
+
+    Args:
+        cloud: The points. Among its fields are those of the result, as far as they are known:
+            ``labels``, ``normals``, ``curvature``, the masks ``sharp`` and ``valid``, and
+            ``superpoints``, with coarser levels as ``superpoints_1`` and so on.
+        table: The plane table that came with them, about :attr:`Cloud.origin`; its rows are the
+            labels, ascending. Default: there is none.
+        plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
+        provenance: How the result was made.
+
+    Example:
+        >>> points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [5, 5, 5]])
+        >>> labelled = Cloud(points, {"labels": np.array([7, 7, 7, 7, -1])})
+        >>> result = Result(labelled)
+        >>> result.names.tolist(), result.planes.offset.tolist(), result.planes.count.tolist()
+        ([7], [2.0], [4])
+    """
+
+    cloud: Cloud
+    table: Planes | None = None
+    plane_of_superpoint: Tensor | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, cloud: Cloud, segmentation: Segmentation, superpoints: Superpoints | None = None
+    ) -> "Result":
+        """Return the result of segmenting a cloud, or a depth image whose pixels are its points.
+
+        Own fields of the cloud whose names it takes are put aside, as in files.
+
+        Raises:
+            ShapeError: If the segmentation is not of its points.
+        """
+        if segmentation.labels.numel() != len(cloud):
+            raise ShapeError(
+                f"Result: expected a segmentation of {len(cloud):,} points, got "
+                f"{segmentation.labels.numel():,}; pass the points that were segmented."
+            )
+        found = {
+            name: getattr(segmentation, name)
+            .numpy(force=True)
+            .reshape(len(cloud), *_KINDS[name][1])
+            for name in _FOUND
+        }
+        if superpoints is not None:
+            found |= superpoints.by_level()
+        labelled = replace(cloud, fields=put_results(cloud.fields, found))
+        plane_of_superpoint = None if superpoints is None else superpoints.plane
+        return cls(labelled, segmentation.planes, plane_of_superpoint)
+
+    @cached_property
+    def fields(self) -> dict[str, Tensor]:
+        """Fields of the cloud that are what their names say: files from elsewhere may hold others.
+
+        Those of a result, and ``color`` as uint8.
+        """
+        return {
+            name: torch.from_numpy(np.ascontiguousarray(values))
+            for name, (kinds, shape) in _KINDS.items()
+            if (values := self.cloud.fields.get(name)) is not None
+            and values.dtype.kind in kinds
+            and values.shape[1:] == shape
+            and (name != "color" or values.dtype == np.uint8)
+        }
+
+    @cached_property
+    def _numbering(self) -> tuple[Tensor, Tensor]:
+        """Label of each plane, and the plane of each point."""
+        labels = self.fields.get("labels", torch.full((len(self.cloud),), UNLABELED)).long()
+        if self.table is not None:
+            return torch.arange(len(self.table.count)), labels
+        known = torch.from_numpy(self.cloud.finite) & (labels >= 0)
+        return number_labels(torch.where(known, labels, UNLABELED))
+
+    @property
+    def names(self) -> Tensor:
+        """Label of each row of :attr:`planes`, ascending, shape ``(M,)``, int64."""
+        return self._numbering[0]
+
+    @property
+    def labels(self) -> Tensor:
+        """Row of :attr:`planes` that each point is on, or -1, shape ``(N,)``, int64.
+
+        These are the labels of torchrg's own results; labels from elsewhere may have gaps.
+        """
+        return self._numbering[1]
+
+    @cached_property
+    def planes(self) -> Planes | None:
+        """The plane table; None without labels.
+
+        Of a result it is :attr:`table`. What that lacks, for labels from elsewhere all of it, for
+        images which planes meet, is found once, from the labels.
+        """
+        table = self.table
+        if "labels" not in self.fields or (table is not None and table.adjacency is not None):
+            return table
+        rows = finite_rows(self.cloud.points)
+        some = torch.from_numpy(np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED])
+        some = rows[some.sort().values]
+        points, (present, labels) = self.cloud.points[some], number_labels(self.labels[some])
+        neighbors = None
+        if len(present):
+            neighbors = search_knn(points, min(_NEIGHBORS, len(some)), canonical=True)
+        if table is None:
+            has_normals = "normals" in self.fields
+            cloud = (self.cloud.points, self._normals, self.labels)
+            whole = neighbors if has_normals and len(some) == len(rows) else None
+            table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
+            table = table._replace(curved=table.curved & has_normals)
+        if neighbors is None or table.adjacency is not None:
+            return table
+        normal, rms = (column[present].double() for column in (table.normal, table.rms))
+        curved, dtype = table.curved[present], table.rms.dtype
+        met = find_adjacency(points, labels, neighbors, normal, rms, curved=curved)
+        sizes = (size.to(dtype) for size in (met.boundary_length, met.dihedral_deg))
+        return table._replace(adjacency=PlaneAdjacency(present[met.pairs], *sizes))
+
+    @property
+    def _normals(self) -> Tensor:
+        """Normals in the dtype of the points, zero where there are none."""
+        points = self.cloud.points
+        normals = self.fields.get("normals", torch.zeros_like(points))
+        return normals.to(points.dtype).nan_to_num(0, 0, 0)
+
+    @property
+    def segmentation(self) -> Segmentation | None:
+        """What :func:`torchrg.segment_planes` said about ``cloud.points``; None without labels.
+
+        What a file does not hold is zero or False; points with a normal are ``valid``.
+        """
+        planes = self.table or self.planes
+        if planes is None:
+            return None
+        points, normals = self.cloud.points, self.fields.get("normals", self._normals)
+        has_normal = torch.from_numpy(self.cloud.finite) & (normals != 0).any(dim=1)
+        return Segmentation(
+            self.labels,
+            normals,
+            self.fields.get("curvature", torch.zeros(len(points))),
+            self.fields.get("sharp", torch.zeros_like(has_normal)),
+            self.fields.get("valid", has_normal),
+            planes,
+            points,
+        )
+
+    @property
+    def superpoints(self) -> Superpoints | None:
+        """What :func:`torchrg.make_superpoints` said about them; None where it was not asked."""
+        if "superpoints" not in self.fields:
+            return None
+        fields, labels = self.cloud.fields, self.fields["superpoints"].long()
+        coarser = (f"superpoints_{i}" for i in range(1, len(fields)))
+        levels = (torch.from_numpy(fields[name]).long() for name in coarser if name in fields)
+        plane = self.plane_of_superpoint
+        plane = main_planes(labels, self.labels) if plane is None else plane
+        return Superpoints(labels, plane, tuple(levels))
+
+
+def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
+    """Read what ``segment``, ``depth`` or ``convert`` wrote, or any other cloud.
+
+    Args:
+        path: A file, or a folder of ``torchrg convert`` or in Pointcept's layout.
+        columns: As of :func:`torchrg.read_cloud`.
+
+    Returns:
+        The cloud and what is known about it: ``.npz`` files hold all of a result, folders all but
+        the masks, other files what :func:`torchrg.write_cloud` puts beside each point. A plane
+        table that is not of the labels, as somebody changed them since, is left out, and
+        :attr:`Cloud.notes` says so.
+
+    Raises:
+        FormatError: If there is no such file, or it is damaged; see :func:`torchrg.read_cloud`.
+        MissingDependencyError: If the format needs an optional package.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrg import segment_planes, write_cloud
+        >>> cloud = Cloud(torch.cartesian_prod(*[torch.arange(9.0)] * 2, torch.ones(1)).numpy())
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_cloud(f"{folder}/plane.npz", cloud, segment_planes(cloud.points))
+        ...     result = read_result(f"{folder}/plane.npz")
+        >>> result.planes.count.tolist(), result.segmentation.labels.unique().tolist()
+        ([81], [0])
+    """
+    source = Path(path)
+    if source.is_dir():
+        cloud, beside = _read_folder(source)
+    else:
+        cloud = read_cloud(source, columns=columns)
+        # Text has one kind of numbers for all.
+        whole = {
+            name: values.astype(np.int64)
+            for name, values in cloud.fields.items()
+            if name.startswith("superpoints") and values.dtype.kind == "f" and are_whole(values)
+        }
+        cloud = replace(cloud, fields={**cloud.fields, **whole})
+        beside = read_beside(source) if source.suffix.lower() == ".npz" else {}
+    planes = beside.get("plane_of_superpoint", np.zeros(()))
+    result = Result(
+        cloud,
+        plane_of_superpoint=torch.from_numpy(planes) if planes.dtype == np.int64 else None,
+        provenance=_record(str(beside.get("provenance", ""))),
+    )
+    if "plane_count" not in beside:
+        return result
+    try:
+        normals = result.fields.get("normals", cloud.points)
+        table = Planes.from_arrays(beside, cloud.origin, normals.dtype)
+        sizes = torch.bincount(result.labels + 1, minlength=1)[1:]
+        named = torch.equal(result.names, torch.arange(len(sizes)))
+        if named and torch.equal(sizes, table.count):
+            return replace(result, table=table)
+    except (LookupError, ValueError, TypeError):
+        # A table of an older version, or of another program that has arrays of these names.
+        pass
+    note = "its table of planes left out, as it is not that of its labels"
+    return replace(result, cloud=replace(cloud, notes=(*cloud.notes, note)))
+
+
+def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
+    """Return the cloud of a folder of arrays, and what is beside them as ``.npz`` would hold it."""
+    arrays = map_folder(folder, ("coord", *_FOLDER_FIELDS))
+    fields = {
+        _FOLDER_FIELDS[name]: values.reshape(-1, *_KINDS[_FOLDER_FIELDS[name]][1])
+        for name, values in arrays.items()
+        if name in _FOLDER_FIELDS
+    }
+    for name in fields.keys() & {"labels", "superpoints"}:
+        fields[name] = fields[name].astype(np.int64)
+    coord = arrays["coord"]
+    grid = coord.shape[:2] if coord.ndim == 3 else None
+    cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder))
+    beside: dict[str, NDArray[Any]] = {}
+    if (folder / RECORD).is_file():
+        beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
+    if (folder / PLANES_FILE).is_file():
+        try:
+            text = (folder / PLANES_FILE).read_text(encoding="utf-8")
+            beside |= _arrays_of(json.loads(text))
+        except (LookupError, ValueError, TypeError, AttributeError):
+            beside["plane_count"] = np.zeros(0)
+    return cloud, beside
+
+
+def _record(text: str) -> dict[str, Any]:
+    """Return the record that a text holds, empty if it holds none."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
+    """Return a plane table as JSON can hold it.
+
+    Args:
+        planes: The table.
+        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
+            Default: they are the same.
+
+    Returns:
+        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
+        :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
+        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
+
+    Example:
+        >>> from torchrg.pipeline import segment_planes
+        >>> grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
+        >>> plane = describe_planes(segment_planes(grid).planes, origin=[0, 0, 5])["planes"][0]
+        >>> plane["count"], plane["normal"], plane["offset"]
+        (81, [0.0, 0.0, 1.0], 6.0)
+    """
+    arrays = planes.to_arrays(np.array([0.0] * 3 if origin is None else origin, dtype=np.float64))
+    columns = {"id": [*range(len(planes.count))]} | _lists(arrays, "plane_")
+    if planes.outline is not None:
+        ends = arrays["outline_ring_sizes"].cumsum()[:-1]
+        rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
+        columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
+    table: dict[str, Any] = {"planes": _rows(columns)}
+    if planes.adjacency is not None:
+        pairs = _lists(arrays, "adjacency_")
+        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
+    return table
+
+
+def _lists(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, list[Any]]:
+    """Return the arrays with a prefix as lists, by their names without it."""
+    return {n.removeprefix(prefix): v.tolist() for n, v in arrays.items() if n.startswith(prefix)}
+
+
+def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Turn a table of columns into a list of rows."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _arrays_of(described: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Return what :func:`describe_planes` described as the arrays of ``Planes.to_arrays``."""
+    rows, pairs = described["planes"], described.get("adjacency")
+    arrays = {
+        f"plane_{name}": np.array([row[name] for row in rows], dtype).reshape(len(rows), *shape)
+        for name, (dtype, shape) in PLANE_COLUMNS.items()
+    }
+    if rows and "kind" in rows[0]:
+        arrays["plane_kind"] = np.array([row["kind"] for row in rows])
+    if rows and "outline" in rows[0]:
+        rings = [(row["id"], ring) for row in rows for ring in row["outline"]]
+        arrays["outline_points"] = np.array([p for _, ring in rings for p in ring]).reshape(-1, 3)
+        arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], np.int64)
+        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], np.int64)
+    if pairs is not None:
+        ends = np.array([pair["pair"] for pair in pairs], np.int64).reshape(-1, 2)
+        arrays["adjacency_pairs"] = ends
+        for name in PlaneAdjacency._fields[1:]:
+            arrays[f"adjacency_{name}"] = np.array([pair[name] for pair in pairs], np.float64)
+    return arrays
