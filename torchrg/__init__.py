@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from torchrg.regions import align_axes, grow_regions
     from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud
-    from torchrg.tiling import segment_tiles
 else:
     _MODULES = {
         "UNLABELED": "structures",
@@ -32,7 +31,6 @@ else:
         "read_result": "result",
         "search_knn": "neighbors",
         "segment_planes": "pipeline",
-        "segment_tiles": "tiling",
         "write_cloud": "io",
     }
 
@@ -86,7 +84,6 @@ __all__ = [
     "scenes",
     "search_knn",
     "segment_planes",
-    "segment_tiles",
     "transforms",
     "write_cloud",
 ]

@@ -1,111 +1,211 @@
-"""From points to planes, and to superpoints: each in one function."""
+"""From points to planes, and to superpoints: each in one function.
 
-from collections.abc import Callable
+The steps of :func:`segment_planes` read arrays by name from a store and write their own. Some work
+on a block of rows, with the points around it that decide what is found there: as many steps from
+neighbour to neighbour away as is said beside the functions that they call. In memory the block is
+the cloud; in a folder it is a tile.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import tiles
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import sequential_operations
+from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import PipelineConfig, SuperpointsConfig, load_config
-from torchrg.errors import ShapeError
-from torchrg.neighbors import finite_rows, restore_rows, search_knn
-from torchrg.normals import ESTIMATORS
-from torchrg.regions import grow_regions, partition_points, summarize_planes
-from torchrg.structures import UNLABELED, Neighbors, Segmentation, Superpoints
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.neighbors import (
+    canonical_order,
+    finite_rows,
+    restore_points,
+    restore_rows,
+    sample_voxels,
+    search_knn,
+)
+from torchrg.neighbors.tiles import Part, cut_part
+from torchrg.normals import ESTIMATORS, STEPS
+from torchrg.regions import partition_points, summarize_planes
+from torchrg.regions.edges import EDGE_STEPS, GrowingCloud
+from torchrg.regions.growth import (
+    GrowthOrder,
+    by_column,
+    checked_cloud,
+    find_growth_edges,
+    grow_along,
+    growth_order,
+    label_regions,
+)
+from torchrg.store import FolderStore
+from torchrg.structures import (
+    UNLABELED,
+    Cloud,
+    Neighbors,
+    PlaneAdjacency,
+    Segmentation,
+    Superpoints,
+)
 
 BYTES_PER_POINT = 1_100
 """Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
 that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
 
+_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
+
+
+class MemoryStore:
+    """The arrays of one run in memory, as they were given: on any device, of any dtype."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, Any] = {}
+
+    def note(self, step: str, **found: Any) -> None:  # noqa: ANN401
+        """Keep what a step has found."""
+        self._values[f"{step} found"] = found
+
+    def known(self, step: str) -> dict[str, Any]:
+        """Return what a step that is done found."""
+        found: dict[str, Any] = self._values[f"{step} found"]
+        return found
+
+    def write(self, name: str, start: int, values: Any) -> None:  # noqa: ANN401
+        """Keep the rows of an array, which are all."""
+        self._values[name] = values
+
+    def save(self, name: str, values: Any) -> None:  # noqa: ANN401
+        """Keep a whole array."""
+        self._values[name] = values
+
+    def get(self, name: str) -> Any:  # noqa: ANN401
+        """Return an array."""
+        return self._values[name]
+
+    lazy = map = load_planes = get
+
+    save_planes = save
+
+    def save_points(self, points: Tensor | Iterable[Cloud]) -> None:
+        """Keep points, those of chunks about the origin that the whole cloud has."""
+        if not isinstance(points, Tensor):
+            chunks = [chunk.coordinates for chunk in points] or [np.empty((0, 3), np.float32)]
+            points = Cloud(np.concatenate(chunks)).points
+        self._values["points"] = points
+
+    def remove(self, *names: str) -> None:
+        """Forget arrays that no other step reads."""
+        for name in names:
+            del self._values[name]
+
+
+Store = MemoryStore | FolderStore
+"""Where the arrays of a run are."""
+
 
 @sequential_operations()
 def segment_planes(
-    points: Tensor | NDArray[np.floating],
+    points: Tensor | NDArray[np.floating] | Iterable[Cloud],
     config: PipelineConfig | None = None,
     *,
+    voxel: float | None = None,
+    store: Store | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> Segmentation:
     """Segment a cloud into planes: neighbours, normals, regions, plane table.
 
+    A cloud that does not fit into memory is segmented tile by tile, with its arrays in files of a
+    :class:`torchrg.store.FolderStore`. Neighbours and edges, by far the most, stay on disk; the
+    rest takes about 100 bytes of memory a point, and each tile 2 kB a point of its own. Called
+    again with the same folder it goes on from the last tile that was done, however the last call
+    ended, be it with the power: what the disk has lost is made again.
+
     Convention:
-        The result does not depend on the order of the points, on chunk size, or on the number of
-        threads; only exact duplicates may swap. Lengths are in the unit of the cloud.
+        The result does not depend on the order of the points, on chunk size, on the number of
+        threads or on the size of tiles; only exact duplicates may swap. Lengths are in the unit of
+        the cloud.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64. Clouds far from the origin should be
-            float64, or moved to it first, as :func:`torchrg.read_cloud` does.
+            float64, or moved to it first, as :func:`torchrg.read_cloud` does. Or a cloud in chunks,
+            which stands for the ``Cloud.points`` of the whole, and is read only if the store does
+            not have them.
         config: Settings. Default: the preset ``consensus``.
+        voxel: Side of voxels, in the unit of the cloud: one point of each is segmented, and every
+            point has the result of its voxel. Sizes of regions are counted in voxels then; planes
+            are described from all points and numbered by their number, and which of them meet is
+            found on the voxels. Default: all points are segmented.
+        store: Where arrays are kept: a new :class:`MemoryStore` by default.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
 
     Returns:
         Labels, normals, curvature and masks in the order of the points, and the table of planes. A
         point with NaN or Inf is not ``valid``: label :data:`torchrg.UNLABELED`, normal zero. A
         cloud with fewer points than ``k`` uses those it has; fewer than three points give no plane.
+        From a folder the tensors are maps of files: slices of rows are read when they are used.
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
+        ConfigError: If ``voxel`` is not positive, or the settings ask for ``adaptive_k``, which
+            looks at the whole cloud, in tiles.
+        FormatError: If the folder holds the work of another run or something else, or the disk is
+            full.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
         >>> seg = segment_planes(grid, load_config("classic"))
         >>> seg.planes.count.tolist(), seg.planes.normal.abs().tolist()
         ([400], [[0.0, 0.0, 1.0]])
+        >>> segment_planes(grid, load_config("classic"), voxel=2.0).planes.count.tolist()
+        [400]
+        >>> import tempfile
+        >>> from torchrg.store import FolderStore
+        >>> chunks = (Cloud(some.numpy()) for some in grid.split(150))
+        >>> with tempfile.TemporaryDirectory() as work:
+        ...     store = FolderStore(work, tile_size=100)
+        ...     segment_planes(chunks, load_config("classic"), store=store).planes.count.tolist()
+        [400]
     """
-    tensor = as_tensor("segment_planes", "points", points)
-    check_shapes("segment_planes", points=(tensor, "N 3"))
-    check_floating("segment_planes", points=tensor)
+    if isinstance(points, Tensor | np.ndarray):
+        points = as_tensor("segment_planes", "points", points)
+        check_shapes("segment_planes", points=(points, "N 3"))
+        check_floating("segment_planes", points=points)
     config = load_config() if config is None else config
+    store = MemoryStore() if store is None else store
     begin = on_stage or (lambda stage: None)
+    _begin(store, config, voxel)
+
+    def whole(step: str, work: Callable[[], None]) -> None:
+        _run_once(store, step, work)
+
+    def in_blocks(step: str, work: Callable[..., None]) -> None:
+        if isinstance(store, FolderStore):
+            tiles.run_tiles(store, step, work, config)
+        else:
+            work(store, slice(*store.known("order")["bounds"]), 0, config)
 
     begin("neighbors")
-    rows = finite_rows(tensor)
-    cloud = tensor[rows]
-    if len(cloud) == 0:
-        neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=cloud.device))
-    else:
-        neighbors = search_knn(cloud, min(config.normals.k, len(cloud)), canonical=True)
+    whole("points", lambda: store.save_points(points))
+    whole("order", lambda: sort_points(store, config, voxel))
+    in_blocks("neighbors", search_neighbors)
 
     begin("normals")
-    estimate = ESTIMATORS[config.normals.method]
-    fit = estimate(cloud, neighbors, config.normals, config.chunk_size)
+    in_blocks("normals", estimate_normals)
 
     begin("regions")
-    labels = grow_regions(
-        cloud,
-        fit.normals,
-        fit.curvature,
-        neighbors,
-        config.growing,
-        valid=fit.valid,
-        residual_rms=fit.residual_rms,
-        canonical=True,
-        chunk_size=config.chunk_size,
-    )
+    whole("curvature", lambda: sort_by_curvature(store, config))
+    in_blocks("edges", find_edges)
+    whole("growth", lambda: grow_regions(store, config))
+    whole("regions", lambda: finish_regions(store, config))
 
     begin("planes")
-    planes = summarize_planes(
-        cloud,
-        fit.normals,
-        labels,
-        neighbors=neighbors,
-        up=config.planes.up,
-        outline=config.planes.outline,
-    )
+    whole("planes", lambda: tabulate_planes(store, config))
+    whole("results", lambda: restore_results(store, config, voxel))
     begin("done")
-    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    num_points = len(tensor)
-    return Segmentation(
-        restore_rows(labels, rows, num_points, fill=UNLABELED),
-        restore_rows(fit.normals, rows, num_points),
-        restore_rows(fit.curvature, rows, num_points),
-        restore_rows(sharp, rows, num_points),
-        restore_rows(fit.valid, rows, num_points),
-        planes,
-        tensor,
-    )
+    return load_results(store, voxel)
 
 
 @sequential_operations()
@@ -115,6 +215,7 @@ def make_superpoints(
     config: SuperpointsConfig | None = None,
     *,
     colors: Tensor | NDArray[np.generic] | None = None,
+    voxel: float | None = None,
 ) -> Superpoints:
     """Partition a cloud into superpoints: every finite point in exactly one, in nested levels.
 
@@ -137,6 +238,9 @@ def make_superpoints(
         config: Settings.
         colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
             [0, 1]. Default: they play no part.
+        voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
+            partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
+            voxels then, and superpoints numbered by their number. Default: all points are.
 
     Returns:
         The partition of the first strength, and those of the others. A superpoint smaller than
@@ -161,11 +265,235 @@ def make_superpoints(
     check_floating("make_superpoints", points=tensor)
     shades = None if colors is None else as_tensor("make_superpoints", "colors", colors)
     check_shapes("make_superpoints", points=(tensor, "N 3"), colors=(shades, "N 3"))
-    seg = segment_planes(tensor) if seg is None else seg
+    seg = segment_planes(tensor, voxel=voxel) if seg is None else seg
     if len(seg.labels) != len(tensor):
         raise ShapeError(
             f"make_superpoints: expected seg of {len(tensor):,} points, got {len(seg.labels):,}; "
             "pass the segmentation of these points."
         )
     config = SuperpointsConfig() if config is None else config
-    return partition_points(tensor, seg.normals, seg.labels, config, shades)
+    if voxel is None:
+        return partition_points(tensor, seg.normals, seg.labels, config, shades)
+    rows, inverse = sample_voxels(tensor, voxel)
+    shades = None if shades is None else shades[rows]
+    found = partition_points(tensor[rows], seg.normals[rows], seg.labels[rows], config, shades)
+    labels, *levels = (
+        restore_points(level, inverse, fill=UNLABELED) for level in (found.labels, *found.levels)
+    )
+    return Superpoints(labels, found.plane, tuple(levels))
+
+
+def _begin(store: Store, config: PipelineConfig, voxel: float | None) -> None:
+    """Tell a store what decides the result."""
+    if isinstance(store, MemoryStore):
+        return
+    if config.normals.adaptive_k is not None:
+        raise ConfigError(
+            "segment_planes: expected normals.adaptive_k of none, got "
+            f"{config.normals.adaptive_k}: in tiles k is known before the noise of the whole cloud "
+            "is; choose k, or give the cloud memory."
+        )
+    settings = dataclasses.asdict(config)
+    del settings["chunk_size"]
+    store.begin(config=settings, voxel=voxel)
+
+
+def _run_once(store: Store, name: str, step: Callable[[], None]) -> None:
+    """Run a stage on the whole cloud unless it is done."""
+    if isinstance(store, FolderStore):
+        store.on_progress(name, 0, 1)
+        if store.is_done(name):
+            return
+        # Beside the arrays of the whole cloud, what tiles have freed would be too much.
+        return_freed_memory()
+    step()
+
+
+def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> None:
+    """Sort the finite points, or those that stand for voxels, and choose the blocks of rows."""
+    points = store.get("points")
+    if voxel is None:
+        rows = finite_rows(points)
+    else:
+        voxels = sample_voxels(points, voxel)
+        order = canonical_order(points[voxels.rows])
+        rows = voxels.rows[order]
+        places = torch.cat([order.argsort(), order.new_tensor([UNLABELED])])
+        store.save("inverse", places[voxels.inverse])
+    num_points, k = len(rows), max(min(config.normals.k, len(rows)), 1)
+    bounds = [0, num_points]
+    if isinstance(store, FolderStore):
+        bounds = tiles.choose_tiles(store, points[rows].numpy(), k, config)
+    store.save("rows", rows)
+    store.save("cloud", points[rows])
+    store.note("order", num_points=num_points, k=k, bounds=bounds)
+
+
+def search_neighbors(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
+    """Search the nearest neighbours of the points of a block."""
+    if isinstance(store, FolderStore):
+        tiles.search_neighbors(store, block)
+        return
+    points = store.get("cloud")
+    found = torch.empty(0, 1, dtype=torch.int32, device=points.device)
+    if len(points):
+        found = search_knn(points, store.known("order")["k"], canonical=True).indices
+    store.write("neighbors", block.start, found)
+
+
+def _around(store: Store, block: slice, steps: int) -> Part:
+    """Return a block with all points that so many steps from neighbour to neighbour lead to."""
+    if isinstance(store, FolderStore):
+        return cut_part(store.lazy("neighbors"), block, steps)
+    return Part(block, block, Neighbors(store.get("neighbors")))
+
+
+def estimate_normals(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
+    """Estimate normals and curvature of the points of a block."""
+    method = config.normals.method
+    part = _around(store, block, STEPS[method])
+    points = store.lazy("cloud")[part.rows]
+    fit = ESTIMATORS[method](points, part.neighbors, config.normals, config.chunk_size)
+    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
+    for name, values in zip(tiles.FIT, (*fit[:4], sharp), strict=True):
+        store.write(name, block.start, values[part.own])
+
+
+def _growing_points(store: Store) -> Tensor:
+    """Return which points may join a region."""
+    finite = store.get("curvature").isfinite() & store.get("normals").isfinite().all(dim=1)
+    return finite & store.get("valid")
+
+
+def sort_by_curvature(store: Store, config: PipelineConfig) -> None:
+    """Sort the points by curvature, and find its limit: of the whole cloud."""
+    order = growth_order(store.get("curvature"), _growing_points(store), config.growing)
+    store.save("seeds", order.rows)
+    store.note("curvature", limit=float(order.limit), num_seeds=order.num_seeds)
+
+
+def _order(store: Store) -> GrowthOrder:
+    """Return in which order regions begin."""
+    found, curvature = store.known("curvature"), store.lazy("curvature")
+    limit = torch.tensor(found["limit"], dtype=curvature.dtype, device=curvature.device)
+    return GrowthOrder(np.asarray(store.get("seeds")), found["num_seeds"], limit)
+
+
+def find_edges(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
+    """Find the edges that regions grow along from the points of a block."""
+    part = _around(store, block, EDGE_STEPS)
+    points, normals, curvature, valid, residual_rms = (
+        store.lazy(name)[part.rows]
+        for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
+    )
+    cloud = checked_cloud(
+        config.growing, points, normals, curvature, part.neighbors, valid, residual_rms
+    )
+    if cloud.reach is not None:
+        store.write("reach", block.start, cloud.reach[part.own])
+    found = find_growth_edges(
+        cloud,
+        config.growing,
+        _order(store),
+        chunk_size=config.chunk_size,
+        whole=isinstance(store, MemoryStore),
+    )
+    if isinstance(store, FolderStore):
+        tiles.keep_edges(store, found, part, block, number)
+    else:
+        store.save("edges", found)
+
+
+def grow_regions(store: Store, config: PipelineConfig) -> None:
+    """Grow the regions of the whole cloud along the edges of its points."""
+    order = _order(store)
+    if isinstance(store, FolderStore):
+        roots = tiles.grow_on_disk(store, order, config)
+    else:
+        lists = store.get("neighbors").cpu().numpy()
+        roots = grow_along(store.get("edges"), order, lists, config.growing)
+    store.save("roots", torch.from_numpy(roots).to(store.lazy("curvature").device))
+    store.remove("edges")
+    store.note("growth")
+
+
+def finish_regions(store: Store, config: PipelineConfig) -> None:
+    """Label the points of the regions that have grown."""
+    cloud = GrowingCloud(
+        by_column(store.get("cloud")),
+        by_column(store.get("normals")),
+        store.get("curvature"),
+        Neighbors(store.lazy("neighbors")),
+        _growing_points(store),
+        reach=None if config.growing.plane_reach is None else store.get("reach"),
+    )
+    labels = label_regions(cloud, store.get("roots"), config.growing, config.chunk_size)
+    store.save("labels", labels)
+    store.note("regions")
+
+
+def tabulate_planes(store: Store, config: PipelineConfig) -> None:
+    """Write the table of planes."""
+    planes = summarize_planes(
+        store.get("cloud"),
+        store.get("normals"),
+        store.get("labels"),
+        neighbors=Neighbors(store.lazy("neighbors")),
+        up=config.planes.up,
+        outline=config.planes.outline,
+    )
+    store.save_planes("planes", planes)
+    store.note("planes")
+
+
+def restore_results(store: Store, config: PipelineConfig, voxel: float | None) -> None:
+    """Write what was found about each point in the order of the input; for voxels, of all points.
+
+    The planes of voxels are described from all points then, and numbered by their number.
+    """
+    num_points, rows = len(store.lazy("points")), store.get("rows")
+    for name in _RESULTS:
+        values, fill = store.get(name), UNLABELED if name == "labels" else 0
+        if voxel is None:
+            values = restore_rows(values, rows, num_points, fill=fill)
+        else:
+            values = restore_points(values, store.get("inverse"), fill=fill)
+        store.save(f"result_{name}", values)
+    if voxel is not None:
+        _describe_all_points(store, config)
+    store.note("results")
+
+
+def _describe_all_points(store: Store, config: PipelineConfig) -> None:
+    """Number the planes of voxels by their numbers of points, and describe them from all these."""
+    found = store.load_planes("planes")
+    labels = store.get("result_labels")
+    counts = torch.bincount(labels + 1, minlength=len(found.count) + 1)[1:]
+    place = counts.argsort(descending=True, stable=True).argsort()
+    labels = torch.cat([place, place.new_tensor([UNLABELED])])[labels]
+    store.save("result_labels", labels)
+    points = store.get("points")
+    rows = finite_rows(points)
+    planes = summarize_planes(
+        *(values[rows] for values in (points, store.get("result_normals"), labels)),
+        up=config.planes.up,
+        outline=config.planes.outline,
+    )
+    adjacency = _renumbered(found.adjacency, place)
+    store.save_planes("result_planes", planes._replace(adjacency=adjacency))
+
+
+def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:
+    """Return which planes meet after the planes were given other numbers."""
+    if adjacency is None:
+        return None
+    pairs = place[adjacency.pairs].sort(dim=-1).values
+    order = (pairs[:, 0] * len(place) + pairs[:, 1]).argsort()
+    return PlaneAdjacency(*(part[order] for part in (pairs, *adjacency[1:])))
+
+
+def load_results(store: Store, voxel: float | None) -> Segmentation:
+    """Return what was found; from a folder maps of files, of which rows are read when used."""
+    planes = store.load_planes("planes" if voxel is None else "result_planes")
+    results = {name: store.map(f"result_{name}") for name in _RESULTS}
+    return Segmentation(**results, planes=planes, points=store.map("points"))

@@ -29,10 +29,8 @@ from tests.made import in_pieces, make_kinect_room, objects_of, on_voxels, scan_
 from torchrg import make_superpoints, read_cloud, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.metrics import score_partition
-from torchrg.neighbors import sample_voxels
 from torchrg.scenes import RoomLayout, Scene, build_room, make_room
 from torchrg.structures import UNLABELED
-from torchrg.transforms import partition_voxels, segment_voxels
 
 VOXEL = 0.03
 """Side of voxels, metres."""
@@ -164,11 +162,8 @@ def _run_ours(points: Tensor, voxel: float | None) -> tuple[list[Tensor], list[f
     """Return partitions for all strengths, and the seconds that they took together."""
     config = SuperpointsConfig(strengths=STRENGTHS)
     begin = time.perf_counter()
-    if voxel is None:
-        found = make_superpoints(points, segment_planes(points), config)
-    else:
-        voxels = sample_voxels(points, voxel)
-        found = partition_voxels(points, voxels, segment_voxels(points, voxels), config)
+    seg = segment_planes(points, voxel=voxel)
+    found = make_superpoints(points, seg, config, voxel=voxel)
     return [found.labels, *found.levels], [time.perf_counter() - begin]
 
 

@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from torchrg.config import load_config
+from torchrg.pipeline import segment_planes
+from torchrg.store import FolderStore
 from torchrg.structures import Cloud
-from torchrg.tiling import TileFiles, TileTask, segment_tiles
+from torchrg.tiles import TileTask
 
 
 def main(path, folder, writes):
     """Segment, and note each tile that is done in a log beside the folder."""
-    write, run, left = TileFiles.write, TileTask.run, [writes]
+    write, run, left = FolderStore.write, TileTask.run, [writes]
 
     def counted_write(files, *given):
         left[0] -= 1
@@ -31,9 +33,11 @@ def main(path, folder, writes):
             log.write(f"{task.name}\n")
         return written
 
-    TileFiles.write, TileTask.run = counted_write, noted_run
+    FolderStore.write, TileTask.run = counted_write, noted_run
     points = np.load(path)
-    seg = segment_tiles([Cloud(points)], folder, load_config("classic"), tile_size=600)
+    seg = segment_planes(
+        [Cloud(points)], load_config("classic"), store=FolderStore(folder, tile_size=600)
+    )
     np.savez(f"{folder}.npz", labels=seg.labels, normals=seg.normals, area=seg.planes.area)
 
 

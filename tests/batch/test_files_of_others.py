@@ -23,7 +23,7 @@ POINTS = make_room(num_points=900, noise=0.003, seed=1).points.numpy()
 NAMES = (
     *("tiles.json", ".torchrg.lock", "points.npy", "coordinates.raw", "rows.npy", "cloud.npy"),
     *("boxes_low.npy", "neighbors.npy", "normals.npy", "edges_0.npy", "edges_2.npy", "edges.npy"),
-    *("heads.npy", "labels.npy", "planes.pt", "result_labels.npy", "result_normals.npy"),
+    *("roots.npy", "labels.npy", "planes.pt", "result_labels.npy", "result_normals.npy"),
     *(".tiles.0123abcd.json", ".result.0123456789abcdef01234567.npz", ".result.0123abcd.npz"),
     *("model.pt", "sensor.raw", "notes.txt", "features.npy", "edges_9.npy", "result_color.npy"),
     *(".x.01234567.npy", ".coordinates.raw.swp", ".result.npz.tiles"),

@@ -27,20 +27,21 @@ from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 points = make_room(num_points, noise=0.003, seed=0).points
 config = load_config(preset)
+from torchrg.pipeline import segment_planes
 if what == "scan":
-    from torchrg.pipeline import segment_planes
     reset_peak_memory()
     segment_planes(points, config)
     print(peak_memory())
     sys.exit()
-from torchrg.tiling import segment_tiles
+from torchrg.store import FolderStore
 peaks, stages = {}, ["points"]
 def note(stage, done, of):
     peaks[stages[-1]] = max(peaks.get(stages[-1], 0), peak_memory())
     stages.append(stage)
     reset_peak_memory()
 reset_peak_memory()
-segment_tiles([Cloud(points.numpy())], folder, config, tile_size=num_points // 2, on_stage=note)
+store = FolderStore(folder, tile_size=num_points // 2, on_progress=note)
+segment_planes([Cloud(points.numpy())], config, store=store)
 note("done", 1, 1)
 in_tiles = ("neighbors", "normals", "edges")
 print(max(peaks[stage] for stage in in_tiles))

@@ -18,7 +18,7 @@ from torchrg.batch.tiles import folder_of_work, segmented_in_tiles
 from torchrg.config import load_config
 from torchrg.io import stream_cloud, write_cloud
 from torchrg.scenes import make_room
-from torchrg.tiling import TileFiles
+from torchrg.store import FolderStore
 
 SYSTEM_CALLS = ("fsync", "unlink", "replace", "mkdir", "rmdir")
 """What changes a folder, or flushes it."""
@@ -65,11 +65,11 @@ class Moments:
 
     def __init__(self, monkeypatch, disk):
         self.left, self.number, self.on_cut = -1, 0, None
-        write = TileFiles.write
+        write = FolderStore.write
         for name in SYSTEM_CALLS:
             call = disk.fsync if name == "fsync" else getattr(os, name)
             monkeypatch.setattr(os, name, partial(self.pass_by, call))
-        monkeypatch.setattr(TileFiles, "write", lambda *given: self.pass_by(write, *given))
+        monkeypatch.setattr(FolderStore, "write", lambda *given: self.pass_by(write, *given))
 
     def pass_by(self, call, *given, **options):
         """Do what was asked for, or end if this is the moment."""

@@ -48,8 +48,9 @@ def run(*arguments):
     return main(["segment", *map(str, arguments)])
 
 
-def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys):
-    files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic")
+@pytest.mark.parametrize("flags", [(), ("--voxel", "0.1")])
+def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, flags):
+    files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic", *flags)
     assert run(*files, "--out", tmp_path / "whole.npz", "--limit-memory", "9") == 0
     assert "in tiles of" not in capsys.readouterr().out
     assert run(*files, "--out", tmp_path / "tiles.npz", "--limit-memory", LIMIT) == 0
@@ -101,7 +102,10 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
             "a.npz: expected --limit-memory of at least 0.54 GB for about 20,000",
         ),
         (("--limit-memory", "-1"), "expected --limit-memory > 0, in GB, got -1"),
-        (("--limit-memory", LIMIT, "--merge", "--voxel", "0.1"), "expected no --voxel for a cloud"),
+        (
+            ("--limit-memory", LIMIT, "--merge", "--superpoints"),
+            "expected no --superpoints for a cloud .* no tile tells them; raise --limit-memory",
+        ),
         (("--ray-address", "auto"), "expected --ray-address together with --engine ray"),
     ],
 )

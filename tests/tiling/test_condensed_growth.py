@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg.neighbors.tiles import Part
+from torchrg.regions.condensed import condense, join_condensed
 from torchrg.regions.edges import EdgeLists
 from torchrg.structures import Neighbors
-from torchrg.tiling.growth import condense, join_condensed
-from torchrg.tiling.parts import Part
 
 
 def first_to_reach(targets, seeds):

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from torchrg.neighbors import finite_rows
-from torchrg.tiling.boxes import farthest_neighbor, find_boxes, near_boxes
-from torchrg.tiling.neighbors import search_tile
-from torchrg.tiling.parts import cut_part
+from torchrg.neighbors.octree import farthest_neighbor, find_boxes, near_boxes
+from torchrg.neighbors.tiles import cut_part, search_tile
 
 
 def lattice(rng):

@@ -13,17 +13,23 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg import pipeline
 from torchrg.config import NormalsConfig, load_config
 from torchrg.errors import ConfigError, FormatError
 from torchrg.neighbors import finite_rows, search_knn
+from torchrg.neighbors.tiles import cut_part
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.pipeline import segment_planes
 from torchrg.regions.growth import checked_cloud, grow
 from torchrg.scenes import make_room
+from torchrg.store import FolderStore
 from torchrg.structures import Cloud
-from torchrg.tiling import STAGES, TileFiles, TileTask, segment_tiles, stages
-from torchrg.tiling.parts import cut_part
+from torchrg.tiles import TileTask
 
+STAGES = (
+    *("points", "order", "neighbors", "normals", "curvature", "edges"),
+    *("growth", "regions", "planes", "results"),
+)
 PRESETS = ("classic", "paper", "consensus")
 RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 
@@ -74,10 +80,11 @@ def assert_same(found, expected):
             assert torch.equal(same, values), name
 
 
-def segment(points, folder, config, size, **options):
-    """Segment points that come in three chunks."""
+def segment(points, folder, config, size, *, on_stage=None, identity=None, **options):
+    """Segment points that come in three chunks, in tiles."""
     chunks = (Cloud(part) for part in np.array_split(points, 3))
-    return segment_tiles(chunks, folder, config, tile_size=size, **options)
+    store = FolderStore(folder, identity, tile_size=size, on_progress=on_stage)
+    return segment_planes(chunks, config, store=store, **options)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -123,10 +130,14 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
     done = []
     run = TileTask.run
     monkeypatch.setattr(TileTask, "run", lambda task: (done.append(task.name), run(task))[1])
-    for name in ("read_points", "sort_points", "grow_regions", "finish_regions"):
-        step = getattr(stages, name)
+    for name in ("sort_points", "sort_by_curvature", "grow_regions", "finish_regions"):
+        step = getattr(pipeline, name)
         counted = lambda *given, step=step: (step(*given), done.append(step.__name__))  # noqa: E731
-        monkeypatch.setattr(f"torchrg.tiling.{name}", counted)
+        monkeypatch.setattr(f"torchrg.pipeline.{name}", counted)
+    save = FolderStore.save_points
+    monkeypatch.setattr(
+        FolderStore, "save_points", lambda *given: (save(*given), done.append("points"))
+    )
     ends = ((stage, count) for stage in STAGES for count in (0, 1))
     # Every second stage begins, and ends the run with its first tile or with none.
     for stage, count in itertools.islice(ends, 0, None, 3):
@@ -141,8 +152,8 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
             continue
     assert_same(segment(points, tmp_path, config, 500), whole)
     assert len(done) == len(set(done)) > 12
-    assert_same(segment_tiles([], tmp_path, config), whole)
-    TileFiles(tmp_path).remove_all()
+    assert_same(segment_planes([], config, store=FolderStore(tmp_path)), whole)
+    FolderStore(tmp_path).remove_all()
     assert not tmp_path.exists()
 
 
@@ -177,7 +188,7 @@ def test_what_the_disk_has_lost_is_made_again(damage, tmp_path):
     whole = segment_planes(Cloud(points).points, config)
     for name in ("points", "rows", "boxes_low", "neighbors", "normals", "edges_1"):
         begun(points, tmp_path / name, config, "growth")
-        damage(TileFiles(tmp_path / name).path(name))
+        damage(FolderStore(tmp_path / name).path(name))
         assert_same(segment(points, tmp_path / name, config, 500), whole)
     segment(points, tmp_path / "all", config, 300)
     for path in (tmp_path / "all").glob("[!t]*"):
@@ -190,9 +201,9 @@ def test_points_that_are_lost_are_not_taken_from_another_cloud(tmp_path):
     segment(wall(400), tmp_path, config, 300)
     zero_rows(tmp_path / "points.npy")
     with pytest.raises(FormatError, match=r"points\.npy: is damaged, and the points .* are others"):
-        segment_tiles([], tmp_path, config)
+        segment_planes([], config, store=FolderStore(tmp_path))
     segment(wall(400), tmp_path, config, 300)
-    segment_tiles([], tmp_path, config)
+    segment_planes([], config, store=FolderStore(tmp_path))
 
 
 def test_a_record_that_is_damaged_is_one_line_or_made_again(tmp_path):
@@ -221,7 +232,7 @@ def test_an_array_that_is_lost_during_the_work_is_one_line(tmp_path):
         ("normals", 0, "neighbors"),
         ("normals", 1, "normals"),
         ("edges", 0, "cloud"),
-        ("regions", 0, "heads"),
+        ("regions", 0, "roots"),
     ):
 
         def lose(begun, number, of, *, stage=stage, at=at, name=name):
@@ -231,7 +242,7 @@ def test_an_array_that_is_lost_during_the_work_is_one_line(tmp_path):
         message = rf"{name}\.npy: is damaged: .*; run the same again, or remove .*{stage} and begin"
         with pytest.raises(FormatError, match=message):
             segment(points, tmp_path / stage, config, 300, on_stage=lose)
-        TileFiles(tmp_path / stage).remove_all()
+        FolderStore(tmp_path / stage).remove_all()
 
 
 def test_what_others_have_put_among_the_arrays_stays(tmp_path):
@@ -245,7 +256,7 @@ def test_what_others_have_put_among_the_arrays_stays(tmp_path):
     segment(points, tmp_path, config, 300)
     (tmp_path / "normals.npy").unlink()
     (tmp_path / "normals.npy").symlink_to(tmp_path / "theirs.npy")
-    TileFiles(tmp_path).remove_all()
+    FolderStore(tmp_path).remove_all()
     assert {path.name for path in tmp_path.iterdir()} == {"theirs.npy", "normals.npy"}
     assert (tmp_path / "theirs.npy").read_text() == "theirs"
 
@@ -277,7 +288,8 @@ def test_work_of_other_settings_or_files_is_refused(tmp_path):
 
 
 def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
-    files = TileFiles(tmp_path / "a", {})
+    files = FolderStore(tmp_path / "a")
+    files.begin()
     files.reserve("a.npy")
     with (
         pytest.raises(FormatError, match=r"a\.npy: cannot be written: No space left.*goes on"),
@@ -333,8 +345,8 @@ def test_the_points_around_a_tile_decide_its_edges(preset, tmp_path):
     neighbors = search_knn(points, 12)
     fit = ESTIMATORS[config.normals.method](points, neighbors, config.normals, 4000)
     cloud = checked_cloud(config.growing, points, *fit[:2], neighbors, fit.valid, fit.residual_rms)
-    heads = grow(cloud, config.growing, 4000)
-    assert len(np.unique(heads)) > 20
-    np.testing.assert_array_equal(TileFiles(tmp_path).load("heads"), heads)
+    roots = grow(cloud, config.growing, 4000)
+    assert len(np.unique(roots)) > 20
+    np.testing.assert_array_equal(FolderStore(tmp_path).get("roots"), roots)
     if cloud.reach is not None:
         assert bool(cloud.reach.isinf().any() and cloud.reach.isfinite().any())

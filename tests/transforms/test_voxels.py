@@ -16,7 +16,6 @@ from torchrg.transforms import (
     SegmentPlanes,
     restore_points,
     sample_voxels,
-    segment_voxels,
 )
 
 
@@ -63,7 +62,7 @@ def test_labels_of_voxels_go_back_to_every_point():
     points = room.points.clone()
     points[7] = torch.nan
     config = load_config("classic")
-    seg = segment_voxels(points, 0.1, config)
+    seg = segment_planes(points, config, voxel=0.1)
     rows, inverse = sample_voxels(points, 0.1)
     assert inverse[7] == seg.labels[7] == -1
     own = segment_planes(points[rows], config).labels
@@ -77,7 +76,7 @@ def test_labels_of_voxels_go_back_to_every_point():
 def test_planes_of_voxels_are_numbered_by_their_points(rng):
     wide = torch.rand(4000, 3, generator=rng) * torch.tensor([2.0, 2, 0])
     dense = torch.rand(9000, 3, generator=rng) * torch.tensor([1.0, 0, 1])
-    seg = segment_voxels(torch.cat([wide, dense]), 0.05, load_config("classic"))
+    seg = segment_planes(torch.cat([wide, dense]), load_config("classic"), voxel=0.05)
     assert seg.planes.count.tolist() == torch.bincount(seg.labels[seg.labels >= 0]).tolist()
     assert seg.labels[:4000].mode().values == 1
     assert seg.labels[4000:].mode().values == 0

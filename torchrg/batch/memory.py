@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from torchrg import tiling
+from torchrg import tiles
 from torchrg.pipeline import BYTES_PER_POINT
 
 PROCESS_BYTES = 500_000_000
@@ -35,7 +35,7 @@ def memory_of_tile(num_points: int) -> int:
         >>> memory_of_tile(300_000)
         1100000000
     """
-    return PROCESS_BYTES + tiling.BYTES_PER_TILE_POINT * num_points
+    return PROCESS_BYTES + tiles.BYTES_PER_TILE_POINT * num_points
 
 
 def memory_between_tiles(num_points: int) -> int:
@@ -45,8 +45,8 @@ def memory_between_tiles(num_points: int) -> int:
         >>> memory_between_tiles(10_000_000)
         1875000000
     """
-    at_once = tiling.BYTES_AT_ONCE * min(num_points, tiling.POINTS_AT_ONCE)
-    return PROCESS_BYTES + tiling.BYTES_PER_POINT * num_points + at_once
+    at_once = tiles.BYTES_AT_ONCE * min(num_points, tiles.POINTS_AT_ONCE)
+    return PROCESS_BYTES + tiles.BYTES_PER_POINT * num_points + at_once
 
 
 def spare_memory() -> int:

@@ -19,18 +19,10 @@ from torchrg.batch.task import Converted, Reports, Task, TaskReport, report_on
 from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import marked_parts, remove_leftovers
+from torchrg.pipeline import segment_planes
+from torchrg.store import TILE_SIZE, FolderStore, Written, make_folder, run_in_turn
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiling import (
-    BYTES_PER_TILE_POINT,
-    TILE_SIZE,
-    Done,
-    TileFiles,
-    TileTask,
-    Written,
-    make_folder,
-    run_in_turn,
-    segment_tiles,
-)
+from torchrg.tiles import BYTES_PER_TILE_POINT, TileTask
 
 _SMALLEST_TILE = 20_000
 """Points. Smaller ones are mostly what is around them."""
@@ -101,6 +93,7 @@ def segmented_in_tiles(
     start: Callable[[Sequence[Task]], Reports] | None = None,
     on_stage: Callable[[str, int, int], None] | None = None,
     columns: str | None = None,
+    voxel: float | None = None,
 ) -> Iterator[Segmentation]:
     """Segment files as one cloud, and remove the work when the result is used.
 
@@ -110,7 +103,7 @@ def segmented_in_tiles(
     Args:
         sources: The files.
         chunks: Their points.
-        folder: Of the work alone; see :func:`torchrg.tiling.segment_tiles`. Another process that
+        folder: Of the work alone; see :class:`torchrg.store.FolderStore`. Another process that
             works there is refused.
         settings: Of the pipeline.
         tile_size: Points of a tile.
@@ -119,8 +112,9 @@ def segmented_in_tiles(
         workers: Processes of one thread that work on tiles side by side, as many as there is memory
             for; with one, this process works on tile after tile, on its threads.
         start: Starts another engine on the tasks of a stage.
-        on_stage: See :func:`torchrg.tiling.segment_tiles`.
+        on_stage: See :class:`torchrg.store.FolderStore`.
         columns: Names that were given for the columns of the files.
+        voxel: See :func:`torchrg.segment_planes`.
 
     Yields:
         The segmentation.
@@ -140,17 +134,16 @@ def segmented_in_tiles(
         if start is None and workers > 1:
             start = partial(run_local, workers=workers, lock=lock)
         try:
-            yield segment_tiles(
-                chunks,
+            store = FolderStore(
                 folder,
-                settings,
+                {"inputs": inputs, "versions": describe_versions(), **named},
                 tile_size=tile_size,
-                identity={"inputs": inputs, "versions": describe_versions(), **named},
                 run=run_in_turn if start is None else partial(_run_tiles, start=start),
-                on_stage=on_stage,
+                on_progress=on_stage,
             )
+            yield segment_planes(chunks, settings, voxel=voxel, store=store)
         except BaseException:
-            if not TileFiles(folder).is_begun:
+            if not FolderStore(folder).is_begun:
                 _remove_work(folder, lock)
             raise
         _remove_work(folder, lock)
@@ -169,7 +162,7 @@ def _check_outside(folder: Path, files: Sequence[Path]) -> None:
 def _remove_work(folder: Path, lock: DirectoryLock) -> None:
     """Remove what the work has made, and its folder unless something else is in it."""
     lock.remove()
-    TileFiles(folder).remove_all()
+    FolderStore(folder).remove_all()
 
 
 @dataclass(frozen=True)
@@ -213,7 +206,7 @@ class TileWork:
 
 def _run_tiles(
     tiles: Sequence[TileTask], start: Callable[[Sequence[Task]], Reports]
-) -> Iterator[Done]:
+) -> Iterator[tuple[TileTask, Sequence[Written]]]:
     """Run tiles on an engine, and yield each that is done; raise FormatError for one that fails."""
     by_name = {tile.name: tile for tile in tiles}
     if not tiles:

@@ -39,8 +39,7 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.stream import Extent
-from torchrg.neighbors import sample_voxels
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import (
     Entry,
@@ -51,9 +50,13 @@ from torchrg.render.gallery import (
 )
 from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation
-from torchrg.transforms import partition_voxels, segment_voxels
 
 STAGES = ("neighbors", "normals", "regions", "planes")
+_WHOLE = {
+    "superpoints": "superpoints merge along chains of any length, so that no tile tells them",
+    "picture": "a picture is drawn of all points at once",
+}
+"""What needs the whole cloud in memory, and why."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 """Flags of depth images, which have a command of their own."""
 
@@ -225,11 +228,12 @@ def _segment_tiles(
 ) -> None:
     """Segment a cloud in tiles, after a line that says so."""
     begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
-    for name in ("voxel", "superpoints", "picture"):
+    for name, reason in _WHOLE.items():
         if getattr(arguments, name):
             raise ConfigError(
                 f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
-                f"takes more than {limit / 1e9:.2f} GB; raise --limit-memory, or leave it out."
+                f"takes more than {limit / 1e9:.2f} GB: {reason}; raise --limit-memory, or leave "
+                "it out."
             )
     try:
         tile_size = choose_tile_size(num_points, limit)
@@ -261,6 +265,7 @@ def _segment_tiles(
             start=_engine(arguments, limit),
             on_stage=show,
             columns=arguments.columns,
+            voxel=arguments.voxel,
         ) as seg:
             write_cloud(target, stream, seg, provenance=_describe(arguments, sources))
             seconds, without = time.perf_counter() - begin, console.without(target, fields)
@@ -307,6 +312,8 @@ def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]
     provenance = describe_run(sources[0], settings)
     if arguments.columns is not None:
         provenance["columns"] = arguments.columns
+    if arguments.voxel is not None:
+        provenance["voxel"] = arguments.voxel
     if len(sources) > 1:
         provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
     return provenance
@@ -334,20 +341,18 @@ def _segment_whole(
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
     with console.stage_bar(sources[0].name, stages) as advance:
-        voxels = None if voxel is None else sample_voxels(cloud.points, voxel)
-        if voxels is None:
-            seg = segment_planes(cloud.points, settings, on_stage=advance)
-        else:
-            seg = segment_voxels(cloud.points, voxels, settings, on_stage=advance)
+        seg = segment_planes(cloud.points, settings, voxel=voxel, on_stage=advance)
         parts, provenance = None, _describe(arguments, sources)
         if arguments.superpoints:
             advance("superpoints")
-            parts = partition_voxels(
-                cloud.points, voxels, seg, arguments.partition, colors=cloud.fields.get("color")
+            parts = make_superpoints(
+                cloud.points,
+                seg,
+                arguments.partition,
+                colors=cloud.fields.get("color"),
+                voxel=voxel,
             )
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
-    if voxel is not None:
-        provenance["voxel"] = voxel
     write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
         result = Result.of(cloud, seg, parts)

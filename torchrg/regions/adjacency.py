@@ -113,7 +113,8 @@ class NearestPoints:
 
     def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
         """Return those of the rows that have a new one beside them."""
-        is_new = self.neighbors.indices.new_zeros(len(self.neighbors.indices), dtype=torch.bool)
+        num_points = len(self.neighbors.indices)
+        is_new = torch.zeros(num_points, dtype=torch.bool, device=waiting.device)
         is_new[new] = True
         return waiting[is_new[self.around(waiting)].any(dim=1)]
 

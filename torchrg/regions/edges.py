@@ -231,7 +231,8 @@ def _pack(
 
     The edges are found by as many threads as torch uses.
     """
-    chunks, at_once = chunks_of(len(cloud.points), chunk_size), _CHUNKS_A_THREAD * allowed_threads()
+    chunks = chunks_of(len(cloud.points), chunk_size) or [slice(0, 0)]
+    at_once = _CHUNKS_A_THREAD * allowed_threads()
     spare = 0 if more is None else len(more.targets)
     # As long as it can get: memory that is not used is not touched.
     targets = np.empty(cloud.neighbors.indices.numel() + spare, dtype=np.int32)

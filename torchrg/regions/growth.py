@@ -2,7 +2,8 @@
 
 import math
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,8 +32,7 @@ _LONG_QUEUE = 32
 """From this many waiting seeds on, all of them go through NumPy at once; below, one at a time."""
 
 _CLAIMING_SEEDS = 2**13
-"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB. NumPy keeps other
-threads waiting meanwhile, also the one that gives back pages of files."""
+"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB."""
 
 
 @sequential_operations()
@@ -188,7 +188,7 @@ def checked_cloud(
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
-    columns = _by_column(points), _by_column(normals)
+    columns = by_column(points), by_column(normals)
     return GrowingCloud(*columns, curvature, neighbors, valid, reach)
 
 
@@ -203,7 +203,7 @@ def _with_colors(
         )
     colors = as_tensor("grow_regions", "colors", colors)
     check_shapes("grow_regions", points=(cloud.points, "N 3"), colors=(colors, "N C"))
-    colors = _by_column(colors.to(cloud.points.dtype))
+    colors = by_column(colors.to(cloud.points.dtype))
     return cloud._replace(colors=colors, max_color_distance=max_distance)
 
 
@@ -213,17 +213,17 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
     neighbors = cloud.neighbors.at(order)
     return cloud._replace(
-        points=_by_column(cloud.points[order]),
-        normals=_by_column(cloud.normals[order]),
+        points=by_column(cloud.points[order]),
+        normals=by_column(cloud.normals[order]),
         curvature=cloud.curvature[order],
         neighbors=neighbors._replace(indices=neighbors.of(row_of)),
         valid=cloud.valid[order],
         reach=None if cloud.reach is None else cloud.reach[order],
-        colors=None if cloud.colors is None else _by_column(cloud.colors[order]),
+        colors=None if cloud.colors is None else by_column(cloud.colors[order]),
     )
 
 
-def _by_column(vectors: Tensor) -> Tensor:
+def by_column(vectors: Tensor) -> Tensor:
     """Return vectors ``(N, C)`` laid out column by column."""
     return vectors.T.contiguous().T
 
@@ -251,52 +251,105 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     return torch.from_numpy(ranks[found]).to(regions.device)
 
 
+class GrowthOrder(NamedTuple):
+    """In which order regions begin.
+
+    Attributes:
+        rows: Points that may join a region, by ascending curvature, shape ``(n,)``.
+        num_seeds: How many of them, the first ones, are of at most the limit.
+        limit: The curvature limit, a scalar.
+    """
+
+    rows: NDArray[np.int32]
+    num_seeds: int
+    limit: Tensor
+
+    @property
+    def seeds(self) -> NDArray[np.int32]:
+        """The points of at most the curvature limit."""
+        return self.rows[: self.num_seeds]
+
+
+class GrowthEdges(NamedTuple):
+    """What regions grow along from some points.
+
+    Attributes:
+        coded: Edges as :func:`find_coded_edges` gives them, of all points or of those that are no
+            seeds.
+        of_seeds: Edges of the points of at most the curvature limit, where such a point is a seed
+            whoever claimed it; None where that is a matter of the edge.
+        claims: Neighbours that a point merely claims, shape ``(N, K)``, with late promotion.
+    """
+
+    coded: EdgeLists
+    of_seeds: EdgeLists | None = None
+    claims: NDArray[np.bool_] | None = None
+
+
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
 
     The root of a region is the point it began with. Of a point that is not valid it is -1. This
     needs the edges of the whole cloud: regions have no bounded reach.
     """
-    order, limit = growing_order(cloud.curvature, cloud.valid, config)
-    valid = cloud.valid.cpu().numpy()
-    if not is_order_free(config):
-        edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        indices = cloud.neighbors.indices.cpu().numpy()
-        roots = grow_first_in_first_out(edges, order, valid, claims, indices)
-        return torch.from_numpy(roots).to(cloud.points.device)
-    chain = chain_of(seeds_in_order(order, cloud.curvature, limit), len(valid))
-    edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, more=chain)
-    roots = first_to_reach(edges, len(valid))
-    if may_grow_without_seeds(cloud.neighbors.indices.shape[1], config):
-        roots = grow_rest(roots, others, order)
+    order = growth_order(cloud.curvature, cloud.valid, config)
+    edges = find_growth_edges(cloud, config, order, chunk_size=chunk_size)
+    roots = grow_along(edges, order, cloud.neighbors.indices.cpu().numpy(), config)
     return torch.from_numpy(roots).to(cloud.points.device)
 
 
-def growing_order(
-    curvature: Tensor, valid: Tensor, config: GrowingConfig
-) -> tuple[NDArray[np.int32], Tensor]:
-    """Return the rows of valid points ``(N,)`` by ascending curvature, and its limit, a scalar."""
-    order = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
-    limit = curvature_limit(curvature[valid], config.curvature_quantile)
-    return order[valid.cpu().numpy()[order]], limit
+def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> GrowthOrder:
+    """Return the order in which regions begin at valid points ``(N,)``."""
+    rows = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
+    growing = curvature[valid]
+    limit = curvature_limit(growing, config.curvature_quantile)
+    rows = rows[valid.cpu().numpy()[rows]]
+    return GrowthOrder(rows, int(torch.count_nonzero(growing <= limit)), limit)
 
 
-def seeds_in_order(order: NDArray[np.int32], curvature: Tensor, limit: Tensor) -> NDArray[np.int32]:
-    """Return those of the rows in growing order whose curvature is within the limit."""
-    return order[curvature.cpu().numpy()[order] <= limit.cpu().numpy()]
+def find_growth_edges(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    order: GrowthOrder,
+    *,
+    chunk_size: int,
+    whole: bool = True,
+) -> GrowthEdges:
+    """Return the edges that regions grow along; of a whole cloud with the chain of its seeds."""
+    if not is_order_free(config):
+        coded, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
+        return GrowthEdges(coded, claims=claims)
+    chain = chain_of(order.seeds, len(cloud.points)) if whole else None
+    edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, more=chain)
+    return GrowthEdges(others, edges)
 
 
-def may_grow_without_seeds(k: int, config: GrowingConfig) -> bool:
-    """Tell whether points that no seed reaches may make regions: of at most k neighbours."""
-    return config.min_size <= k
-
-
-def grow_rest(
-    roots: NDArray[np.int32], others: EdgeLists, order: NDArray[np.int32]
+def grow_along(
+    edges: GrowthEdges,
+    order: GrowthOrder,
+    lists: NDArray[np.integer],
+    config: GrowingConfig,
+    reach: Callable[[NDArray[np.int32]], NDArray[np.int32]] | None = None,
 ) -> NDArray[np.int32]:
-    """Let free points that no seed reaches claim free neighbours by the edges of their own."""
+    """Return the root of each point's region.
+
+    ``lists`` ``(N, K)`` are the neighbours of the points. ``reach`` tells which of the seeds
+    reaches each point first, where the edges of seeds are elsewhere.
+    """
+    num_points, k = lists.shape
+    if reach is not None:
+        roots = reach(order.seeds)
+    elif edges.of_seeds is not None:
+        roots = first_to_reach(edges.of_seeds, num_points)
+    else:
+        valid = np.zeros(num_points, dtype=bool)
+        valid[order.rows] = True
+        return grow_first_in_first_out(edges.coded, order.rows, valid, edges.claims, lists)
+    if config.min_size > k:
+        return roots
+    # Points that no seed reaches may make regions with free neighbours of their own.
     free = roots < 0
-    left = grow_first_in_first_out(others, order[free[order]], free)
+    left = grow_first_in_first_out(edges.coded, order.rows[free[order.rows]], free)
     return np.where(free, left, roots)
 
 

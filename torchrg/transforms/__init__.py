@@ -8,7 +8,7 @@ from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
 from torchrg.transforms.sample import CenterCloud, KeepFinite
-from torchrg.transforms.voxels import SampleVoxels, partition_voxels, segment_voxels
+from torchrg.transforms.voxels import SampleVoxels
 
 __all__ = [
     "CenterCloud",
@@ -21,8 +21,6 @@ __all__ = [
     "SegmentDepth",
     "SegmentPlanes",
     "fuse_depth",
-    "partition_voxels",
     "restore_points",
     "sample_voxels",
-    "segment_voxels",
 ]

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
+from torchrg.neighbors.tiles import Part
 from torchrg.regions.edges import EdgeLists
 from torchrg.regions.growth import chain_of, first_to_reach
-from torchrg.tiling.parts import Part
 
 
 class Condensed(NamedTuple):
@@ -51,6 +51,7 @@ def condense(edges: EdgeLists, part: Part) -> Condensed:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
+    numbers = part.numbers
     first, num_points = part.own.start, part.own.stop - part.own.start
     starts = edges.starts[first : part.own.stop + 1]
     begin = starts[0]
@@ -84,10 +85,10 @@ def condense(edges: EdgeLists, part: Part) -> Condensed:
         sources, targets = sources[leaves], targets[leaves]
         is_inner = (targets >= 0) & (targets < num_points)
         targets[is_inner] = last[components[targets[is_inner]]]
-        found.append(sources.astype(np.int64) * len(part.rows) + (targets + first))
+        found.append(sources.astype(np.int64) * len(numbers) + (targets + first))
     keys = np.unique(np.concatenate(found))
-    rows_reached = part.rows.numpy()[keys % len(part.rows)]
-    return Condensed(components, (keys // len(part.rows)).astype(np.int32), rows_reached)
+    sources = (keys // len(numbers)).astype(np.int32)
+    return Condensed(components, sources, numbers[keys % len(numbers)])
 
 
 def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[np.int32]:
