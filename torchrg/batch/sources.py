@@ -22,7 +22,7 @@ from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,
     FolderOfClouds,
-    Scene,
+    SceneFiles,
     read_pointcept_scene,
     read_room,
     write_pointcept_scene,
@@ -39,7 +39,7 @@ from torchrg.structures import Cloud, Segmentation
 _COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
-"""Width and height of a PNG, and where they are."""
+"""Width and height in the header of a PNG, and the byte at which they begin."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class FolderSource:
             )
         return [self._scan(scene) for scene in scenes]
 
-    def _scan(self, scene: Scene) -> Scan:
+    def _scan(self, scene: SceneFiles) -> Scan:
         """Return a cloud with its input files."""
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
@@ -201,7 +201,7 @@ def find_areas(root: Path) -> tuple[int, ...]:
     return tuple(n for n in range(1, 7) if (root / f"Area_{n}").is_dir()) or tuple(range(1, 7))
 
 
-def _estimate(scene: Scene) -> int:
+def _estimate(scene: SceneFiles) -> int:
     """Return the number of points by the size of the files and the lines of the largest."""
     sizes = {file: file.stat().st_size for file in scene.files}
     largest = max(sizes, key=lambda file: sizes[file])
