@@ -10,7 +10,7 @@ import pytest
 from tqdm import tqdm
 
 from torchrg.batch.lock import DirectoryLock
-from torchrg.batch.report import BatchReport
+from torchrg.batch.run import BatchReport
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
 from torchrg.cli.convert import format_report

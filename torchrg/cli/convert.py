@@ -10,20 +10,19 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.convert import Job
 from torchrg.batch.local import run_local
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import spare_memory
-from torchrg.batch.report import BatchReport
 from torchrg.batch.run import (
     REPORT,
+    BatchReport,
     Plan,
     check_room,
     list_jobs,
     make_plan,
     write_report,
 )
-from torchrg.batch.scans import Source
+from torchrg.batch.scans import Job, Source
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
@@ -38,7 +37,7 @@ from torchrg.render.page import check_library
 from torchrg.result import read_result
 
 MOST_ROWS = 300
-"""A longer batch is not printed scan by scan."""
+"""Most scans of a batch that is printed scan by scan."""
 
 
 @dataclass(frozen=True)

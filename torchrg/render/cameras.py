@@ -9,9 +9,13 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MARGIN = 0.03  # of the picture on each side
-_NEAREST = 0.25  # distance of the nearest point, in depths of the cloud
-_FLATTEST = 0.25  # ratio of height to width
+_MARGIN = 0.03
+"""Share of the picture that stays free on each side."""
+_NEAREST = 0.25
+"""Least distance from the camera to the nearest point, in depths of the cloud. A nearer camera
+would show what is in front much larger than what is behind."""
+_FLATTEST = 0.25
+"""Least ratio of height to width of a picture whose height is not given."""
 
 
 def make_camera(

@@ -1,4 +1,4 @@
-"""A picture of each of many scans that leads to its page, and an index of them."""
+"""A picture of each of many scans that links to its page, and an index of them."""
 
 import os
 from collections.abc import Sequence

@@ -30,9 +30,9 @@ _ROOM = 100
 """Purpose of the random numbers: sizes and places in a room."""
 
 _FLOOR_CELL = (1.85, 1.35)
-"""Metres. A table with room to pass around it."""
+"""Metres along and across a place on the floor: a table with room to pass around it."""
 _WALL_CELL = 1.75
-"""Metres. A window or a cabinet with wall on both sides."""
+"""Metres along a place on a wall: a window or a cabinet with wall on both sides."""
 _CORNER = 0.6
 """Metres that are free at both ends of a wall, for a cabinet on the next wall."""
 _AISLE = 0.75
