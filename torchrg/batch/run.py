@@ -42,7 +42,7 @@ class Plan(NamedTuple):
 
     @property
     def done(self) -> list[Job]:
-        """The jobs that are."""
+        """The jobs that are done."""
         return [job for job in self.jobs if job.name not in self.reasons]
 
 

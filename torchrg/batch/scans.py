@@ -96,7 +96,7 @@ class Job:
         source: The data set.
         scan: One of its scans.
         out: Where results go.
-        mark: Of the names that results are written under before they have their own; see
+        mark: Part of the names that results are written under before they have their own; see
             :func:`torchrg.io.files.marked_parts`. What a killed process leaves is removed by those
             who know it.
     """

@@ -30,7 +30,7 @@ from torchrg.datasets import (
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_depth
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import depth_to_points, make_intrinsics
+from torchrg.depth.camera import make_intrinsics, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.pipeline import make_superpoints, segment_planes
@@ -262,8 +262,7 @@ class RGBDSource:
             raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
         begin("planes")
         found = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
-        poses = None if frame.pose is None else frame.pose[None]
-        points = depth_to_points(depth[None].double(), frame.intrinsics[None], poses)[0]
+        points = points_of_image(depth, frame.intrinsics, frame.pose)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = write_results(folder, coord, found)

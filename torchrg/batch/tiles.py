@@ -103,9 +103,9 @@ def segmented_in_tiles(
     Args:
         sources: The files.
         chunks: Their points.
-        folder: Of the work alone; see :class:`torchrg.store.FolderStore`. Another process that
-            works there is refused.
-        settings: Of the pipeline.
+        folder: Folder for this work alone; see :class:`torchrg.store.FolderStore`. Another process
+            that works there is refused.
+        settings: Settings of the pipeline.
         tile_size: Points of a tile.
         target: The file that the caller writes the result to. What an earlier call was writing when
             it was killed is removed.

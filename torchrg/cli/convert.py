@@ -78,7 +78,7 @@ class CloudArguments(Arguments):
 
     pages: Path | None = None
     """Directory for a picture and a page of each scan that is done, and for index.html, in which
-    the pictures lead to the pages (pip install 'torchrg[view]'). Default: none are made."""
+    the pictures are links to the pages (pip install 'torchrg[view]'). Default: none are made."""
     superpoint: bool = False
     """Write superpoints as superpoint.npy too: a partition of all points, for networks on them."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)

@@ -24,11 +24,11 @@ from torchrg.datasets.folder import listed
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
 from torchrg.depth import (
     DepthConfig,
-    depth_to_points,
     find_intrinsics,
     make_intrinsics,
     segment_depth,
 )
+from torchrg.depth.camera import points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
@@ -304,7 +304,7 @@ def _read_frame(path: Path, source: RGBDSource) -> tuple[Cloud, Tensor, Tensor]:
         return _read_organised(path, camera)
     depth = read_depth(path, depth_scale=scale)
     height, width = depth.shape
-    points = depth_to_points(depth[None].double(), camera[None]).view(-1, 3).float()
+    points = points_of_image(depth, camera).view(-1, 3).float()
     return Cloud(points.numpy(), grid_shape=(height, width), source=str(path)), depth, camera
 
 

@@ -1,4 +1,4 @@
-"""Any folder of clouds."""
+"""Any folder of clouds as a data set, and how the files below a folder are found and ordered."""
 
 import os
 import re

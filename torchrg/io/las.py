@@ -224,7 +224,7 @@ class _Plan(NamedTuple):
 
 
 def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
-    """Look at all points."""
+    """Look at all points for what the header has to say of them."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     unfit, limits = set[str](), dict[str, Limits]()
     for number, chunk in enumerate(stream):

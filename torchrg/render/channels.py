@@ -84,7 +84,7 @@ def channels_of(
 
     Args:
         points: Shape ``(n, 3)``, finite; they tell which planes need unlike colours.
-        fields: Of a cloud, of those points; see :class:`torchrg.structures.Cloud`. Labels and
+        fields: Fields of those points; see :class:`torchrg.structures.Cloud`. Labels and
             superpoints are numbered without gaps.
         truth: ``labels`` or ``normals`` of the same points.
         reference: Labels whose planes shall have the same colours, shape ``(n,)``.

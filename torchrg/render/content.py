@@ -78,7 +78,8 @@ class Shown(NamedTuple):
         rows: Those that are shown, by strata, shape ``(n,)``.
         levels: Number of points in the first stratum, in the first two, and so on.
         points: In the axes of the page, shape ``(n, 3)``, float32.
-        fields: Of those points; normals in the axes of the page, labels numbered without gaps.
+        fields: Fields of those points; normals are in the axes of the page, and labels numbered
+            without gaps.
     """
 
     rows: Tensor

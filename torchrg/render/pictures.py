@@ -63,10 +63,11 @@ def draw_picture(
     Args:
         camera: A batch of one, with the size of the picture.
         grid: The cloud, of at least one finite point.
-        spacing: Of its finite points, shape ``(n,)``.
+        spacing: Distance of each finite point from its neighbours, shape ``(n,)``.
         kept: Which of them to draw, shape ``(n,)``, bool.
-        colors: Of all points, shape ``(N, 3)``, uint8.
-        normals: Of all points, shape ``(N, 3)``. Default: those of small cubes of the cloud.
+        colors: Colours of all points, shape ``(N, 3)``, uint8.
+        normals: Normals of all points, shape ``(N, 3)``. Default: those of small cubes of the
+            cloud.
         supersampling: Pixels along the side of each pixel of the picture.
 
     Returns:
@@ -257,8 +258,8 @@ def render_points(
         colors: Shape ``(N, 3)``, uint8.
         camera: A batch of one camera of kornia, with the size of the picture; for example from
             :func:`torchrg.render.make_camera`.
-        normals: As for :func:`render_cloud`.
-        supersampling: As for :func:`render_cloud`.
+        normals: See :func:`render_cloud`.
+        supersampling: See :func:`render_cloud`.
 
     Returns:
         The picture, shape ``(height, width, 3)``, uint8.

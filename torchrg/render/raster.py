@@ -30,9 +30,9 @@ class DepthBuffer:
     """What is nearest in each pixel of a picture.
 
     Args:
-        width: Of the picture.
-        height: Of the picture.
-        max_radius: Of the discs, in pixels; larger ones are drawn as large as this.
+        width: Width of the picture, in pixels.
+        height: Height of the picture, in pixels.
+        max_radius: Largest radius of a disc, in pixels; larger ones are drawn as large as this.
         device: Where to draw.
 
     Example:
