@@ -53,7 +53,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
 
 def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
-    """Return the points of one image ``(H, W)`` in float64 ``(H, W, 3)``; see depth_to_points."""
+    """Do as :func:`depth_to_points` for one image ``(H, W)``, in float64: ``(H, W, 3)``."""
     poses = None if pose is None else pose[None]
     return depth_to_points(depth[None].double(), intrinsics[None].double(), poses)[0]
 

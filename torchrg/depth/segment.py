@@ -36,7 +36,8 @@ def segment_depth(
 
     Args:
         depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
-        intrinsics: Camera matrix, shape ``(3, 3)``; see :func:`depth_to_points`.
+        intrinsics: Camera matrix, shape ``(3, 3)``; see
+            :func:`torchrg.depth.camera.depth_to_points`.
         config: Settings. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
             the world. Default: they are in camera coordinates.
