@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -65,9 +65,7 @@ class Arguments:
     Settings come from the preset, then from --config, then from the flags given here.
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt. Depth images and organised
-    clouds taken as such: see torchrg depth --help."""
+    inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
