@@ -13,7 +13,7 @@ import torchrg.io
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
-from torchrg.structures import Cloud, PlaneAdjacency, Planes, Superpoints
+from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes, Superpoints
 
 EXACT = [".npz", ".npy", ".ply", ".pcd", ".e57"]
 TEXT = [".xyz", ".txt"]
@@ -225,7 +225,8 @@ def test_kinds_adjacency_and_outlines_are_written(tmp_path, make_cloud, make_seg
 
 def test_no_planes_make_a_file_too(tmp_path, make_cloud, make_segmentation):
     seg = make_segmentation(60)
-    none = Planes(*(column[:0] for column in seg.planes[:10]), None, (), None)
+    columns = {name: getattr(seg.planes, name)[:0] for name in PLANE_COLUMNS}
+    none = Planes(**columns, outline=())
     write_cloud(tmp_path / "a.npz", make_cloud(), seg._replace(planes=none))
     with np.load(tmp_path / "a.npz") as result:
         assert result["outline_points"].shape == (0, 3)
