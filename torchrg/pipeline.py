@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrg import tiles
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import return_freed_memory, sequential_operations
+from torchrg._parallel import sequential_operations
 from torchrg.config import PipelineConfig, SuperpointsConfig, load_config
 from torchrg.errors import ShapeError
 from torchrg.neighbors import (
@@ -68,6 +68,10 @@ class MemoryStore:
     def begin(self, **identity: Any) -> None:  # noqa: ANN401
         """Do nothing: the work of no other run can be there."""
 
+    def once(self, step: str, work: Callable[[], None]) -> None:
+        """Do a step on the whole cloud."""
+        work()
+
     def note(self, step: str, **found: Any) -> None:  # noqa: ANN401
         """Keep what a step has found."""
         self._values[f"{step} found"] = found
@@ -89,8 +93,8 @@ class MemoryStore:
         """Return an array."""
         return self._values[name]
 
+    # What a folder reads in parts, maps or decodes is here already.
     lazy = map = load_planes = get
-
     save_planes = save
 
     def save_points(self, points: Tensor | Iterable[Cloud]) -> None:
@@ -181,9 +185,6 @@ def segment_planes(
     begin = on_stage or (lambda stage: None)
     store.begin(config={**dataclasses.asdict(config), "chunk_size": None}, voxel=voxel)
 
-    def whole(step: str, work: Callable[[], None]) -> None:
-        _run_once(store, step, work)
-
     def in_blocks(step: str, work: Callable[..., None]) -> None:
         if isinstance(store, FolderStore):
             tiles.run_tiles(store, step, work, config)
@@ -191,27 +192,27 @@ def segment_planes(
             work(store, slice(*store.known("order")["bounds"]), 0, config)
 
     begin("neighbors")
-    whole("points", lambda: store.save_points(points))
-    whole("order", lambda: sort_points(store, config, voxel))
+    store.once("points", lambda: store.save_points(points))
+    store.once("order", lambda: sort_points(store, config, voxel))
     in_blocks("neighbors", search_neighbors)
 
     begin("normals")
     if isinstance(store, FolderStore) and tiles.adapts(config.normals):
         # A tile does not tell the noise of the cloud, which in memory the estimator finds itself.
         in_blocks("noise", tiles.measure_noise)
-        whole("width", partial(tiles.choose_width, store, config))
+        store.once("width", partial(tiles.choose_width, store, config))
         in_blocks("wider_neighbors", tiles.search_wider)
     in_blocks("normals", estimate_normals)
 
     begin("regions")
-    whole("curvature", lambda: sort_by_curvature(store, config))
+    store.once("curvature", lambda: sort_by_curvature(store, config))
     in_blocks("edges", find_edges)
-    whole("growth", lambda: grow_regions(store, config))
-    whole("regions", lambda: finish_regions(store, config))
+    store.once("growth", lambda: grow_regions(store, config))
+    store.once("regions", lambda: finish_regions(store, config))
 
     begin("planes")
-    whole("planes", lambda: tabulate_planes(store, config))
-    whole("results", lambda: restore_results(store, config, voxel))
+    store.once("planes", lambda: tabulate_planes(store, config))
+    store.once("results", lambda: restore_results(store, config, voxel))
     begin("done")
     return load_results(store, voxel)
 
@@ -289,17 +290,6 @@ def make_superpoints(
         restore_points(level, inverse, fill=UNLABELED) for level in (found.labels, *found.levels)
     )
     return Superpoints(labels, found.plane, tuple(levels))
-
-
-def _run_once(store: Store, name: str, step: Callable[[], None]) -> None:
-    """Run a stage on the whole cloud unless it is done."""
-    if isinstance(store, FolderStore):
-        store.on_progress(name, 0, 1)
-        if store.is_done(name):
-            return
-        # Beside the arrays of the whole cloud, what tiles have freed would be too much.
-        return_freed_memory()
-    step()
 
 
 def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> None:
