@@ -15,6 +15,7 @@ from torchrg.config import PlanesConfig, load_config
 from torchrg.datasets import write_pointcept_scene
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS
+from torchrg.io.stream import CloudStream
 from torchrg.neighbors import finite_rows
 from torchrg.render.page import make_page
 from torchrg.result import Result
@@ -350,3 +351,29 @@ def test_segmentations_of_other_points_and_other_files_are_refused(tmp_path, clo
         torchrg.read_result(tmp_path / "gone.npz")
     with pytest.raises(FormatError, match=r"expected coord\.npy in this folder, got none"):
         torchrg.read_result(tmp_path)
+
+
+def test_a_sample_is_of_the_same_points_in_any_order(cloud, seg):
+    place = np.array([5e6, 4e5, 100])
+    far = replace(cloud, coordinates=cloud.coordinates + place)
+    far.coordinates[17] = np.nan
+    found = []
+    for order in (np.arange(len(far)), np.random.default_rng(2).permutation(len(far))):
+        mixed = replace(far, coordinates=far.coordinates[order], fields={})
+        of_points = {name: getattr(seg, name)[order] for name in seg._fields[:5]}
+        known = seg._replace(**of_points, points=mixed.points)
+        sample = Result.of_sample(CloudStream.of(mixed, chunk_size=700), known, 500)
+        found.append(
+            {
+                (*x, n)
+                for x, n in zip(
+                    sample.cloud.coordinates.tolist(), sample.labels.tolist(), strict=True
+                )
+            }
+        )
+        np.testing.assert_array_equal(sample.cloud.origin, far.origin)
+        assert sample.table is seg.planes
+    assert found[0] == found[1]
+    assert 500 <= len(found[0]) <= 506
+    with pytest.raises(ShapeError, match="expected a segmentation with points, got none"):
+        Result.of_sample(CloudStream.of(far), seg._replace(points=None), 500)

@@ -8,6 +8,7 @@ the cloud; in a folder it is a tile.
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,9 @@ from torch import Tensor
 
 from torchrg import tiles
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import return_freed_memory, sequential_operations
+from torchrg._parallel import sequential_operations
 from torchrg.config import PipelineConfig, SuperpointsConfig, load_config
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import ShapeError
 from torchrg.neighbors import (
     canonical_order,
     finite_rows,
@@ -64,6 +65,13 @@ class MemoryStore:
     def __init__(self) -> None:
         self._values: dict[str, Any] = {}
 
+    def begin(self, **identity: Any) -> None:  # noqa: ANN401
+        """Do nothing: the work of no other run can be there."""
+
+    def once(self, step: str, work: Callable[[], None]) -> None:
+        """Do a step on the whole cloud."""
+        work()
+
     def note(self, step: str, **found: Any) -> None:  # noqa: ANN401
         """Keep what a step has found."""
         self._values[f"{step} found"] = found
@@ -85,8 +93,8 @@ class MemoryStore:
         """Return an array."""
         return self._values[name]
 
+    # What a folder reads in parts, maps or decodes is here already.
     lazy = map = load_planes = get
-
     save_planes = save
 
     def save_points(self, points: Tensor | Iterable[Cloud]) -> None:
@@ -149,8 +157,7 @@ def segment_planes(
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
-        ConfigError: If ``voxel`` is not positive, or the settings ask for ``adaptive_k``, which
-            looks at the whole cloud, in tiles.
+        ConfigError: If ``voxel`` is not positive.
         FormatError: If the folder holds the work of another run or something else, or the disk is
             full.
 
@@ -176,10 +183,7 @@ def segment_planes(
     config = load_config() if config is None else config
     store = MemoryStore() if store is None else store
     begin = on_stage or (lambda stage: None)
-    _begin(store, config, voxel)
-
-    def whole(step: str, work: Callable[[], None]) -> None:
-        _run_once(store, step, work)
+    store.begin(config={**dataclasses.asdict(config), "chunk_size": None}, voxel=voxel)
 
     def in_blocks(step: str, work: Callable[..., None]) -> None:
         if isinstance(store, FolderStore):
@@ -188,22 +192,27 @@ def segment_planes(
             work(store, slice(*store.known("order")["bounds"]), 0, config)
 
     begin("neighbors")
-    whole("points", lambda: store.save_points(points))
-    whole("order", lambda: sort_points(store, config, voxel))
+    store.once("points", lambda: store.save_points(points))
+    store.once("order", lambda: sort_points(store, config, voxel))
     in_blocks("neighbors", search_neighbors)
 
     begin("normals")
+    if isinstance(store, FolderStore) and tiles.adapts(config.normals):
+        # A tile does not tell the noise of the cloud, which in memory the estimator finds itself.
+        in_blocks("noise", tiles.measure_noise)
+        store.once("width", partial(tiles.choose_width, store, config))
+        in_blocks("wider_neighbors", tiles.search_wider)
     in_blocks("normals", estimate_normals)
 
     begin("regions")
-    whole("curvature", lambda: sort_by_curvature(store, config))
+    store.once("curvature", lambda: sort_by_curvature(store, config))
     in_blocks("edges", find_edges)
-    whole("growth", lambda: grow_regions(store, config))
-    whole("regions", lambda: finish_regions(store, config))
+    store.once("growth", lambda: grow_regions(store, config))
+    store.once("regions", lambda: finish_regions(store, config))
 
     begin("planes")
-    whole("planes", lambda: tabulate_planes(store, config))
-    whole("results", lambda: restore_results(store, config, voxel))
+    store.once("planes", lambda: tabulate_planes(store, config))
+    store.once("results", lambda: restore_results(store, config, voxel))
     begin("done")
     return load_results(store, voxel)
 
@@ -283,32 +292,6 @@ def make_superpoints(
     return Superpoints(labels, found.plane, tuple(levels))
 
 
-def _begin(store: Store, config: PipelineConfig, voxel: float | None) -> None:
-    """Tell a store what decides the result."""
-    if isinstance(store, MemoryStore):
-        return
-    if config.normals.adaptive_k is not None:
-        raise ConfigError(
-            "segment_planes: expected normals.adaptive_k of none, got "
-            f"{config.normals.adaptive_k}: in tiles k is known before the noise of the whole cloud "
-            "is; choose k, or give the cloud memory."
-        )
-    settings = dataclasses.asdict(config)
-    del settings["chunk_size"]
-    store.begin(config=settings, voxel=voxel)
-
-
-def _run_once(store: Store, name: str, step: Callable[[], None]) -> None:
-    """Run a stage on the whole cloud unless it is done."""
-    if isinstance(store, FolderStore):
-        store.on_progress(name, 0, 1)
-        if store.is_done(name):
-            return
-        # Beside the arrays of the whole cloud, what tiles have freed would be too much.
-        return_freed_memory()
-    step()
-
-
 def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> None:
     """Sort the finite points, or those that stand for voxels, and choose the blocks of rows."""
     points = store.get("points")
@@ -332,7 +315,7 @@ def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> No
 def search_neighbors(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
     """Search the nearest neighbours of the points of a block."""
     if isinstance(store, FolderStore):
-        tiles.search_neighbors(store, block)
+        tiles.search_neighbors(store, block, "neighbors", store.known("order")["k"])
         return
     points = store.get("cloud")
     found = torch.empty(0, 1, dtype=torch.int32, device=points.device)
@@ -341,19 +324,21 @@ def search_neighbors(store: Store, block: slice, number: int, config: PipelineCo
     store.write("neighbors", block.start, found)
 
 
-def _around(store: Store, block: slice, steps: int) -> Part:
+def _around(store: Store, block: slice, steps: int, lists: str = "neighbors") -> Part:
     """Return a block with all points that so many steps from neighbour to neighbour lead to."""
     if isinstance(store, FolderStore):
-        return cut_part(store.lazy("neighbors"), block, steps)
-    return Part(block, block, Neighbors(store.get("neighbors")))
+        return cut_part(store.lazy(lists), block, steps)
+    return Part(block, block, Neighbors(store.get(lists)))
 
 
 def estimate_normals(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
     """Estimate normals and curvature of the points of a block."""
-    method = config.normals.method
-    part = _around(store, block, STEPS[method])
+    lists, settings = "neighbors", config.normals
+    if isinstance(store, FolderStore):
+        lists, settings = tiles.wider_neighbors(store, settings)
+    part = _around(store, block, STEPS[settings.method], lists)
     points = store.lazy("cloud")[part.rows]
-    fit = ESTIMATORS[method](points, part.neighbors, config.normals, config.chunk_size)
+    fit = ESTIMATORS[settings.method](points, part.neighbors, settings, config.chunk_size)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     for name, values in zip(tiles.FIT, (*fit[:4], sharp), strict=True):
         store.write(name, block.start, values[part.own])

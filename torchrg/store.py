@@ -28,7 +28,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE, chunks_of
+from torchrg._parallel import ROWS_IN_CACHE, chunks_of, return_freed_memory
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import DAMAGES, is_disk_full, refusing, sync_folder
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, origin_of_box
@@ -215,6 +215,14 @@ class FolderStore:
     @cached_property
     def _record(self) -> _Record:
         return _Record(self.folder / _RECORD)
+
+    def once(self, step: str, work: Callable[[], None]) -> None:
+        """Do a step on the whole cloud unless it is done; the work notes that it is."""
+        self.on_progress(step, 0, 1)
+        if not self.is_done(step):
+            # Beside the arrays of the whole cloud, what tiles have freed would be too much.
+            return_freed_memory()
+            work()
 
     def note(self, step: str, written: Sequence[Written] = (), **found: Any) -> None:  # noqa: ANN401
         """Note that a step is done, and what it found.

@@ -6,7 +6,7 @@ around it that these look at; arrays of the whole cloud take a few bytes a point
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._parallel import sequential_operations
-from torchrg.config import PipelineConfig
+from torchrg.config import NormalsConfig, PipelineConfig
 from torchrg.io.files import check_space
 from torchrg.neighbors.octree import Boxes, find_boxes
-from torchrg.neighbors.tiles import Part, search_tile
+from torchrg.neighbors.tiles import Part, cut_part, search_tile
+from torchrg.normals import NOISE_STEPS
+from torchrg.normals.consensus import share_of_noise, wanted_neighbors
 from torchrg.regions.condensed import Condensed, condense, join_condensed
 from torchrg.regions.edges import EdgeLists, is_order_free, promotes_late
 from torchrg.regions.growth import GrowthEdges, GrowthOrder, grow_along
@@ -93,7 +95,9 @@ def choose_tiles(
 ) -> list[int]:
     """Find boxes about the points, and return where tiles end: where boxes do."""
     edge_bytes = 0 if is_order_free(config.growing) else 5 * k
-    check_space(store.folder, len(points) * (_ROW_BYTES + 4 * k + edge_bytes), "the work")
+    wider_bytes = 4 * (config.normals.adaptive_k or 0) if adapts(config.normals) else 0
+    row_bytes = _ROW_BYTES + 4 * k + wider_bytes + edge_bytes
+    check_space(store.folder, len(points) * row_bytes, "the work")
     boxes = find_boxes(points)
     for name, values in boxes._asdict().items():
         store.save(f"boxes_{name}", values)
@@ -107,6 +111,15 @@ def choose_tiles(
 def _begin_neighbors(store: FolderStore, config: PipelineConfig) -> None:
     order = store.known("order")
     store.create("neighbors", np.int32, (order["num_points"], order["k"]))
+
+
+def _begin_noise(store: FolderStore, config: PipelineConfig) -> None:
+    store.create("noise", store.read("cloud").dtype, (store.known("order")["num_points"],))
+
+
+def _begin_wider(store: FolderStore, config: PipelineConfig) -> None:
+    shape = (store.known("order")["num_points"], store.known("width")["k"])
+    store.create("wider_neighbors", np.int32, shape)
 
 
 def _begin_normals(store: FolderStore, config: PipelineConfig) -> None:
@@ -127,15 +140,51 @@ def _begin_edges(store: FolderStore, config: PipelineConfig) -> None:
         store.create("claims", np.bool_, (num_points, order["k"]))
 
 
-_BEGIN = {"neighbors": _begin_neighbors, "normals": _begin_normals, "edges": _begin_edges}
+_BEGIN = {
+    "neighbors": _begin_neighbors,
+    "noise": _begin_noise,
+    "wider_neighbors": _begin_wider,
+    "normals": _begin_normals,
+    "edges": _begin_edges,
+}
 """Make the files whose rows the tiles write; those of a run that ended early keep their rows."""
 
 
-def search_neighbors(store: FolderStore, tile: slice) -> None:
-    """Search the neighbours of the points of a tile."""
-    boxes = Boxes(*(store.get(f"boxes_{name}").numpy() for name in Boxes._fields))
-    found = search_tile(store.lazy("cloud"), boxes, tile, store.known("order")["k"])
-    store.write("neighbors", tile.start, found)
+def search_neighbors(store: FolderStore, tile: slice, name: str, k: int) -> None:
+    """Search the nearest neighbours of the points of a tile."""
+    boxes = Boxes(*(store.get(f"boxes_{part}").numpy() for part in Boxes._fields))
+    store.write(name, tile.start, search_tile(store.lazy("cloud"), boxes, tile, k))
+
+
+def adapts(config: NormalsConfig) -> bool:
+    """Return whether the noise of the whole cloud decides how many neighbours normals have."""
+    return config.method == "consensus" and config.adaptive_k is not None
+
+
+def measure_noise(store: FolderStore, tile: slice, number: int, config: PipelineConfig) -> None:
+    """Measure the noise about the points of a tile."""
+    part = cut_part(store.lazy("neighbors"), tile, NOISE_STEPS)
+    shares = share_of_noise(store.lazy("cloud")[part.rows], part.neighbors, config.chunk_size)
+    store.write("noise", tile.start, shares[part.own])
+
+
+def choose_width(store: FolderStore, config: PipelineConfig) -> None:
+    """Choose the number of neighbours that normals are estimated from."""
+    k = wanted_neighbors(store.get("noise"), store.known("order")["k"], config.normals)
+    store.note("width", k=k)
+
+
+def search_wider(store: FolderStore, tile: slice, number: int, config: PipelineConfig) -> None:
+    """Search so many neighbours of the points of a tile, if they are more than there are."""
+    k = store.known("width")["k"]
+    if k > store.known("order")["k"]:
+        search_neighbors(store, tile, "wider_neighbors", k)
+
+
+def wider_neighbors(store: FolderStore, config: NormalsConfig) -> tuple[str, NormalsConfig]:
+    """Return the array of the neighbours that normals are estimated from, and settings for them."""
+    is_wider = store.known("width").get("k", 0) > store.known("order")["k"]
+    return "wider_neighbors" if is_wider else "neighbors", replace(config, adaptive_k=None)
 
 
 def keep_edges(

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,11 +21,12 @@ from torchrg.batch.tiles import (
     folder_of_work,
     segmented_in_tiles,
 )
-from torchrg.cli import main
+from torchrg.cli import main, segment
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud, stream_cloud
 from torchrg.pipeline import segment_planes
+from torchrg.render import color_planes, render_cloud
 from torchrg.scenes import make_room
 
 LIMIT = "0.542"
@@ -104,7 +106,11 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
         (("--limit-memory", "-1"), "expected --limit-memory > 0, in GB, got -1"),
         (
             ("--limit-memory", LIMIT, "--merge", "--superpoints"),
-            "expected no --superpoints for a cloud .* no tile tells them; raise --limit-memory",
+            "expected no --superpoints for a cloud .* no tile tells it; raise --limit-memory",
+        ),
+        (
+            ("--limit-memory", LIMIT, "--merge", "--picture", "x.png"),
+            r"expected --limit-memory of at least 0\.71 GB for --picture, got 0\.54 GB; raise it",
         ),
         (("--ray-address", "auto"), "expected --ray-address together with --engine ray"),
     ],
@@ -161,6 +167,56 @@ def test_what_is_in_the_way_of_the_work_is_named_and_stays(tmp_path, capsys, mon
         assert message in error
         assert error.count("\n") == 1
         assert [path.name for path in folder.iterdir()] == ["scan.npy"]
+
+
+def draw_in_both_ways(monkeypatch, files, folder, picture, most):
+    """Segment and draw in memory and in tiles; return the results that were drawn."""
+    drawn = []
+
+    def draw(arguments, path, result):
+        drawn.append(result)
+        draw_result(arguments, path, result)
+
+    draw_result = segment._draw
+    monkeypatch.setattr(segment, "_draw", draw)
+    monkeypatch.setattr(segment, "MAX_POINTS", most)
+    monkeypatch.setattr("torchrg.render.gallery.render_cloud", partial(render_cloud, width=80))
+    for name, least in (("whole", 0), ("tiles", 3e9)):
+        monkeypatch.setattr(segment, "memory_of_scan", lambda num_points, least=least: least)
+        (folder / name).mkdir()
+        flags = ("--merge", "--preset", "classic", "--limit-memory", "2")
+        out = ("--out", folder / name / "x.npz", "--picture", folder / name / picture)
+        assert run(*files, *flags, *out) == 0
+    return drawn
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("picture", ["x.png", "x.html"])
+def test_tiles_and_memory_draw_the_same_bytes(rooms, tmp_path, monkeypatch, picture):
+    if picture == "x.html":
+        pytest.importorskip("pydeck")
+    files = (rooms / "a.npz", rooms / "b.npz")
+    draw_in_both_ways(monkeypatch, files, tmp_path, picture, ROOM)
+    whole, tiles = ((tmp_path / name / picture).read_bytes() for name in ("whole", "tiles"))
+    assert whole == tiles
+
+
+def test_a_sample_shows_the_planes_that_memory_finds(rooms, tmp_path, monkeypatch):
+    files, most = (rooms / "a.npz", rooms / "b.npz"), 4_000
+    whole, sample = draw_in_both_ways(monkeypatch, files, tmp_path, "x.png", most)
+    assert most <= len(sample.cloud) <= most + 6
+    label_of = dict(zip(map(bytes, whole.cloud.coordinates), whole.labels.tolist(), strict=True))
+    labels = [label_of[bytes(point)] for point in sample.cloud.coordinates]
+    assert sample.labels.tolist() == labels
+    assert len(set(labels)) == len(whole.planes.count) + 1
+    for one, other in zip(sample.planes[:10], whole.planes[:10], strict=True):
+        assert torch.equal(one, other)
+    colors = color_planes(sample.labels, sample.cloud.points).tolist()
+    assert len({(label, *color) for label, color in zip(labels, colors, strict=True)}) == len(
+        set(labels)
+    )
+    np.testing.assert_array_equal(sample.cloud.origin, whole.cloud.origin)
+    assert sample.whole[:2] == (ROOM, ROOM - 1)
 
 
 def test_tiles_are_as_large_as_memory_allows():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.structures import Cloud, Planes, Segmentation
+from torchrg.structures import PLANE_COLUMNS, Cloud, Planes, Segmentation
 
 
 @pytest.fixture
@@ -37,7 +37,8 @@ def make_segmentation():
         rng = torch.Generator().manual_seed(0)
         normal = torch.nn.functional.normalize(torch.randn(3, 3, generator=rng), dim=1)
         centroid = torch.randn(3, 3, generator=rng)
-        columns = {
+        columns = {name: torch.zeros(3, *shape) for name, (_, shape) in PLANE_COLUMNS.items()}
+        columns |= {
             "normal": normal,
             "offset": (normal * centroid).sum(dim=1),
             "centroid": centroid,

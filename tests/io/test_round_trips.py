@@ -1,6 +1,7 @@
 """What torchrg writes, it reads back, in every format."""
 
 import json
+import re
 import zipfile
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import torchrg.io
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
-from torchrg.structures import Cloud, PlaneAdjacency, Planes, Superpoints
+from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes, Superpoints
 
 EXACT = [".npz", ".npy", ".ply", ".pcd", ".e57"]
 TEXT = [".xyz", ".txt"]
@@ -224,7 +225,8 @@ def test_kinds_adjacency_and_outlines_are_written(tmp_path, make_cloud, make_seg
 
 def test_no_planes_make_a_file_too(tmp_path, make_cloud, make_segmentation):
     seg = make_segmentation(60)
-    none = Planes(*(column[:0] for column in seg.planes[:10]), None, (), None)
+    columns = {name: getattr(seg.planes, name)[:0] for name in PLANE_COLUMNS}
+    none = Planes(**columns, outline=())
     write_cloud(tmp_path / "a.npz", make_cloud(), seg._replace(planes=none))
     with np.load(tmp_path / "a.npz") as result:
         assert result["outline_points"].shape == (0, 3)
@@ -346,7 +348,7 @@ def test_suffix_in_capitals_is_the_same(tmp_path, make_cloud, assert_same):
 @pytest.mark.parametrize("call", [read_cloud, check_output])
 def test_unknown_suffix_lists_the_known_ones(tmp_path, call):
     (tmp_path / "a.stl").write_bytes(b"solid")
-    known = r"\.npz \.npy \.ply \.pcd \.las \.laz \.e57 \.xyz \.txt, got '\.stl'"
+    known = re.escape(f"{' '.join(FORMATS)}, got '.stl'")
     with pytest.raises(FormatError, match=rf"a\.stl: expected a file that ends in one of {known}"):
         call(tmp_path / "a.stl")
 

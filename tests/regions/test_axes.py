@@ -12,7 +12,7 @@ from torchrg.errors import ConfigError
 from torchrg.regions import summarize_planes
 from torchrg.regions.axes import move_planes
 from torchrg.scenes import make_room
-from torchrg.structures import Planes
+from torchrg.structures import PLANE_COLUMNS, Planes
 
 
 def tilted(rng, most_tilt=5.0):
@@ -59,18 +59,18 @@ def table(normals, areas, centers=None, sides=1.0):
     first = torch.nn.functional.normalize(torch.linalg.cross(normals, helper), dim=1)
     axes = torch.stack([first, torch.linalg.cross(normals, first)], dim=1)
     center = torch.zeros(count, 3) if centers is None else torch.tensor(centers)
-    return Planes(
-        normal=normals,
-        offset=(normals * center.double()).sum(dim=1),
-        centroid=center.double(),
-        area=torch.tensor(areas, dtype=torch.float64),
-        count=torch.full((count,), 100),
-        rms=torch.zeros(count),
-        extent=torch.full((count, 2), sides),
-        axes=axes,
-        center=center.double(),
-        curved=torch.zeros(count, dtype=torch.bool),
-    )
+    columns = {name: torch.zeros(count, *shape) for name, (_, shape) in PLANE_COLUMNS.items()}
+    columns |= {
+        "normal": normals,
+        "offset": (normals * center.double()).sum(dim=1),
+        "center": center.double(),
+        "area": torch.tensor(areas, dtype=torch.float64),
+        "count": torch.full((count,), 100),
+        "extent": torch.full((count, 2), sides),
+        "axes": axes,
+        "curved": torch.zeros(count, dtype=torch.bool),
+    }
+    return Planes(**columns)
 
 
 def test_motions_are_rigid_and_turn_least():

@@ -301,11 +301,20 @@ def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
         segment(wall(300), tmp_path / "b", settings("classic"), 100)
 
 
-def test_settings_that_look_at_the_whole_cloud_are_refused(tmp_path):
-    config = settings("consensus")
-    config = dataclasses.replace(config, normals=dataclasses.replace(config.normals, adaptive_k=99))
-    with pytest.raises(ConfigError, match=r"expected normals\.adaptive_k of none, got 99"):
-        segment(wall(300), tmp_path, config, 100)
+@pytest.mark.parametrize(
+    ("noise", "most", "expected"), [(0.15, 20, 20), (0.1, 60, 23), (0.0, 60, 16)]
+)
+def test_noise_of_the_whole_cloud_decides_the_number_of_neighbors(noise, most, expected, tmp_path):
+    points, config = difficult_room(2500), settings("consensus")
+    points += noise * np.random.default_rng(5).normal(size=points.shape).astype(np.float32)
+    normals = dataclasses.replace(config.normals, adaptive_k=most)
+    config = dataclasses.replace(config, normals=normals)
+    whole = segment_planes(Cloud(points).points, config)
+    assert_same(segment(points, tmp_path, config, 900), whole)
+    assert FolderStore(tmp_path).known("width")["k"] == expected
+
+
+def test_a_tile_has_points(tmp_path):
     with pytest.raises(ConfigError, match="expected tile_size >= 1, got 0"):
         segment(wall(300), tmp_path, settings("classic"), 0)
 

@@ -4,7 +4,6 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -31,8 +30,7 @@ class Arguments:
     The planes of the scan say where floors and walls are; settings are those of torchrg segment.
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
+    inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     matrix: Path | None = None

@@ -113,6 +113,15 @@ class PlaneSettings:
         return cls(resolved=load_config(values["--config"] or values["--preset"]))
 
 
+CloudsFlag = Annotated[
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    tyro.conf.arg(
+        help=f"Clouds to read: {' '.join(FORMATS)}. Depth images and organised clouds taken as "
+        "such: see torchrg depth --help."
+    ),
+]
+"""Type of the argument that names clouds."""
 ColumnsFlag = Annotated[
     str | None,
     tyro.conf.arg(

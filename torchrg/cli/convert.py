@@ -88,14 +88,15 @@ class CloudArguments(Arguments):
 class FolderArguments(CloudArguments):
     """Convert every cloud below a folder: normals, curvature, plane labels, table of planes.
 
-    Clouds are files (.npz .npy .ply .pcd .las .laz .e57 .xyz .txt) and folders in Pointcept's
-    layout; with ROOT for OUT, the latter are completed in place. The results of ROOT/a/b.ply are in
-    OUT/a/b. Links are followed, and each file is converted once.
+    Clouds are files of --suffixes and folders in Pointcept's layout; with ROOT for OUT, the latter
+    are completed in place. The results of ROOT/a/b.ply are in OUT/a/b. Links are followed, and each
+    file is converted once.
     """
 
     columns: console.ColumnsFlag = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
-    """Which files are clouds, where two differ in the suffix alone."""
+    """Which files are clouds, by default those that torchrg segment reads; fewer where two differ
+    in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""

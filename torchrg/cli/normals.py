@@ -4,11 +4,10 @@ import dataclasses
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
@@ -29,8 +28,7 @@ RESULTS = ("normals", "curvature", "sharp", "valid")
 class Arguments:
     """Estimate normals and curvature of scans, and tell sharp feature points."""
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
+    inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     method: NormalMethod | None = None

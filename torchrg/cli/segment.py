@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.memory import available_memory, memory_of_scan
+from torchrg.batch.memory import PROCESS_BYTES, available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.batch.task import Reports, Task
@@ -46,17 +46,14 @@ from torchrg.render.gallery import (
     check_gallery,
     draw_entry,
     draw_planes,
+    memory_of_picture,
     write_index,
 )
+from torchrg.render.page import MAX_POINTS
 from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation
 
 STAGES = ("neighbors", "normals", "regions", "planes")
-_WHOLE = {
-    "superpoints": "superpoints merge along chains of any length, so that no tile tells them",
-    "picture": "a picture is drawn of all points at once",
-}
-"""What needs the whole cloud in memory, and why."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 """Flags of depth images, which have a command of their own."""
 
@@ -68,14 +65,12 @@ class Arguments:
     Settings come from the preset, then from --config, then from the flags given here.
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt. Depth images and organised
-    clouds taken as such: see torchrg depth --help."""
+    inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
     """Picture of the planes to write too, a .png file, or page, a .html file; for several inputs a
-    directory of pictures."""
+    directory of pictures. Of a cloud in tiles both show a sample of the points."""
     pages: bool = False
     """Beside each picture in the directory write a page for the browser to turn the cloud in, and
     index.html, in which the pictures link to their pages (pip install 'torchrg[view]')."""
@@ -198,7 +193,7 @@ def _segment(
     if memory_of_scan(num_points) > limit:
         # A header that promises more than the file holds is refused before anything is planned.
         next(iter(stream))
-        _segment_tiles(arguments, sources, stream, target, num_points, limit)
+        _segment_tiles(arguments, sources, stream, target, picture, num_points, limit)
     else:
         _segment_whole(arguments, sources, stream, target, picture)
 
@@ -223,18 +218,25 @@ def _segment_tiles(
     sources: tuple[Path, ...],
     stream: CloudStream,
     target: Path,
+    picture: Path | None,
     num_points: int,
     limit: int,
 ) -> None:
     """Segment a cloud in tiles, after a line that says so."""
     begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
-    for name, reason in _WHOLE.items():
-        if getattr(arguments, name):
-            raise ConfigError(
-                f"{source}: expected no --{name} for a cloud of about {num_points:,} points, which "
-                f"takes more than {limit / 1e9:.2f} GB: {reason}; raise --limit-memory, or leave "
-                "it out."
-            )
+    if arguments.superpoints:
+        raise ConfigError(
+            f"{source}: expected no --superpoints for a cloud of about {num_points:,} points, "
+            f"which takes more than {limit / 1e9:.2f} GB: whether two regions merge depends on the "
+            "merges beside them, and so on through the whole cloud, so that no tile tells it; "
+            "raise --limit-memory, or leave it out."
+        )
+    needed = PROCESS_BYTES + memory_of_picture(min(num_points, MAX_POINTS))
+    if picture is not None and needed > limit:
+        raise ConfigError(
+            f"{source}: expected --limit-memory of at least {needed / 1e9:.2f} GB for --picture, "
+            f"got {limit / 1e9:.2f} GB; raise it, or leave out --picture."
+        )
     try:
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
@@ -268,6 +270,8 @@ def _segment_tiles(
             voxel=arguments.voxel,
         ) as seg:
             write_cloud(target, stream, seg, provenance=_describe(arguments, sources))
+            if picture is not None:
+                _draw(arguments, picture, Result.of_sample(stream, seg, MAX_POINTS))
             seconds, without = time.perf_counter() - begin, console.without(target, fields)
             _report(source, seg, stream.extent, f"{target}{without}", seconds)
 
@@ -355,18 +359,22 @@ def _segment_whole(
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     if picture is not None:
-        result = Result.of(cloud, seg, parts)
-        if arguments.pages:
-            draw_entry(picture.parent, picture.stem, result)
-        elif console.is_page(picture):
-            write_page(picture, make_page(result))
-        else:
-            draw_planes(picture, result)
+        _draw(arguments, picture, Result.of(cloud, seg, parts))
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         print(f"{source}: superpoints of each level: {found}")
     without = console.without(target, cloud.fields)
     _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
+
+
+def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
+    """Write the picture of a result, or the page, or both."""
+    if arguments.pages:
+        draw_entry(picture.parent, picture.stem, result)
+    elif console.is_page(picture):
+        write_page(picture, make_page(result))
+    else:
+        draw_planes(picture, result)
 
 
 def _report(source: str, seg: Segmentation, extent: Extent, target: str, seconds: float) -> None:

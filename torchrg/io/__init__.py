@@ -303,11 +303,10 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | CloudStream | None
         MissingDependencyError: If the format needs an optional package.
 
     Example:
-        >>> check_output("planes.stl")
+        >>> check_output("planes.stl")  # doctest: +ELLIPSIS
         Traceback (most recent call last):
             ...
-        torchrg.errors.FormatError: planes.stl: expected a file that ends in one of .npz .npy \
-.ply .pcd .las .laz .e57 .xyz .txt, got '.stl'.
+        torchrg.errors.FormatError: planes.stl: expected a file that ends in one of .npz ...'.stl'.
     """
     found = _format_of(Path(path))
     check_place(path)

@@ -169,7 +169,10 @@ class CloudStream:
         return origin_of_box(self.extent.low, self.extent.high)
 
     def each(self, change: Callable[[Cloud, slice], Cloud]) -> "CloudStream":
-        """Change each chunk, of which the rows in the whole cloud are told, but not its points."""
+        """Change each chunk, of which the rows in the whole cloud are told.
+
+        Its points may only change if nobody asks for the extent or the count.
+        """
 
         def changed() -> Iterator[Cloud]:
             start = 0

@@ -55,16 +55,17 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 """Estimators by name: points, their neighbours, settings, chunk size -> fit."""
 
-_NOISE_STEPS = 3
+NOISE_STEPS = 3
 STEPS = dict.fromkeys(ESTIMATORS, 1) | {
-    "irls": _NOISE_STEPS,
+    "irls": NOISE_STEPS,
     "paper": 2,
-    "consensus": _NOISE_STEPS + 1 + 2 * constants.NUM_PASSES,
+    "consensus": NOISE_STEPS + 1 + 2 * constants.NUM_PASSES,
 }
 """Steps from neighbour to neighbour within which the points lie that decide the fit of a point. It
 is 1 where only the point's own neighbourhood decides. Each step of an estimate of the noise adds
 one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles.
-``consensus`` with ``adaptive_k`` looks at the whole cloud."""
+``consensus`` with ``adaptive_k`` looks at the whole cloud, but only for the number of neighbours:
+see :func:`torchrg.normals.consensus.wanted_neighbors`."""
 
 
 @sequential_operations()

@@ -14,6 +14,8 @@ from torchrg.result import Result
 
 INDEX = "index.html"
 """Name of the index in its folder."""
+_IMAGE_BYTES, _BYTES_PER_POINT = 200_000_000, 200
+"""Memory that the pixels of a picture take, and each of its points; a page takes no more."""
 
 
 class Entry(NamedTuple):
@@ -42,6 +44,16 @@ def draw_planes(path: str | os.PathLike[str], result: Result) -> None:
         normals=None if normals is None else normals.to(points.dtype),
     )
     write_png(path, picture)
+
+
+def memory_of_picture(num_points: int) -> int:
+    """Return the bytes that a picture or a page of a result takes.
+
+    Example:
+        >>> memory_of_picture(1_000_000)
+        400000000
+    """
+    return _IMAGE_BYTES + _BYTES_PER_POINT * num_points
 
 
 def check_gallery(folder: Path, names: Sequence[str]) -> None:

@@ -28,6 +28,7 @@ from torch.nn import functional
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
+from torchrg.io.stream import Extent
 from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
 from torchrg.render.content import (
     PAGE_EXTENT,
@@ -245,11 +246,11 @@ def _describe_cloud(
         if channel.colors is not None:
             arrays[f"{channel.mode} colors"] = channel.colors
     manifest, blob = _pack(arrays)
-    num_finite = int(cloud.finite.sum())
+    whole = result.whole or Extent.of(cloud)
     scene = {
         "name": Path(cloud.source).name or "cloud",
-        "count": len(cloud),
-        "finite": num_finite,
+        "count": whole.num_points,
+        "finite": whole.num_finite,
         "shown": len(shown.rows),
         "levels": shown.levels,
         "low": low.tolist(),

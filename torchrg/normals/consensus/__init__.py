@@ -77,7 +77,7 @@ def estimate_consensus(
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = survey_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
-        count = _wanted_neighbors(survey, neighbors, config.adaptive_k)
+        count = wanted_neighbors(_share_of_noise(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
@@ -98,12 +98,45 @@ def estimate_consensus(
     return NormalFit(planes.normals, curvature, fit.valid, residual_rms, sharp)
 
 
-def _wanted_neighbors(survey: Survey, neighbors: Neighbors, most: int) -> int:
-    """Return the number of neighbours with which noise is a small share of the radius."""
-    num_points, count = neighbors.indices.shape
+def _share_of_noise(survey: Survey) -> Tensor:
+    """Return the noise by the radius of each neighbourhood, shape ``(N,)``; NaN where unknown."""
     known = survey.noise.isfinite() & (survey.radius > 0)
-    if not bool(known.any()):
+    return torch.where(known, survey.noise / survey.radius, torch.nan)
+
+
+@torch.no_grad()
+def share_of_noise(points: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
+    """Return the noise by the radius of each neighbourhood, shape ``(N,)``; NaN where unknown.
+
+    It is that of the fits with which :func:`estimate_consensus` begins.
+
+    Example:
+        >>> floor = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
+        >>> bool((share_of_noise(floor, search_knn(floor, 30), 256) < 1e-5).all())
+        True
+    """
+    if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
+        return torch.full_like(points[:, 0], torch.nan)
+    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    size = min(chunk_size, ROWS_IN_CACHE)
+    return _share_of_noise(survey_noise(points, neighbors, fit, chunk_size=size))
+
+
+def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
+    """Return the number of neighbours with which noise is a small share of the radius.
+
+    Args:
+        shares: Those of all points with ``count`` neighbours, as of :func:`share_of_noise`.
+        count: Number of neighbours.
+        config: ``adaptive_k`` is the most there may be.
+
+    Example:
+        >>> shares = torch.full((500,), 0.3)
+        >>> wanted_neighbors(shares, 50, NormalsConfig(adaptive_k=300))
+        200
+    """
+    known = shares[~shares.isnan()]
+    if config.adaptive_k is None or len(known) == 0:
         return count
-    share = float((survey.noise[known] / survey.radius[known]).median())
-    wanted = round(count * (share / constants.ADAPTIVE_NOISE) ** 2)
-    return min(max(count, wanted), most, num_points)
+    wanted = round(count * (float(known.median()) / constants.ADAPTIVE_NOISE) ** 2)
+    return min(max(count, wanted), config.adaptive_k, len(shares))
