@@ -22,7 +22,14 @@ def changes(settings, base):
     ("name", "expected"),
     [
         ("s3dis", {("growing", "min_size"): 100, ("planes", "up"): "z"}),
-        ("scannet", {("normals", "k"): 30, ("planes", "up"): "z"}),
+        (
+            "scannet",
+            {
+                ("normals", "noise_scope"): "regional",
+                ("growing", "min_size"): 20,
+                ("planes", "up"): "z",
+            },
+        ),
         ("laser", {("planes", "up"): "z"}),
         ("rgbd", {("normals", "k"): 100, ("growing", "min_size"): 100}),
     ],

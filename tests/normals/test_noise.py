@@ -83,3 +83,28 @@ def test_masked_neighbours_take_memory_by_chunks_only():
     assert results.most < counted.numel()
     whole = survey_noise(points, neighbors, fit)
     assert torch.allclose(found.noise, whole.noise, rtol=1e-5)
+
+
+def ramped_step(offset, ramp, noise, spacing=0.02):
+    """A board parallel to a wall, and the step about it as a slope so many points wide.
+
+    Returns the points, and which of them are on the board beyond the slope.
+    """
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(10_000, 3, generator=generator) * 100 * spacing
+    outside = (points[:, :2] - 50 * spacing).abs().amax(dim=1) - 8 * spacing
+    slope = (0.5 - outside / (ramp * spacing)).clamp(0, 1)
+    points[:, 2] = offset * slope + noise * torch.randn(10_000, generator=generator)
+    return points, slope == 1
+
+
+@pytest.mark.parametrize(("offset", "ramp"), [(0.03, 2), (0.05, 3), (0.07, 2), (0.1, 4)])
+@pytest.mark.parametrize("noise", [0.002, 0.004])
+def test_a_step_that_was_rounded_is_no_noise_of_the_region(offset, ramp, noise):
+    points, board = ramped_step(offset, ramp, noise)
+    neighbors = search_knn(points, 50)
+    fit = fit_points(points, neighbors, fit_normals_pca)
+    assert survey_noise(points, neighbors, fit).noise[board].median() > 1.3 * noise
+    found = survey_noise(points, neighbors, fit, regional=True).noise
+    assert found[board].max() < 1.3 * noise
+    assert found.min() > 0.6 * noise

@@ -59,12 +59,12 @@ _NOISE_STEPS = 3
 STEPS = dict.fromkeys(ESTIMATORS, 1) | {
     "irls": _NOISE_STEPS,
     "paper": 2,
-    "consensus": _NOISE_STEPS + 1 + 2 * constants.NUM_PASSES,
+    "consensus": _NOISE_STEPS + constants.REGIONAL_STEPS + 1 + 2 * constants.NUM_PASSES,
 }
 """Steps from neighbour to neighbour within which the points lie that decide the fit of a point. It
 is 1 where only the point's own neighbourhood decides. Each step of an estimate of the noise adds
-one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles.
-``consensus`` with ``adaptive_k`` looks at the whole cloud."""
+one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles; the
+noise of a region takes some more. ``consensus`` with ``adaptive_k`` looks at the whole cloud."""
 
 
 @sequential_operations()

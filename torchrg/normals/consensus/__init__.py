@@ -55,7 +55,8 @@ def estimate_consensus(
     Args:
         points: Points, shape ``(N, 3)``.
         neighbors: Neighbours of all points.
-        config: ``adaptive_k`` is used; the estimator finds all other scales itself.
+        config: ``adaptive_k`` and ``noise_scope`` are used; the estimator finds all other scales
+            itself.
         chunk_size: Points handled at a time.
 
     Returns:
@@ -75,13 +76,14 @@ def estimate_consensus(
     fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
     if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))
-    survey = survey_noise(points, neighbors, fit, chunk_size=size)
+    regional = config.noise_scope == "regional"
+    survey = survey_noise(points, neighbors, fit, regional=regional, chunk_size=size)
     if config.adaptive_k is not None:
         count = _wanted_neighbors(survey, neighbors, config.adaptive_k)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
-            survey = survey_noise(points, neighbors, fit, chunk_size=size)
+            survey = survey_noise(points, neighbors, fit, regional=regional, chunk_size=size)
     noise = survey.noise
 
     planes, sharp, voted = fit_surfaces(points, neighbors, fit, survey, chunk_size=size)

@@ -43,7 +43,12 @@ class Survey(NamedTuple):
 
 
 def survey_noise(
-    points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = CHUNK_SIZE
+    points: Tensor,
+    neighbors: Neighbors,
+    fit: NormalFit,
+    *,
+    regional: bool = False,
+    chunk_size: int = CHUNK_SIZE,
 ) -> Survey:
     r"""Estimate the noise about each point, at edges and on curved surfaces too.
 
@@ -65,6 +70,7 @@ def survey_noise(
         points: Points, shape ``(N, 3)``.
         neighbors: Neighbours of all points.
         fit: Planes of all neighbours.
+        regional: Whether the noise is at most that of the region, see :func:`regional_noise`.
         chunk_size: Points handled at a time.
 
     Returns:
@@ -110,7 +116,39 @@ def survey_noise(
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
     common = _neighbor_quantiles(noise, neighbors, constants.COMMON_QUANTILE)
     noise = torch.minimum(noise, constants.MAX_ABOVE_COMMON * common)
+    if regional:
+        noise = torch.minimum(noise, regional_noise(noise, neighbors))
     return Survey(offsets, whole, torch.maximum(noise, floor), radius)
+
+
+def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
+    """Return the noise of the region around each point from the noise about single ones.
+
+    Where a reconstruction has rounded the step between two parallel faces into a ramp, no
+    neighbourhood on it is of one face, not even the smallest, and all of them find the step to be
+    noise. Beside it they do not. The noise of the region is a low quantile over the neighbours, of
+    that over theirs, and so on: each step brings in what is one neighbourhood farther away.
+
+    Nothing else than steps from neighbour to neighbour is asked, so that a part of a cloud with the
+    points around it gives what the whole gives.
+
+    Args:
+        noise: Noise about each point, shape ``(N,)``.
+        neighbors: Neighbours of all points.
+
+    Returns:
+        Noise of the region, shape ``(N,)``.
+
+    Example:
+        >>> line = torch.arange(8)
+        >>> neighbors = Neighbors(torch.stack([line, line - 1, line + 1], dim=1).clamp(0, 7).int())
+        >>> noise = torch.tensor([1.0, 1, 1, 9, 9, 1, 1, 1])
+        >>> regional_noise(noise, neighbors)
+        tensor([1., 1., 1., 1., 1., 1., 1., 1.])
+    """
+    for _ in range(constants.REGIONAL_STEPS):
+        noise = _neighbor_quantiles(noise, neighbors, constants.REGIONAL_QUANTILE)
+    return noise
 
 
 def _deviations(
