@@ -21,7 +21,14 @@ def changes(settings, base):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("s3dis", {("growing", "min_size"): 100, ("planes", "up"): "z"}),
+        (
+            "s3dis",
+            {
+                ("growing", "facet_tolerance"): 0.009,
+                ("growing", "min_size"): 200,
+                ("planes", "up"): "z",
+            },
+        ),
         (
             "scannet",
             {

@@ -129,6 +129,9 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
     noise. Beside it they do not. The noise of the region is a low quantile over the neighbours, of
     that over theirs, and so on: each step brings in what is one neighbourhood farther away.
 
+    Where the noise of each point is its own, as scanners have it, estimates scatter, and this is
+    about three quarters of it.
+
     Nothing else than steps from neighbour to neighbour is asked, so that a part of a cloud with the
     points around it gives what the whole gives.
 
