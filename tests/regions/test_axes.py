@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from torchrg import align_axes, segment_planes
 from torchrg.errors import ConfigError
+from torchrg.regions import summarize_planes
+from torchrg.regions.axes import move_planes
 from torchrg.scenes import make_room
 from torchrg.structures import Planes
 
@@ -126,3 +128,23 @@ def test_what_has_no_axes_is_refused():
             align_axes(planes)
     with pytest.raises(ConfigError, match="expected up to be three numbers"):
         align_axes(table([[0, 0, 1]], [9.0]), up=(0, 0, 0))
+
+
+def test_tables_are_moved_as_if_made_of_moved_points():
+    room = make_room(num_points=6_000, noise=0.003, seed=2)
+    turn = torch.from_numpy(Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix())
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = turn, torch.tensor([3.0, -4, 5])
+    points, normals = room.points.double(), room.normals.double()
+    labels = torch.unique(room.labels, return_inverse=True)[1]
+    given = summarize_planes(points, normals, labels, outline=True)
+    moved = move_planes(given, motion)
+    expected = summarize_planes(points @ turn.T + motion[:3, 3], normals @ turn.T, labels)
+    for name in ("normal", "offset", "centroid"):
+        # Of a few points any of several planes is best.
+        found, wanted = (getattr(table, name)[given.count > 5] for table in (moved, expected))
+        assert torch.allclose(found, wanted, atol=1e-9), name
+    rings = [ring for rings in moved.outline for ring in rings]
+    owners = [i for i, rings in enumerate(moved.outline) for _ in rings]
+    for owner, ring in zip(owners, rings, strict=True):
+        assert torch.allclose(ring @ moved.normal[owner], moved.offset[owner], atol=1e-6)

@@ -20,6 +20,7 @@ COMMANDS = {
     "segment": "label the planes of scans",
     "depth": "label the planes of depth images and of organised clouds",
     "normals": "estimate normals and curvature of scans",
+    "align": "set scans upright, with their walls along x and y",
     "convert": "segment every scan of a data set, on one machine or a cluster",
     "score": "compare labels and normals with a truth",
     "sample": "make a synthetic room with its truth",

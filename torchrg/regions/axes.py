@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.linalg.eigen import eigh3_of_few
+from torchrg.regions.fit import with_table_sign
 from torchrg.structures import Planes, Segmentation
 
 _MOST_TILT_DEG = 30.0
@@ -82,6 +83,55 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
     motion[:3, :3] = rotation
     motion[:3, 3] = -_origin(planes, rotation)
     return motion
+
+
+def move_planes(planes: Planes, motion: Tensor) -> Planes:
+    """Return a plane table in coordinates that a rigid motion leads to.
+
+    Args:
+        planes: A table of M planes.
+        motion: Shape ``(4, 4)``, as :func:`align_axes` gives it.
+
+    Returns:
+        The same planes. Normals have the sign that every table gives them.
+
+    Example:
+        >>> from torchrg.regions import summarize_planes
+        >>> floor = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
+        >>> up = torch.tensor([0.0, 0, 1]).expand(16, 3)
+        >>> table = summarize_planes(floor, up, torch.zeros(16, dtype=torch.int64))
+        >>> motion = torch.eye(4, dtype=torch.float64)
+        >>> motion[2, 3] = 5
+        >>> move_planes(table, motion).offset.tolist()
+        [5.0]
+    """
+    dtype = planes.normal.dtype
+    rotation, shift = motion[:3, :3].to(planes.normal.device), motion[:3, 3]
+    shift = shift.to(planes.normal.device)
+
+    def turned(vectors: Tensor) -> Tensor:
+        return vectors.double() @ rotation.T
+
+    def moved(points: Tensor) -> Tensor:
+        return (turned(points) + shift).to(dtype)
+
+    normal = with_table_sign(turned(planes.normal))
+    center = turned(planes.center) + shift
+    # On the plane, and nearer than the origin, so that little is lost where that is far.
+    foot = planes.center.double() - planes.normal.double() * (
+        (planes.center.double() * planes.normal.double()).sum(dim=1) - planes.offset.double()
+    ).unsqueeze(1)
+    outline = planes.outline
+    if outline is not None:
+        outline = tuple(tuple(moved(ring) for ring in rings) for rings in outline)
+    return planes._replace(
+        normal=normal.to(dtype),
+        offset=((turned(foot) + shift) * normal).sum(dim=1).to(dtype),
+        centroid=moved(planes.centroid),
+        center=center.to(dtype),
+        axes=turned(planes.axes).to(dtype),
+        outline=outline,
+    )
 
 
 def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:

@@ -138,7 +138,7 @@ def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> Region
         centered = [x - segments.spread(m) for x, m in zip(local, mean.unbind(dim=1), strict=True)]
         covariance = _covariances(segments, centered, weights)
         variances, axes = eigh3_of_few(covariance)
-        normal = _with_sign(_plane_normals(variances, axes, usual))
+        normal = with_table_sign(_plane_normals(variances, axes, usual))
         residuals = coordinates_along(segments, centered, normal)
         thickness = MAD_FACTOR * segments.median(residuals.abs())
         if last == _NUM_FITS - 1:
@@ -242,7 +242,7 @@ def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
     return torch.where(is_flat[:, None], axes[:, :, 0], across)
 
 
-def _with_sign(normals: Tensor) -> Tensor:
+def with_table_sign(normals: Tensor) -> Tensor:
     """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
     magnitudes = normals.abs()
     near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)

@@ -1,0 +1,164 @@
+"""``torchrg align``: scans set upright, with their walls along x and y."""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg.batch.records import describe_run
+from torchrg.batch.scans import check_finite
+from torchrg.cli import console
+from torchrg.cli.loop import run_each
+from torchrg.errors import ConfigError
+from torchrg.io import atomic_path, check_output, read_cloud, write_cloud
+from torchrg.io.files import check_place
+from torchrg.pipeline import segment_planes
+from torchrg.regions.axes import align_axes, move_planes
+from torchrg.structures import Cloud, Segmentation
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Set scans upright, with walls along x and y, the lowest floor at z = 0, the middle at 0, 0.
+
+    The planes of the scan say where floors and walls are; settings are those of torchrg segment.
+    """
+
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Clouds to read: .npz .npy .ply .pcd .las .laz .e57 .xyz .txt."""
+    out: Path
+    """File to write, its format by suffix; for several inputs a directory."""
+    matrix: Path | None = None
+    """Also write the motion: .npy holds it as 4 x 4 numbers, .txt as the line axisAlignment of
+    ScanNet. For one input."""
+    segment: bool = False
+    """Write labels, normals, curvature and the table of planes too, as torchrg segment does."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Where up is in the input, to within 30 degrees."""
+    threads: int | None = None
+    """Threads to use. Default: as torch decides, usually one a core."""
+    columns: console.ColumnsFlag = None
+    settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
+
+
+def run(argv: list[str]) -> int:
+    """Parse the arguments, align each input and write it."""
+    start = Arguments(
+        inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
+    )
+    arguments = console.parse(Arguments, argv, prog="torchrg align", default=start)
+    if not any(arguments.up):
+        raise ConfigError(f"expected --up to be a direction, got {arguments.up}.")
+    console.use_threads(arguments.threads)
+    console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    outputs = console.output_paths(arguments.inputs, arguments.out)
+    console.check_apart(outputs, arguments.inputs)
+    if arguments.matrix is not None:
+        _check_matrix(arguments, arguments.matrix, outputs)
+    names = list(map(str, arguments.inputs))
+    return run_each(_align_file, arguments, names, arguments.inputs, outputs)
+
+
+def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
+    """Refuse a file for the motion that cannot be written, or stands for several."""
+    if len(arguments.inputs) > 1:
+        raise ConfigError(f"expected one input with --matrix, got {len(arguments.inputs)}.")
+    if path.suffix.lower() not in (".npy", ".txt"):
+        raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
+    console.check_apart([path], [*arguments.inputs, *outputs])
+    check_place(path)
+
+
+def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
+    """Align one file."""
+    begin = time.perf_counter()
+    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    cloud = read_cloud(source, columns=names.of(source))
+    console.note_input(f"{source}", cloud, target, _results(arguments))
+    for note in check_finite(cloud):
+        console.warn(f"{source}: {note}.")
+    check_output(target, dataclasses.replace(cloud, header={}))
+    settings = arguments.settings.resolved
+    with console.stage_bar(source.name, ("neighbors", "normals", "regions", "planes")) as advance:
+        seg = segment_planes(cloud.points, settings, on_stage=advance)
+    try:
+        with console.warnings_as_lines():
+            motion = align_axes(seg, up=arguments.up)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
+    # That of the coordinates in the file; points are about their origin.
+    whole = motion.clone()
+    whole[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
+    moved = move_cloud(cloud, whole)
+    found = _move(seg, motion, moved.origin) if arguments.segment else None
+    provenance = describe_run(source, settings) | {"motion": whole.tolist()}
+    write_cloud(target, moved, found, provenance=provenance)
+    if arguments.matrix is not None:
+        _write_matrix(arguments.matrix, whole.numpy())
+    tilt, turn = _angles(whole)
+    seconds = time.perf_counter() - begin
+    print(
+        f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
+        f"{seconds:.1f} s -> {target}"
+    )
+
+
+def _results(arguments: Arguments) -> tuple[str, ...]:
+    """Return the names of what is written of each point beside the fields of the cloud."""
+    return ("labels", "normals", "curvature") if arguments.segment else ()
+
+
+def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
+    """Return a cloud after a rigid motion ``(4, 4)`` of its coordinates and normals.
+
+    What its file says about places, as a viewpoint or a coordinate system, is left out. Points that
+    are not finite stay as they are.
+
+    Example:
+        >>> cloud = Cloud(np.array([[1.0, 2, 3]]), {"normals": np.array([[1.0, 0, 0]])})
+        >>> quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        >>> moved = move_cloud(cloud, quarter.double())
+        >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
+        ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
+    """
+    rotation, coordinates, kept = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
+    # Far from the origin most digits are those of the place, which a turn would spread over all.
+    shift = motion[:3, 3].numpy() + rotation @ cloud.origin
+    coordinates[kept] = (cloud.coordinates[kept] - cloud.origin) @ rotation.T + shift
+    fields = dict(cloud.fields)
+    for name in ("normals", "normals_input"):
+        if name in fields:
+            fields[name] = (fields[name] @ rotation.T).astype(fields[name].dtype)
+    return dataclasses.replace(cloud, coordinates=coordinates, fields=fields, header={})
+
+
+def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Segmentation:
+    """Return a segmentation after a rigid motion, about the origin of the moved cloud."""
+    about = motion.clone()
+    about[:3, 3] -= torch.from_numpy(origin)
+    normals = (seg.normals.double() @ motion[:3, :3].T).to(seg.normals.dtype)
+    return seg._replace(normals=normals, planes=move_planes(seg.planes, about), points=None)
+
+
+def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:
+    """Write a motion as an array, or as the line that ScanNet has in the text of a scan."""
+    with atomic_path(path) as beside:
+        if path.suffix.lower() == ".npy":
+            np.save(beside, matrix)
+        else:
+            numbers = " ".join(f"{value:.9f}" for value in matrix.reshape(-1))
+            beside.write_text(f"axisAlignment = {numbers}\n", encoding="utf-8")
+
+
+def _angles(motion: Tensor) -> tuple[float, float]:
+    """Return how far a motion tilts the z axis, and turns about it, in degrees."""
+    tilt = torch.rad2deg(motion[2, 2].clamp(-1, 1).acos())
+    turn = torch.rad2deg(torch.atan2(motion[1, 0], motion[0, 0]))
+    return float(tilt), float(turn)
