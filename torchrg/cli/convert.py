@@ -122,7 +122,10 @@ def _places_below(root: Path) -> list[Path] | None:
 
 @dataclass(frozen=True)
 class S3DISArguments(CloudArguments):
-    """Convert S3DIS as it is released into Pointcept's layout, with normals and planes."""
+    """Convert S3DIS as it is released into Pointcept's layout, with normals and planes.
+
+    Settings are those of the preset s3dis unless told otherwise.
+    """
 
     areas: tuple[int, ...] = ()
     """Numbers of the areas. Default: those that are there."""
