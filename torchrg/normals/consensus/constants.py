@@ -32,8 +32,8 @@ by it, as no neighbourhood is flat there."""
 MAX_ABOVE_COMMON = 3.0
 """Times. Noise that is larger than the common noise by this factor is taken for shape."""
 REGIONAL_STEPS = 4
-"""Steps from neighbour to neighbour. So far away is noise that counts as that of the region: with
-three, steps about things 30 cm wide are still noise."""
+"""Steps. So many from neighbour to neighbour away is noise that counts as that of the region, where
+it is asked for: with three, more small faces of fused meshes stay part of the one behind them."""
 REGIONAL_QUANTILE = 0.1
 """Share. Quantile over the neighbours in each of these steps: higher ones do not leave the slope of
 a step, as a neighbourhood at its end lies on it for the most part."""
