@@ -51,6 +51,11 @@ class NormalsConfig:
     """Largest number of neighbours that consensus may use in noisy clouds, where k are too few to
     tell faces apart. None: always k."""
 
+    noise_scope: Literal["local", "regional"] = "local"
+    """What consensus takes for the noise about a point: what it finds there, or at most what it
+    finds in the region around, within four neighbourhoods. Where a reconstruction has rounded a
+    step between parallel faces into a ramp, the ramp looks like noise to the points on it."""
+
     def __post_init__(self) -> None:
         _require(self, "k", ">= 3", self.k >= 3)
         most = self.adaptive_k
@@ -100,6 +105,10 @@ class GrowingConfig:
     cut_bridges: bool = False
     """Whether regions of several faces that a few points join are split: faces 12 degrees apart,
     floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
+    facet_tolerance: float | None = None
+    """After growth, regions that touch and lie within this distance of one plane, root mean square,
+    become one, in the unit of the cloud: points drawn from a mesh lie exactly on its facets, of
+    which a flat face has several. None: they do not."""
     max_plane_residual: float | None = None
     """After growth, points farther from the plane of their region than this many times its
     thickness lose their label. None: they keep it."""
@@ -130,6 +139,8 @@ class GrowingConfig:
         for name in ("max_distance", "plane_reach"):
             value = getattr(self, name)
             _require(self, name, ">= 0 or none", value is None or value >= 0)
+        facets = self.facet_tolerance
+        _require(self, "facet_tolerance", "> 0 or none", facets is None or facets > 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
         residual = self.max_plane_residual
         _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)

@@ -30,7 +30,7 @@ from torchrg.neighbors import (
     search_knn,
 )
 from torchrg.neighbors.tiles import Part, cut_part
-from torchrg.normals import ESTIMATORS, STEPS
+from torchrg.normals import ESTIMATORS, steps_of
 from torchrg.regions import partition_points, summarize_planes
 from torchrg.regions.edges import EDGE_STEPS, GrowingCloud
 from torchrg.regions.growth import (
@@ -336,7 +336,7 @@ def estimate_normals(store: Store, block: slice, number: int, config: PipelineCo
     lists, settings = "neighbors", config.normals
     if isinstance(store, FolderStore):
         lists, settings = tiles.wider_neighbors(store, settings)
-    part = _around(store, block, STEPS[settings.method], lists)
+    part = _around(store, block, steps_of(settings), lists)
     points = store.lazy("cloud")[part.rows]
     fit = ESTIMATORS[settings.method](points, part.neighbors, settings, config.chunk_size)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp

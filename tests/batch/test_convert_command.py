@@ -3,13 +3,16 @@
 import io
 import json
 import shutil
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tqdm import tqdm
 
+from tests.datasets.s3dis_tree import write_clean_room
 from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.records import RECORD
 from torchrg.batch.run import BatchReport
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
@@ -188,3 +191,14 @@ def test_depth_frames_are_counted_by_the_second():
     assert "640 points in 4.0 s: 160 points, 0.25 frames a second" in format_report(
         report, unit="frame"
     )
+
+
+@pytest.mark.filterwarnings("ignore:.*expected .* rooms")
+@pytest.mark.parametrize(("flags", "preset"), [([], "s3dis"), (["--preset", "classic"], "classic")])
+def test_s3dis_has_the_settings_made_for_it_unless_told_otherwise(flags, preset, tmp_path):
+    write_clean_room(tmp_path / "in" / "Area_1" / "office_1", 1, {"wall_1": 300, "floor_1": 300})
+    main(["convert", "s3dis", str(tmp_path / "in"), str(tmp_path / "out"), *flags])
+    (record,) = (tmp_path / "out").rglob(RECORD)
+    used, expected = json.loads(record.read_text())["config"], asdict(load_config(preset))
+    for section in ("normals", "growing", "planes"):
+        assert used[section] == expected[section]

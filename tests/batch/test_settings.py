@@ -21,8 +21,22 @@ def changes(settings, base):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("s3dis", {("growing", "min_size"): 100, ("planes", "up"): "z"}),
-        ("scannet", {("normals", "k"): 30, ("planes", "up"): "z"}),
+        (
+            "s3dis",
+            {
+                ("growing", "facet_tolerance"): 0.009,
+                ("growing", "min_size"): 200,
+                ("planes", "up"): "z",
+            },
+        ),
+        (
+            "scannet",
+            {
+                ("normals", "noise_scope"): "regional",
+                ("growing", "min_size"): 20,
+                ("planes", "up"): "z",
+            },
+        ),
         ("laser", {("planes", "up"): "z"}),
         ("rgbd", {("normals", "k"): 100, ("growing", "min_size"): 100}),
     ],

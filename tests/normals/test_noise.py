@@ -5,10 +5,12 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.made import make_shape
+from torchrg.config import load_config
 from torchrg.neighbors import search_knn
 from torchrg.normals.consensus.noise import survey_noise
 from torchrg.normals.patches import fit_points
 from torchrg.normals.pca import fit_normals_pca
+from torchrg.pipeline import segment_planes
 from torchrg.structures import Neighbors
 
 
@@ -83,3 +85,42 @@ def test_masked_neighbours_take_memory_by_chunks_only():
     assert results.most < counted.numel()
     whole = survey_noise(points, neighbors, fit)
     assert torch.allclose(found.noise, whole.noise, rtol=1e-5)
+
+
+def ramped_step(offset, ramp, noise, half_width, spacing=0.02):
+    """A board parallel to a wall, and the step about it as a slope so many points wide.
+
+    Returns the points, and the height of each as a share of that of the board.
+    """
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(10_000, 3, generator=generator) * 100 * spacing
+    outside = (points[:, :2] - 50 * spacing).abs().amax(dim=1) - half_width * spacing
+    slope = (0.5 - outside / (ramp * spacing)).clamp(0, 1)
+    points[:, 2] = offset * slope + noise * torch.randn(10_000, generator=generator)
+    return points, slope
+
+
+@pytest.mark.parametrize(("offset", "ramp"), [(0.03, 2), (0.05, 3), (0.07, 2), (0.1, 4)])
+def test_a_step_that_was_rounded_is_no_noise_of_the_region(offset, ramp):
+    points, height = ramped_step(offset, ramp, 0.001, 4)
+    neighbors = search_knn(points, 50)
+    fit = fit_points(points, neighbors, fit_normals_pca)
+    assert survey_noise(points, neighbors, fit).noise[height == 1].median() > 0.0013
+    found = survey_noise(points, neighbors, fit, regional=True).noise
+    assert found.max() < 0.001
+    assert found.median() > 0.0007
+    assert found.min() > 0.0005
+
+
+@pytest.mark.parametrize(
+    ("offset", "ramp", "noise"),
+    [(0.015, 1, 0.002), (0.025, 2, 0.004), (0.05, 3, 0.004), (0.1, 4, 0.004)],
+)
+def test_a_board_a_few_times_the_noise_off_its_wall_is_a_face(offset, ramp, noise):
+    points, height = ramped_step(offset, ramp, noise, 5)
+    labels = segment_planes(points, load_config("scannet")).labels
+    wall = labels[height == 0].mode().values
+    board = labels[height == 1]
+    assert float((labels[height == 0] == wall).float().mean()) > 0.97
+    assert float((board == wall).float().mean()) < 0.25
+    assert float((board == board.mode().values).float().mean()) > 0.7

@@ -13,7 +13,8 @@ from torchrg.regions import grow_regions
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
-from torchrg.regions.repair import absorb_points, refine_regions
+from torchrg.regions.growth import label_regions
+from torchrg.regions.repair import absorb_points, merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 OFF = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)
@@ -224,6 +225,53 @@ def test_planes_of_large_regions_are_those_of_all_their_points():
     assert (away - full.distances(cloud.points, labels)).abs().max() < 1e-3
 
 
+def faceted_face(rng, height, bend):
+    """Points exactly on the facets of a mesh of a face that bends, and the number of their facet.
+
+    The corners of the facets, 20 cm apart, are off by some height.
+    """
+    corners = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0), indexing="ij"), axis=2) * 0.2
+    heights = rng.uniform(-height, height, (11, 11)) + bend * corners[:, :, 0] ** 2
+    cell, (u, v) = rng.integers(0, 10, (20_000, 2)), rng.uniform(0, 1, (2, 20_000))
+    lower = u + v < 1
+    x, y = cell.T
+    across = heights[x + 1, y], heights[x, y + 1]
+    base = np.where(lower, heights[x, y], heights[x + 1, y + 1])
+    first, second = np.where(lower, u, 1 - v), np.where(lower, v, 1 - u)
+    z = base + first * (across[0] - base) + second * (across[1] - base)
+    points = np.stack([0.2 * (x + u), 0.2 * (y + v), z], axis=1)
+    return points, (10 * x + y) * 2 + lower
+
+
+@pytest.mark.parametrize("height", [0.005, 0.012])
+def test_facets_of_a_flat_face_become_one_and_those_of_a_bend_do_not(height):
+    rng = np.random.default_rng(17)
+    config = with_settings(min_size=100, facet_tolerance=0.009)
+    for bend, fewest, most in ((0.0, 1, 1), (0.2, 3, 25)):
+        points, facet = faceted_face(rng, height, bend)
+        cloud, order = flat_cloud(points)
+        grown = torch.from_numpy(facet)[order]
+        assert label_regions(cloud, grown, with_settings(), 4096).max() == 199
+        found = label_regions(cloud, grown, config, 4096)
+        assert fewest <= int(found.max()) + 1 <= most
+        planes = fit_regions(cloud, found, config)
+        assert planes.rms.max() < 0.009
+
+
+def test_a_thin_side_is_no_facet_of_the_face_beside_it():
+    rng = np.random.default_rng(18)
+    front, side = sheet(rng, 3000, 0.0), sheet(rng, 300, 0.0)
+    side = np.stack([1 + side[:, 2], side[:, 1], -0.01 * side[:, 0]], axis=1)
+    points = np.concatenate([front, side])
+    cloud, order = flat_cloud(points)
+    labels = (order >= 3000).long()
+    contacts, planes = (
+        NearestPoints(cloud.neighbors).contacts(labels),
+        fit_regions(cloud, labels, OFF),
+    )
+    assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == 2
+
+
 def scattered(rng, count, angle_deg):
     """Upward normals that are off by some degrees along both axes."""
     slopes = np.tan(np.radians(angle_deg)) * rng.normal(size=(count, 2))
@@ -332,6 +380,7 @@ def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
         ("absorb_reach", -1.0),
         ("absorb_angle_deg", 91.0),
         ("merge_tolerance", 0.9),
+        ("facet_tolerance", 0.0),
         ("max_distance", -1.0),
     ],
 )

@@ -98,19 +98,21 @@ class PlaneSettings:
     )
 
     @classmethod
-    def asked_for(cls, argv: list[str]) -> "PlaneSettings":
+    def asked_for(cls, argv: list[str], preset: str = DEFAULT_PRESET) -> "PlaneSettings":
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
+
+        ``preset`` is that of commands which name none.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
             'pca'
         """
-        values = {"--preset": DEFAULT_PRESET, "--config": ""}
+        values = {"--preset": preset, "--config": ""}
         for argument, following in zip_longest(argv, argv[1:], fillvalue=""):
             name, equals, value = argument.partition("=")
             if name in values:
                 values[name] = value if equals else following
-        return cls(resolved=load_config(values["--config"] or values["--preset"]))
+        return cls(preset, resolved=load_config(values["--config"] or values["--preset"]))
 
 
 CloudsFlag = Annotated[

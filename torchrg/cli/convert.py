@@ -27,7 +27,7 @@ from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_ar
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
 from torchrg.cli.loop import finish, run_with_bar, tell_failure
-from torchrg.config import DepthConfig
+from torchrg.config import DEFAULT_PRESET, DepthConfig
 from torchrg.datasets.folder import files_below
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
@@ -82,6 +82,8 @@ class CloudArguments(Arguments):
     superpoint: bool = False
     """Write superpoints as superpoint.npy too: a partition of all points, for networks on them."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
+    usual_preset: ClassVar[str] = DEFAULT_PRESET
+    """Settings to start from where no flag names any."""
 
 
 @dataclass(frozen=True)
@@ -120,12 +122,16 @@ def _places_below(root: Path) -> list[Path] | None:
 
 @dataclass(frozen=True)
 class S3DISArguments(CloudArguments):
-    """Convert S3DIS as it is released into Pointcept's layout, with normals and planes."""
+    """Convert S3DIS as it is released into Pointcept's layout, with normals and planes.
+
+    Settings are those of the preset s3dis unless told otherwise.
+    """
 
     areas: tuple[int, ...] = ()
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
     """What the numbers in segment.npy mean."""
+    usual_preset: ClassVar[str] = "s3dis"
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the rooms of the areas."""
@@ -181,7 +187,8 @@ def run(argv: list[str]) -> int:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     start = KINDS[kind](root=tyro.MISSING, out=tyro.MISSING)
     if isinstance(start, CloudArguments):
-        start = dataclasses.replace(start, settings=console.PlaneSettings.asked_for(rest))
+        settings = console.PlaneSettings.asked_for(rest, start.usual_preset)
+        start = dataclasses.replace(start, settings=settings)
     arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()

@@ -68,6 +68,17 @@ one: the deviations of neighbourhoods, their quantile, and the quantile of these
 see :func:`torchrg.normals.consensus.wanted_neighbors`."""
 
 
+def steps_of(config: NormalsConfig) -> int:
+    """Return the :data:`STEPS` of an estimator with its settings: noise of a region takes more.
+
+    Example:
+        >>> steps_of(NormalsConfig(noise_scope="regional")) - steps_of(NormalsConfig())
+        4
+    """
+    is_regional = config.method == "consensus" and config.noise_scope == "regional"
+    return STEPS[config.method] + is_regional * constants.REGIONAL_STEPS
+
+
 @sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],

@@ -15,6 +15,7 @@ from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_op
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
+from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import (
     EdgeLists,
@@ -25,7 +26,7 @@ from torchrg.regions.edges import (
     neighborhood_radii,
 )
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
-from torchrg.regions.repair import refine_regions
+from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 _LONG_QUEUE = 32
@@ -129,13 +130,22 @@ def label_regions(
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
         least = min(least, max(least // 2, LEAST_FITTED))
-    labels, fits = number_by_size(roots, least), RegionFits(cloud, config)
+    # Facets make a face together, however small they are.
+    fitted = least if config.facet_tolerance is None else min(least, LEAST_FITTED)
+    labels, fits = number_by_size(roots, fitted), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
         mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)
         if mixed is not None:
             cores = number_by_size(grow(mixed.part, config, chunk_size), config.min_size)
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
-            labels = number_by_size(labels, least)
+            labels = number_by_size(labels, fitted)
+    if config.facet_tolerance is not None and bool((labels >= 0).any()):
+        contacts, tolerance = (
+            NearestPoints(cloud.neighbors).contacts(labels),
+            config.facet_tolerance,
+        )
+        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
+        labels = number_by_size(labels, least)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), config.min_size)
     return labels

@@ -31,6 +31,11 @@ _ONE_SIDED = 0.5
 share of the mean without; of a face that goes on behind the plane it is near 0."""
 
 
+_FACET_TURN_DEG = 25.0
+"""The plane through two facets of a flat face is not turned by more against either of them. Those
+of ten points are turned most; the sides of a thin board are turned by 90."""
+
+
 class Beside(Protocol):
     """Who is beside whom: nearest points (:mod:`torchrg.regions.adjacency`), or pixels."""
 
@@ -186,6 +191,34 @@ def merge_coplanar(
     return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
 
 
+def merge_facets(
+    labels: Tensor,
+    contacts: tuple[Tensor, Tensor],
+    planes: RegionPlanes,
+    *,
+    tolerance: float,
+) -> Tensor:
+    """Merge regions that touch and lie within a distance of one plane, the nearest pair first.
+
+    Reconstructed meshes show a flat face as facets: each is an exact plane, so that its own
+    thickness does not say how far from the face it may be. Two regions are merged when the root
+    mean square distance of either to the plane through both is at most ``tolerance``, in the unit
+    of the cloud, and that plane is turned against neither by more than 25 degrees: a strip narrower
+    than the tolerance lies near any plane that it touches. What is merged is one region from then
+    on, so that the facets of a bend join only as far as one plane goes.
+
+    ``contacts`` and labels are those of :func:`merge_coplanar`.
+    """
+    pairs, num_contacts = contacts
+    pairs = pairs[num_contacts >= LEAST_CONTACTS]
+    moments = _moments_of(planes)
+    scale, noise = torch.full_like(moments.scale, tolerance), torch.zeros_like(moments.noise)
+    moments = moments._replace(scale=scale, noise=noise)
+    moments = _Moments(*(part.cpu() for part in moments))
+    owner = _merge_pairs(moments, pairs.cpu(), 1.0, max_turn_deg=_FACET_TURN_DEG)
+    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+
+
 class _Moments(NamedTuple):
     """What merging reads of M regions, in float64.
 
@@ -227,8 +260,13 @@ def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
     return _misfit(first, second)
 
 
-def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int]:
-    """Return for each region the smallest of those that it is merged with."""
+def _merge_pairs(
+    moments: _Moments, pairs: Tensor, tolerance: float, *, max_turn_deg: float = 90.0
+) -> list[int]:
+    """Return for each region the smallest of those that it is merged with.
+
+    Regions are not merged whose own planes are turned by more than an angle against the joint one.
+    """
     groups = _Moments(*(values.clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(touching))), [0] * len(touching)
@@ -236,8 +274,11 @@ def _merge_pairs(moments: _Moments, pairs: Tensor, tolerance: float) -> list[int
 
     def offer(pairs: Tensor) -> None:
         first, second = pairs.unbind(dim=1)
-        misfits = _misfit(groups.at(first), groups.at(second)).tolist()
-        for (a, b), misfit in zip(pairs.tolist(), misfits, strict=True):
+        sides = groups.at(first), groups.at(second)
+        misfits = _misfit(*sides)
+        if max_turn_deg < 90:
+            misfits = torch.where(_turn_deg(*sides) <= max_turn_deg, misfits, torch.inf)
+        for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
 
@@ -296,6 +337,14 @@ def _misfit(a: _Moments, b: _Moments) -> Tensor:
         lent = torch.where(other.weight > part.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(part.scale, lent), 0.0))
     return torch.maximum(*misfits)
+
+
+def _turn_deg(a: _Moments, b: _Moments) -> Tensor:
+    """Return the larger of the angles of the planes of both to the joint one, in degrees."""
+    joint, first, second = (
+        eigh3_of_few(part.covariance)[1][:, :, 0] for part in (_joined(a, b), a, b)
+    )
+    return torch.maximum(*(unsigned_angle_deg(own, joint) for own in (first, second)))
 
 
 def refine_borders(

@@ -11,7 +11,7 @@ from torchrg._parallel import ROWS_IN_CACHE
 from torchrg.config import NormalsConfig
 from torchrg.neighbors import search_knn
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.noise import Survey, survey_noise
+from torchrg.normals.consensus.noise import Survey, regional_noise, survey_noise
 from torchrg.normals.consensus.smoothing import (
     choose_planes,
     describe_inliers,
@@ -55,7 +55,8 @@ def estimate_consensus(
     Args:
         points: Points, shape ``(N, 3)``.
         neighbors: Neighbours of all points.
-        config: ``adaptive_k`` is used; the estimator finds all other scales itself.
+        config: ``adaptive_k`` and ``noise_scope`` are used; the estimator finds all other scales
+            itself.
         chunk_size: Points handled at a time.
 
     Returns:
@@ -83,6 +84,9 @@ def estimate_consensus(
             fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
             survey = survey_noise(points, neighbors, fit, chunk_size=size)
     noise = survey.noise
+    if config.noise_scope == "regional":
+        noise = torch.minimum(noise, regional_noise(noise, neighbors))
+        survey = survey._replace(noise=noise)
 
     planes, sharp, voted = fit_surfaces(points, neighbors, fit, survey, chunk_size=size)
 

@@ -31,6 +31,12 @@ COMMON_QUANTILE = 0.15
 by it, as no neighbourhood is flat there."""
 MAX_ABOVE_COMMON = 3.0
 """Times. Noise that is larger than the common noise by this factor is taken for shape."""
+REGIONAL_STEPS = 4
+"""Steps. So many from neighbour to neighbour away is noise that counts as that of the region, where
+it is asked for: with three, more small faces of fused meshes stay part of the one behind them."""
+REGIONAL_QUANTILE = 0.1
+"""Share. Quantile over the neighbours in each of these steps: higher ones do not leave the slope of
+a step, as a neighbourhood at its end lies on it for the most part."""
 MAX_LAYERED_KURTOSIS = 2.2
 """Ratio. Kurtosis of the residuals from one plane up to which two parallel planes are tried. It is
 1 for both faces of a plate without noise, 1.8 for an even spread, and 3 for noise."""
