@@ -1,7 +1,12 @@
-"""Each layer imports only from the layers below it."""
+"""Each layer imports only from those below it, and no modules import each other in a circle."""
 
 import ast
 from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
     {"errors", "version", "_display"},
@@ -24,54 +29,172 @@ RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 PACKAGE = Path(__file__).parents[1] / "torchrg"
 
 
-def layer_of(path):
-    """Return the name under which a file stands in LAYERS."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+FILES = {
+    ".".join(("torchrg", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(
+        ".__init__"
+    ): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+"""Every module of the package by its name."""
+LOADS_ANYTHING = {"torchrg._optional"}
+"""Modules that import by a name they are given: packages of others."""
 
 
-def imported_layers(source):
-    """Yield the layer of every module of torchrg that a source imports."""
+def layer_of(module):
+    """Return the name under which a module stands in LAYERS."""
+    return module.split(".")[1] if "." in module else "__init__"
+
+
+def module_of(name):
+    """Return the module that holds what a dotted name means, and None beyond the package."""
+    while name and name not in FILES:
+        name = name.rpartition(".")[0]
+    return name or None
+
+
+def modules_below(name):
+    """Return the modules whose names begin so, as a name made while running may be any of them."""
+    return {module for module in FILES if module.startswith(name)}
+
+
+def named_by_call(node):
+    """Return the modules that a call loads by a name, and None where the name is a variable."""
+    argument = (node.args or [keyword.value for keyword in node.keywords])[0]
+    if isinstance(argument, ast.JoinedStr) and isinstance(argument.values[0], ast.Constant):
+        return modules_below(argument.values[0].value)
+    if not isinstance(argument, ast.Constant):
+        return None
+    return {module_of(argument.value)}
+
+
+def imported_modules(module, source):
+    """Return the modules of torchrg that a source imports, wherever in it and in any spelling.
+
+    The top of the package loads its names when they are asked for: it imports what it names for
+    checkers of types.
+    """
+    found = set()
     for node in ast.walk(ast.parse(source)):
-        names = []
         if isinstance(node, ast.ImportFrom):
-            names = [node.module or ""]
-            if node.module == "torchrg":
-                names = [f"torchrg.{alias.name}" for alias in node.names]
+            assert node.level == 0, f"{module}: import by full names"
+            found |= {module_of(f"{node.module}.{alias.name}") for alias in node.names}
         elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        for package, _, rest in (name.partition(".") for name in names):
-            if package == "torchrg":
-                layer = rest.split(".")[0]
-                yield layer if layer in RANK else "__init__"
+            found |= {module_of(alias.name) for alias in node.names}
+        elif isinstance(node, ast.Call) and is_loader(node.func):
+            named = named_by_call(node)
+            assert named is not None or module in LOADS_ANYTHING | {"torchrg"}, (
+                f"{module}: import_module of a variable hides what is imported"
+            )
+            found |= named or set()
+    return found - {None, module}
 
 
-def upward_imports(layer, source):
-    """Return the layers that a source of some layer may not import."""
-    return [
+def is_loader(function):
+    """Return whether a called function loads modules by name."""
+    name = getattr(function, "attr", getattr(function, "id", ""))
+    return name in ("import_module", "__import__")
+
+
+def upward_imports(module, source):
+    """Return the modules that a source may not import: those of its own row or of one above."""
+    own = layer_of(module)
+    return sorted(
         target
-        for target in imported_layers(source)
-        if target not in (layer, "__init__") and RANK[target] >= RANK[layer]
-    ]
+        for target in imported_modules(module, source)
+        if layer_of(target) != own and RANK[layer_of(target)] >= RANK[own]
+    )
+
+
+def packages_of(module):
+    """Return the packages that a module is in, which are loaded before it."""
+    parts = module.split(".")
+    return {".".join(parts[:count]) for count in range(1, len(parts))}
+
+
+def circles(imports):
+    """Return the groups of modules that import each other, directly or around, in any order.
+
+    Whoever imports a module of another package loads that package first.
+    """
+    loads = {
+        module: targets.union(*map(packages_of, targets))
+        - (packages_of(module) - targets)
+        - {module}
+        for module, targets in imports.items()
+    }
+    order = list(loads)
+    number = {module: i for i, module in enumerate(order)}
+    pairs = [(number[m], number[t]) for m in order for t in sorted(loads[m])]
+    rows, columns = zip(*pairs, strict=True) if pairs else ((), ())
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(order),) * 2)
+    _, parts = connected_components(graph, directed=True, connection="strong")
+    groups = [[order[i] for i in np.flatnonzero(parts == part)] for part in np.unique(parts)]
+    return [group for group in groups if len(group) > 1]
+
+
+def imports_of_package():
+    """Return what each module of the package imports."""
+    return {module: imported_modules(module, path.read_text()) for module, path in FILES.items()}
 
 
 def test_every_module_has_a_layer():
-    assert {layer_of(path) for path in PACKAGE.rglob("*.py")} <= RANK.keys()
+    assert {layer_of(module) for module in FILES} <= RANK.keys()
 
 
 def test_imports_point_down():
     upward = {
-        str(path.relative_to(PACKAGE)): targets
-        for path in PACKAGE.rglob("*.py")
-        if (targets := upward_imports(layer_of(path), path.read_text()))
+        module: targets
+        for module, path in FILES.items()
+        if (targets := upward_imports(module, path.read_text()))
     }
     assert not upward
 
 
-def test_upward_imports_are_seen_in_every_spelling():
-    for source in (
+def test_no_modules_import_each_other_in_a_circle():
+    assert circles(imports_of_package()) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
         "import torchrg.pipeline",
         "from torchrg.pipeline import segment_planes",
         "from torchrg import pipeline",
-    ):
-        assert upward_imports("regions", source) == ["pipeline"]
-    assert upward_imports("regions", "from torchrg.normals import pca") == ["normals"]
+        "def late():\n    from torchrg import pipeline",
+        "if TYPE_CHECKING:\n    from torchrg import pipeline",
+        "import importlib\nimportlib.import_module('torchrg.pipeline')",
+        "from importlib import import_module\nimport_module(name='torchrg.pipeline')",
+        "__import__('torchrg.pipeline')",
+    ],
+)
+def test_upward_imports_are_seen_in_every_spelling(source):
+    assert upward_imports("torchrg.regions.fit", source) == ["torchrg.pipeline"]
+
+
+def test_a_name_of_the_top_is_an_import_from_the_top():
+    source = "from torchrg import segment_planes"
+    assert upward_imports("torchrg.regions.fit", source) == ["torchrg"]
+
+
+def test_a_name_made_while_running_may_be_any_module():
+    source = "import_module(f'torchrg.render.{name}')"
+    assert "torchrg.render.page" in upward_imports("torchrg.regions.fit", source)
+    with pytest.raises(AssertionError, match="hides what is imported"):
+        imported_modules("torchrg.regions.fit", "import_module(name)")
+
+
+def test_circles_are_found_directly_around_and_through_packages():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert circles({"a": {"b"}, "b": {"a"}, "c": {"a"}}) == [["a", "b"]]
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == [["a", "b", "c"]]
+    # One loads the package of what it imports, and that package loads it.
+    assert circles({"a": {"p.x"}, "p": {"a"}, "p.x": set()}) == [["a", "p"]]
+    # A package may load its own modules, as long as they ask nothing of it.
+    assert circles({"p": {"p.x"}, "p.x": {"p.y"}, "p.y": set()}) == []
+    assert circles({"p": {"p.x"}, "p.x": {"p"}}) == [["p", "p.x"]]
+
+
+def test_an_import_upward_closes_a_circle_of_the_package():
+    imports = imports_of_package()
+    imports["torchrg.structures"] |= {"torchrg"}
+    assert any("torchrg.structures" in group for group in circles(imports))

@@ -8,7 +8,7 @@ from torch import Tensor
 from reproduction.cells import Record
 from reproduction.clouds import EvalCloud
 from torchrg.metrics import contingency_table, match_regions
-from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.render.channels import OUTCOMES, outcomes_of
 from torchrg.structures import UNLABELED, Neighbors
 
 LARGE = 1000

@@ -14,7 +14,7 @@ from torch import Tensor
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
 from torchrg.render import color_planes, make_page, render_cloud, write_page
-from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.render.channels import OUTCOMES, outcomes_of
 from torchrg.result import Result
 from torchrg.structures import Cloud
 

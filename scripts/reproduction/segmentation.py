@@ -21,7 +21,7 @@ from reproduction.segmentations import (
     score_sphere,
 )
 from torchrg.metrics import METRICS, adjusted_rand_index, contingency_table
-from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.render.channels import OUTCOMES, outcomes_of
 
 FIGURES = {
     "tutorial": "Figure 7",

@@ -7,8 +7,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from torchrg.batch.convert import Job
-from torchrg.batch.scans import Scan
+from torchrg.batch.scans import Job, Scan
 from torchrg.batch.task import Converted
 from torchrg.config import PipelineConfig
 from torchrg.errors import FormatError

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from tests.datasets.s3dis_tree import write_clean_room
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.records import RECORD
-from torchrg.batch.report import BatchReport
+from torchrg.batch.run import BatchReport
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
 from torchrg.cli.convert import format_report

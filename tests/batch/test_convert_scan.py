@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
 from torchrg.scenes import make_room

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from torchrg import version
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import list_jobs, make_plan
+from torchrg.batch.scans import convert_scan
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.datasets.s3dis_tree import write_clean_room
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
 from torchrg.scenes import make_room

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tests.batch.power import Disk, PowerCutError
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.run import list_jobs, make_plan
+from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.batch.tiles import folder_of_work, segmented_in_tiles
 from torchrg.config import load_config

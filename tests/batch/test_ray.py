@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
 from torchrg.errors import MissingDependencyError

@@ -2,8 +2,8 @@
 
 import json
 
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.run import make_plan, run_plan, write_report
+from torchrg.batch.scans import convert_scan
 from torchrg.cli.console import format_table
 from torchrg.cli.convert import format_report
 

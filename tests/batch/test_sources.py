@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.batch.convert import convert_scan
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config

@@ -7,7 +7,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, stream_cloud, write_cloud
-from torchrg.io.e57 import Scan, to_cartesian
+from torchrg.io.e57 import ScanPose, to_cartesian
 from torchrg.structures import Cloud
 
 pye57 = pytest.importorskip("pye57")
@@ -120,7 +120,7 @@ def test_the_coordinate_system_is_kept_and_pictures_are_told(tmp_path):
 def test_normals_turn_with_the_points(tmp_path):
     normals = np.array([[1.0, 0, 0], [0, 1, 0]])
     cloud = Cloud(
-        np.eye(3)[:2], {"normals": normals}, header={"scans": (Scan("a", tuple(QUARTER)),)}
+        np.eye(3)[:2], {"normals": normals}, header={"scans": (ScanPose("a", tuple(QUARTER)),)}
     )
     write_cloud(tmp_path / "a.e57", cloud)
     with pye57.E57(str(tmp_path / "a.e57")) as file:
@@ -133,7 +133,7 @@ def test_normals_turn_with_the_points(tmp_path):
 
 def test_poses_go_back_and_forth_to_the_last_digits():
     points = np.random.default_rng(0).normal(size=(50, 3))
-    scan = Scan("a", (0.1, -0.2, 0.3, 0.4), (5.0, -6.0, 7.0))
+    scan = ScanPose("a", (0.1, -0.2, 0.3, 0.4), (5.0, -6.0, 7.0))
     there = scan.to_world(points)
     np.testing.assert_allclose(scan.to_scan(there), points, rtol=0, atol=1e-14)
     # w x y z of any length: the rotation of a quaternion is q p q*.
@@ -143,7 +143,7 @@ def test_poses_go_back_and_forth_to_the_last_digits():
 
 
 def test_a_quaternion_of_zeros_turns_nothing():
-    scan = Scan("a", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0))
+    scan = ScanPose("a", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0))
     assert scan.to_world(np.eye(3)).tolist() == [[1, 0, 2], [0, 1, 2], [0, 0, 3]]
 
 

@@ -282,11 +282,11 @@ def test_what_reading_the_files_said_is_told(tmp_path):
 
 def test_scans_of_several_e57_files_are_numbered_on(tmp_path, make_cloud):
     pytest.importorskip("pye57")
-    from torchrg.io.e57 import Scan
+    from torchrg.io.e57 import ScanPose
 
     number = np.repeat(np.arange(2, dtype=np.int32), 10)
-    two = {"scans": (Scan("a"), Scan("b"))}
-    one = {"scans": (Scan("c"),)}
+    two = {"scans": (ScanPose("a"), ScanPose("b"))}
+    one = {"scans": (ScanPose("c"),)}
     write_cloud(tmp_path / "a.e57", Cloud(make_cloud(20).coordinates, {"scan": number}, header=two))
     write_cloud(tmp_path / "b.e57", Cloud(make_cloud(5).coordinates, header=one))
     paths = [tmp_path / "a.e57", tmp_path / "b.e57", tmp_path / "b.e57"]

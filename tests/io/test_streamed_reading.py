@@ -274,17 +274,17 @@ def test_text_between_blank_lines_and_comments(tmp_path):
 
 def test_scans_of_an_e57_file_with_poses_and_fields_of_their_own(tmp_path):
     pytest.importorskip("pye57")
-    from torchrg.io.e57 import Scan
+    from torchrg.io.e57 import ScanPose
 
     rng = np.random.default_rng(0)
-    turned = Scan("b", (0.9, 0.1, -0.3, 0.2), (500_000.0, 2.0, 3.0))
+    turned = ScanPose("b", (0.9, 0.1, -0.3, 0.2), (500_000.0, 2.0, 3.0))
     cloud = Cloud(
         rng.random((NUM_POINTS, 3)),
         {
             "scan": np.repeat(np.arange(2, dtype=np.int32), [20, NUM_POINTS - 20]),
             "normals": rng.random((NUM_POINTS, 3)).astype("f4"),
         },
-        header={"scans": (Scan("a"), turned)},
+        header={"scans": (ScanPose("a"), turned)},
     )
     cloud.coordinates[30] = np.nan
     write_cloud(tmp_path / "a.e57", cloud)

@@ -141,10 +141,10 @@ def test_las_names_the_first_point_that_is_not_finite(tmp_path, make_cloud):
 
 def test_e57_in_chunks_holds_the_same_scans(tmp_path, make_cloud, assert_same):
     pye57 = pytest.importorskip("pye57")
-    from torchrg.io.e57 import Scan
+    from torchrg.io.e57 import ScanPose
 
     number = np.repeat(np.arange(3, dtype=np.int32), [20, 0, 40])
-    scans = (Scan("a"), Scan("none"), Scan("b", (0.9, 0.1, -0.3, 0.2), (5e5, 2.0, 3.0)))
+    scans = (ScanPose("a"), ScanPose("none"), ScanPose("b", (0.9, 0.1, -0.3, 0.2), (5e5, 2.0, 3.0)))
     cloud = make_cloud(dtype="f8", header={"scans": scans})
     cloud = replace(cloud, fields={**cloud.fields, "scan": number})
     cloud.coordinates[-1] = np.nan
@@ -176,12 +176,12 @@ def limits_of(header):
 @pytest.mark.parametrize("field", ["unsorted", "unsigned"])
 def test_e57_scans_out_of_order_are_one_scan(tmp_path, make_cloud, field):
     pytest.importorskip("pye57")
-    from torchrg.io.e57 import Scan
+    from torchrg.io.e57 import ScanPose
 
     number = np.repeat([0, 1], [20, 40])
     number[-1] = 0
     number = number.astype(np.uint8 if field == "unsigned" else np.int32)
-    cloud = make_cloud(header={"scans": (Scan("a"), Scan("b"))})
+    cloud = make_cloud(header={"scans": (ScanPose("a"), ScanPose("b"))})
     cloud = replace(cloud, fields={"scan": number})
     write_cloud(tmp_path / "a.e57", CloudStream.of(cloud, chunk_size=7))
     found = read_cloud(tmp_path / "a.e57")

@@ -206,7 +206,7 @@ def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run, method):
 
 
 def test_outcome_of_each_point():
-    from torchrg.render.outcomes import outcomes_of
+    from torchrg.render.channels import outcomes_of
 
     truth = torch.tensor([7, 7, 7, 7, 7, 7, 7, 3, 3, 5, 5, -1])
     labels = torch.tensor([0, 0, 0, 0, 2, 2, -1, 0, 0, 4, 4, 4])

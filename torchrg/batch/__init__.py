@@ -12,7 +12,7 @@ Example:
     >>> import tempfile
     >>> from pathlib import Path
     >>> import numpy as np
-    >>> from torchrg.batch.convert import convert_scan
+    >>> from torchrg.batch.scans import convert_scan
     >>> from torchrg.batch.sources import FolderSource
     >>> from torchrg.batch.run import list_jobs
     >>> from torchrg.config import load_config

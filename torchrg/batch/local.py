@@ -19,6 +19,7 @@ ONE_THREAD = dict.fromkeys(
 )
 """Environment of a worker, set before the libraries that read it are loaded."""
 BEAT_SECONDS = 0.5
+"""How often an engine yields while no task ends, so that progress is shown and Ctrl-C is heard."""
 
 
 def run_here(tasks: Sequence[Task]) -> Reports:

@@ -18,9 +18,9 @@ LOCK = ".torchrg.lock"
 _HELD = re.compile(r"(?:([0-9a-f]{16}) )?(process \d+ on .*)?", re.DOTALL)
 """What is in it: a mark, which older versions did not write, and who holds it or did last."""
 _PATIENCE_SECONDS = 5.0
-"""How long a lock that is held is waited for: workers of a command that was killed end by then."""
+"""Seconds to wait for another holder: the workers of a command that was killed end by then."""
 _BEAT_SECONDS = 0.05
-"""How often it is tried."""
+"""Seconds between two tries to take it."""
 
 
 class DirectoryLock:
@@ -35,8 +35,8 @@ class DirectoryLock:
         patience: Seconds to wait for another holder.
 
     Attributes:
-        mark: Of the names that holders of this lock write under before files have their own, the
-            same for all of them; see :func:`torchrg.io.files.marked_parts`.
+        mark: Part of the names that holders of this lock write under before files have their own,
+            the same for all of them; see :func:`torchrg.io.files.marked_parts`.
 
     Raises:
         FormatError: If another process holds the lock, or the file of the lock is another one.

@@ -9,13 +9,15 @@ from torchrg.pipeline import BYTES_PER_POINT
 PROCESS_BYTES = 500_000_000
 """What a process takes before the first point: Python, torch, scipy."""
 _CGROUP = Path("/sys/fs/cgroup")
+"""Where Linux shows control groups, with which containers are limited."""
 _CGROUP_FILES = (
     ("memory.max", "memory.current"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
 )
 """Limit and use of a control group, of versions 2 and 1."""
 _SHARE = 0.8
-"""The rest is for the process that starts the others, and for what else the machine does."""
+"""Share of the free memory that a batch may take. The rest is for the process that starts the
+others, and for what else the machine does."""
 
 
 def memory_of_scan(num_points: int) -> int:

@@ -21,9 +21,9 @@ from torchrg.io import atomic_path
 from torchrg.result import RECORD as RECORD
 
 _TEXT = b"tEXttorchrg\0"
-"""How the part of a PNG begins that holds a record: a text of the name torchrg."""
+"""Beginning of the part of a PNG that holds a record: a text of the name torchrg."""
 _END_BYTES = 12
-"""Length of the part that every PNG ends with."""
+"""Bytes of the part that every PNG ends with."""
 
 
 class Recorded(Protocol):

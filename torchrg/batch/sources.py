@@ -22,7 +22,7 @@ from torchrg.config import PipelineConfig
 from torchrg.datasets import (
     S3DIS,
     FolderOfClouds,
-    Scene,
+    SceneFiles,
     read_pointcept_scene,
     read_room,
     write_pointcept_scene,
@@ -30,7 +30,7 @@ from torchrg.datasets import (
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_depth
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import depth_to_points, make_intrinsics
+from torchrg.depth.camera import make_intrinsics, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.pipeline import make_superpoints, segment_planes
@@ -39,7 +39,7 @@ from torchrg.structures import Cloud, Segmentation
 _COPIED = ("coord", "color", "strength", "segment", "instance")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
-"""Width and height of a PNG, and where they are."""
+"""Width and height in the header of a PNG, and the byte at which they begin."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class FolderSource:
             )
         return [self._scan(scene) for scene in scenes]
 
-    def _scan(self, scene: Scene) -> Scan:
+    def _scan(self, scene: SceneFiles) -> Scan:
         """Return a cloud with its input files."""
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
@@ -201,7 +201,7 @@ def find_areas(root: Path) -> tuple[int, ...]:
     return tuple(n for n in range(1, 7) if (root / f"Area_{n}").is_dir()) or tuple(range(1, 7))
 
 
-def _estimate(scene: Scene) -> int:
+def _estimate(scene: SceneFiles) -> int:
     """Return the number of points by the size of the files and the lines of the largest."""
     sizes = {file: file.stat().st_size for file in scene.files}
     largest = max(sizes, key=lambda file: sizes[file])
@@ -262,8 +262,7 @@ class RGBDSource:
             raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
         begin("planes")
         found = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
-        poses = None if frame.pose is None else frame.pose[None]
-        points = depth_to_points(depth[None].double(), frame.intrinsics[None], poses)[0]
+        points = points_of_image(depth, frame.intrinsics, frame.pose)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = write_results(folder, coord, found)

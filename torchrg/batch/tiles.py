@@ -25,10 +25,10 @@ from torchrg.structures import Cloud, Segmentation
 from torchrg.tiles import BYTES_PER_TILE_POINT, TileTask
 
 _SMALLEST_TILE = 20_000
-"""Points. Smaller ones are mostly what is around them."""
+"""Least number of points of a tile. With fewer, most of the work is on the points around it."""
 _LEAST_POINTS_A_WORKER = 2_000_000
-"""Of the whole cloud: a process takes two seconds to load torch, in each stage, and one of these
-points a microsecond at least."""
+"""Points of the whole cloud for each process. One takes two seconds to load torch in each stage,
+which is as long as so many points take at a microsecond each."""
 
 
 def choose_tile_size(num_points: int, memory_limit: int) -> int:
@@ -103,9 +103,9 @@ def segmented_in_tiles(
     Args:
         sources: The files.
         chunks: Their points.
-        folder: Of the work alone; see :class:`torchrg.store.FolderStore`. Another process that
-            works there is refused.
-        settings: Of the pipeline.
+        folder: Folder for this work alone; see :class:`torchrg.store.FolderStore`. Another process
+            that works there is refused.
+        settings: Settings of the pipeline.
         tile_size: Points of a tile.
         target: The file that the caller writes the result to. What an earlier call was writing when
             it was killed is removed.

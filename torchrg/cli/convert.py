@@ -10,20 +10,19 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 from tqdm import tqdm
 
-from torchrg.batch.convert import Job
 from torchrg.batch.local import run_local
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import spare_memory
-from torchrg.batch.report import BatchReport
 from torchrg.batch.run import (
     REPORT,
+    BatchReport,
     Plan,
     check_room,
     list_jobs,
     make_plan,
     write_report,
 )
-from torchrg.batch.scans import Source
+from torchrg.batch.scans import Job, Source
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
@@ -38,7 +37,7 @@ from torchrg.render.page import check_library
 from torchrg.result import read_result
 
 MOST_ROWS = 300
-"""A longer batch is not printed scan by scan."""
+"""Most scans of a batch that is printed scan by scan."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ class CloudArguments(Arguments):
 
     pages: Path | None = None
     """Directory for a picture and a page of each scan that is done, and for index.html, in which
-    the pictures lead to the pages (pip install 'torchrg[view]'). Default: none are made."""
+    the pictures are links to the pages (pip install 'torchrg[view]'). Default: none are made."""
     superpoint: bool = False
     """Write superpoints as superpoint.npy too: a partition of all points, for networks on them."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)

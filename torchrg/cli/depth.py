@@ -11,12 +11,11 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchrg.batch.convert import Job
 from torchrg.batch.local import run_here, run_local
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.records import describe_run, write_record
 from torchrg.batch.run import make_plan
-from torchrg.batch.scans import Scan
+from torchrg.batch.scans import Job, Scan
 from torchrg.batch.sources import RGBDSource, num_pixels
 from torchrg.batch.task import Converted, TaskReport, report_on
 from torchrg.cli import console
@@ -25,11 +24,11 @@ from torchrg.datasets.folder import listed
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
 from torchrg.depth import (
     DepthConfig,
-    depth_to_points,
     find_intrinsics,
     make_intrinsics,
     segment_depth,
 )
+from torchrg.depth.camera import points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
@@ -40,13 +39,13 @@ from torchrg.structures import Cloud, Segmentation
 _ORGANISED = ".pcd"
 """Suffix of organised clouds."""
 _COLORED_FROM = 200
-"""So many pixels along the longer side tell which planes are next to each other and must differ in
-colour: choosing colours from all would take as long as finding the planes."""
+"""Pixels along the longer side that tell which planes are next to each other and must differ in
+colour. Choosing colours from all pixels would take as long as finding the planes."""
 _NO_IMAGES = ("planes", "points")
-"""Parts of a segmentation that are none."""
+"""Parts of a segmentation of an image that are no images."""
 _FRAMES_OF_WORKER = 8
-"""Where no number of workers is given, each has so many frames at least: one takes as long to start
-as it takes for some frames of 640 x 480 pixels."""
+"""Least number of frames for each worker where no number of workers is given. To start one takes as
+long as some frames of 640 x 480 pixels take."""
 
 
 @dataclass(frozen=True)
@@ -305,7 +304,7 @@ def _read_frame(path: Path, source: RGBDSource) -> tuple[Cloud, Tensor, Tensor]:
         return _read_organised(path, camera)
     depth = read_depth(path, depth_scale=scale)
     height, width = depth.shape
-    points = depth_to_points(depth[None].double(), camera[None]).view(-1, 3).float()
+    points = points_of_image(depth, camera).view(-1, 3).float()
     return Cloud(points.numpy(), grid_shape=(height, width), source=str(path)), depth, camera
 
 

@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 USAGE_ERROR = 2
+"""Exit code where a command was used wrongly, or its input is bad."""
 SOME_FAILED = 3
+"""Exit code where some inputs failed and the results of the others are complete."""
 INTERRUPTED = 130
+"""Exit code of shells for a program that Ctrl-C ended: 128, and the number of the signal."""
 
 INTERRUPTED_LINE = "interrupted; every file written is complete."
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)

@@ -13,7 +13,8 @@ from torchrg.neighbors import search_knn
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
-"""Of a coordinate by its bytes: float32 holds no more, float64 is for millimetres far away."""
+"""Digits of a coordinate that are shown, by its bytes. float32 holds no more than six, and ten are
+millimetres at a thousand kilometres."""
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from torchrg.batch.report import BatchReport
-from torchrg.batch.run import Plan, run_plan, run_tasks
+from torchrg.batch.run import BatchReport, Plan, run_plan, run_tasks
 from torchrg.batch.task import Converted, Reports, TaskReport, report_on
 from torchrg.cli.ending import INTERRUPTED, SOME_FAILED, fail
 

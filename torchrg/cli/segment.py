@@ -78,7 +78,7 @@ class Arguments:
     directory of pictures."""
     pages: bool = False
     """Beside each picture in the directory write a page for the browser to turn the cloud in, and
-    index.html, in which the pictures lead to their pages (pip install 'torchrg[view]')."""
+    index.html, in which the pictures link to their pages (pip install 'torchrg[view]')."""
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""

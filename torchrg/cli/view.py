@@ -68,7 +68,7 @@ class Arguments:
     truth: Path | None = None
     """Cloud of the same points with true labels or normals, to show errors on a page."""
     max_points: int = MAX_POINTS
-    """Of more points a page shows a random sample of so many, and says so."""
+    """Most points that a page shows. Of a larger cloud it shows a random sample, and says so."""
     columns: ColumnsFlag = None
 
 

@@ -2,7 +2,7 @@
 
 Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``, ``data[i]`` is a
 sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...), ``transform=`` is
-called with it, and ``data.scenes`` lists what there is without reading it: :class:`Scene` with
+called with it, and ``data.scenes`` lists what there is without reading it: :class:`SceneFiles` with
 ``name`` (the place below an output folder), ``path``, and ``files`` (every input file).
 :func:`collate_offset` joins samples into a ragged batch. :func:`read_room` reads one room of S3DIS,
 :func:`read_pointcept_scene` and :func:`write_pointcept_scene` one folder of Pointcept's layout.
@@ -40,7 +40,7 @@ here, and a test; a new folder of depth frames is a row of :data:`~torchrg.datas
 """
 
 from torchrg.datasets.collate import collate_offset
-from torchrg.datasets.folder import FolderOfClouds, Scene, read_pointcept_area
+from torchrg.datasets.folder import FolderOfClouds, SceneFiles, read_pointcept_area
 from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
@@ -55,7 +55,7 @@ __all__ = [
     "Repair",
     "Room",
     "RoomReport",
-    "Scene",
+    "SceneFiles",
     "Skipped",
     "collate_offset",
     "read_pointcept_area",

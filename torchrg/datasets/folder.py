@@ -1,4 +1,4 @@
-"""Any folder of clouds."""
+"""Any folder of clouds as a data set, and how the files below a folder are found and ordered."""
 
 import os
 import re
@@ -23,7 +23,7 @@ _FIELD_KEYS = {"normals": "normal"}
 """Fields of a cloud that have another name in a sample."""
 
 
-class Scene(NamedTuple):
+class SceneFiles(NamedTuple):
     """One item of a data set, and what it is made from.
 
     Attributes:
@@ -44,7 +44,7 @@ class SceneDataset(Dataset[Any]):
     A data set sets :attr:`scenes` and :attr:`transform`, and says how to read a sample.
     """
 
-    scenes: list[Scene]
+    scenes: list[SceneFiles]
     transform: Callable[[dict[str, Any]], Any] | None
 
     def read_sample(self, index: int) -> dict[str, Any]:
@@ -108,7 +108,7 @@ class FolderOfClouds(SceneDataset):
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
             )
-        self.scenes = [Scene(self._name_of(path), path, _files_of(path)) for path in paths]
+        self.scenes = [SceneFiles(self._name_of(path), path, _files_of(path)) for path in paths]
         first: dict[str, Path] = {}
         for name, path, _ in self.scenes:
             if first.setdefault(name, path) != path:

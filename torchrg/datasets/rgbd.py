@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchrg._checks import check_shapes
 from torchrg.datasets.folder import (
-    Scene,
     SceneDataset,
+    SceneFiles,
     check_folder,
     files_below,
     listed,
@@ -38,6 +38,7 @@ _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 _MILLIMETERS = 1000.0
 """Stored value of one metre in ScanNet and 7-Scenes."""
 _TUM_SCALE = 5000.0
+"""Stored value of one metre in TUM and ICL-NUIM."""
 _TUM_INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
@@ -48,6 +49,7 @@ _ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
 """The scenes were rendered with y upwards: rows count against it."""
 _SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
 _SEVEN_SCENES_NO_DEPTH = 65535
+"""Stored value of a pixel without depth in 7-Scenes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +140,7 @@ class RGBDFrames(SceneDataset):
     ) -> None:
         self.frames = tuple(frames)
         self.transform = transform
-        self.scenes = [Scene(frame.name, frame.depth, frame.files) for frame in self.frames]
+        self.scenes = [SceneFiles(frame.name, frame.depth, frame.files) for frame in self.frames]
         first: dict[str, Path] = {}
         for number, (name, path, _) in enumerate(self.scenes):
             first.setdefault(name, path)

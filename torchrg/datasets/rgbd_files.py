@@ -17,7 +17,7 @@ from torchrg.io.files import DAMAGES, check_file, refusing
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
 _MOST_SECONDS = 0.02
-"""Images and poses further apart in time do not belong together."""
+"""Most seconds between an image and a pose that belong together."""
 
 
 def read_depth(

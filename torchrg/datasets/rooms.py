@@ -38,8 +38,11 @@ _OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
 """Names of the files of objects, and of their copies."""
 _COLUMNS = ("x", "y", "z", "red", "green", "blue")
 _CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
+"""Bytes that no text of numbers has."""
 _LOST_BIT = 0x20
+"""Bit that the broken bytes of the releases have lost."""
 _LARGEST = float(np.finfo(np.float32).max)
+"""Largest coordinate, in metres, that the arrays of a room hold."""
 _NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 

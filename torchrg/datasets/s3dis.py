@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrg.datasets.folder import Scene, SceneDataset, listed
+from torchrg.datasets.folder import SceneDataset, SceneFiles, listed
 from torchrg.datasets.rooms import (
     ANNOTATIONS,
     Repair,
@@ -108,7 +108,7 @@ class S3DIS(SceneDataset):
         return _read_cached(scene, self.cache, self.class_order)
 
 
-def _scenes_of_area(root: Path, area: int) -> list[Scene]:
+def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
     """Return the rooms of an area, and warn if there are not as many as in the release."""
     if area not in ROOMS_PER_AREA:
         known = ", ".join(map(str, ROOMS_PER_AREA))
@@ -127,10 +127,10 @@ def _scenes_of_area(root: Path, area: int) -> list[Scene]:
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}.",
             stacklevel=3,
         )
-    return [Scene(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]
+    return [SceneFiles(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]
 
 
-def _read_cached(scene: Scene, cache: Path, class_order: str) -> Room:
+def _read_cached(scene: SceneFiles, cache: Path, class_order: str) -> Room:
     """Read a room from the cache, and put it there first if it is not.
 
     An entry counts as long as path, size and time of change of every input file are what they were
@@ -149,7 +149,7 @@ def _read_cached(scene: Scene, cache: Path, class_order: str) -> Room:
     return room
 
 
-def _fingerprint(scene: Scene) -> str:
+def _fingerprint(scene: SceneFiles) -> str:
     """Return a name for the state of a room's files."""
     state = [
         (os.path.realpath(file), (status := file.stat()).st_size, status.st_mtime_ns)

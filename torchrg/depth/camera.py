@@ -52,6 +52,12 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
     return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
 
 
+def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
+    """Do as :func:`depth_to_points` for one image ``(H, W)``, in float64: ``(H, W, 3)``."""
+    poses = None if pose is None else pose[None]
+    return depth_to_points(depth[None].double(), intrinsics[None].double(), poses)[0]
+
+
 def has_depth(depth: Tensor) -> Tensor:
     """Return which pixels have a depth: finite and positive, the shape of ``depth``."""
     return depth.isfinite() & (depth > 0)

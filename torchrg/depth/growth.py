@@ -25,25 +25,26 @@ _NUM_PASSES = 2
 """Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
 
 _CURVED = 3.0
-"""Times the noise. A region that is no thicker is a plane, however it is bent."""
+"""Thickness of a region in units of the noise up to which it is a plane, however it is bent."""
 
 _BENT = 0.03
-"""Share of a region's own extent. One that is no thicker than this is a plane, too: a slightly bent
-face is a face. A column is 0.4 of its extent thick."""
+"""Thickness of a region as a share of its extent up to which it is a plane, whatever the noise is.
+A slightly bent face is a face, and a column is 0.4 of its extent thick."""
 
 _NUM_FITS = 2
-"""A plain fit and a reweighted one: pixels that grew into a region are near its plane already."""
+"""Fits of a region's plane: a plain one and a reweighted one. More change nothing, as the pixels
+that grew into a region are near its plane already."""
 
 _ALIKE = 1.75
-"""Times the angle. Normals of two windows that both hold both pixels may differ by so much: on a
-column large windows turn by more than the angle from one cell to the next."""
+"""Factor of the largest angle between normals of two windows that both hold both pixels. On a
+column, large windows turn by more than the angle from one cell to the next."""
 
 _SLOPE_NOISE = 1.0
-"""Standard deviations. Slopes of two such windows may also differ by this, whatever the angle:
-small windows of a narrow face turn by noise alone."""
+"""Standard deviations by which the slopes of two windows that both hold both pixels may differ,
+whatever the angle is. The small windows of a narrow face turn by noise alone."""
 
 _MOST_MOVES = 16
-"""In pixels: windows hardly reach farther from their middle."""
+"""Pixels by which a border may move: windows hardly reach farther from their middle."""
 
 _STRAIGHT = 0.85
 """Cosine of the largest angle between a step straight away from a crease and one that counts."""

@@ -21,15 +21,18 @@ _FLAT = 1.35
 _OWN_REACH = 3.5
 """A pixel is on the plane of a window within this many times the noise."""
 _SAME_NOISE = 2.0
-"""A flat window deviates by at most this over its side in pixels more than its quarters do."""
+"""A flat window deviates from its plane at most by a factor of 1 plus this over its side in pixels
+more than its quarters do from planes of their own."""
 _LEAST_QUARTERS = 0.7
-"""Quarters count as if they deviated by this many times the tolerance at least."""
+"""Least deviation of the quarters of a window that is counted, in units of the tolerance."""
 _BEND = 0.005
-"""A flat window may bend by this share of half its side, however little noise there is."""
+"""Share of half its side by which a flat window may bend, however little noise there is."""
 _MOST_BEND = 0.03
-"""A smallest window by this, where none is flat: twice as much would hide creases of 20 degrees."""
+"""Share of half its side by which a window of the smallest size may bend where none is flat. Twice
+as much would hide creases of 20 degrees."""
 _STEEPEST = 4.0
-"""Surfaces seen at a cosine below the inverse of this may not bend: there a step looks like one."""
+"""Inverse of the cosine of the steepest angle at which a surface may bend. Seen at a steeper angle,
+a step looks like a bend."""
 
 
 class PixelPlanes(NamedTuple):
@@ -252,7 +255,7 @@ def _tolerances(
     camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
     depth is one of ``d z e`` from the plane.
     """
-    (fx, fy), level = focal, noise.at(planes.mean)
+    (fx, fy), by_noise = focal, noise.at(planes.mean)
     sq_nearness = (
         (planes.u_slope * fx).square() + (planes.v_slope * fy).square() + planes.origin.square()
     )
@@ -260,7 +263,7 @@ def _tolerances(
     half = SIDE * size / 2 / max(abs(fx), abs(fy))
     bend = half * torch.where(is_steep, 0.0, sq_nearness) / planes.mean
     bend = torch.where(planes.mean > 0, bend, 0.0)
-    return _Tolerances(level, torch.maximum(level, _BEND * bend), _MOST_BEND * bend)
+    return _Tolerances(by_noise, torch.maximum(by_noise, _BEND * bend), _MOST_BEND * bend)
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:

@@ -6,7 +6,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
-from torchrg.depth.camera import depth_to_points, has_depth
+from torchrg.depth.camera import has_depth, points_of_image
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import PixelPlanes, fit_pixels
 from torchrg.depth.windows import WindowPlanes
@@ -36,7 +36,8 @@ def segment_depth(
 
     Args:
         depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
-        intrinsics: Camera matrix, shape ``(3, 3)``; see :func:`depth_to_points`.
+        intrinsics: Camera matrix, shape ``(3, 3)``; see
+            :func:`torchrg.depth.camera.depth_to_points`.
         config: Settings. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
             the world. Default: they are in camera coordinates.
@@ -92,9 +93,7 @@ def segment_depth(
     if pose is not None:
         pose = pose.to(normals)
         normals = normals @ pose[:3, :3].T
-    points = depth_to_points(
-        depth[None].double(), intrinsics[None].double(), None if pose is None else pose[None]
-    )[0]
+    points = points_of_image(depth, intrinsics, pose)
     rows = seen.flatten().nonzero().squeeze(1)
     table = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
     return Segmentation(

@@ -21,12 +21,12 @@ REACH = 2
 SIDE = 2 * REACH + 1
 """Cells along a side of a window."""
 _LEAST_SHARE = 0.4
-"""A window with fewer of its pixels seen has no plane."""
+"""Least share of a window's pixels that must be seen for it to have a plane."""
 _LEAST_SPREAD = 0.2
-"""Nor has one whose pixels have a covariance with less than this of a full window's determinant:
-they lie nearly on a line."""
+"""Least determinant of the covariance of a window's pixels, as a share of that of a full window.
+With less, the pixels lie nearly on a line and tell no plane."""
 _FLAT_QUANTILE = 0.35
-"""At least a third of an indoor image is flat: its windows deviate by noise alone."""
+"""Share of the windows of an image that deviate by noise alone: at least a third of it is flat."""
 _NUM_BINS = 12
 """Classes of depth that noise is fitted to."""
 _MOST_GROWTH = 1.4
@@ -34,7 +34,7 @@ _MOST_GROWTH = 1.4
 _ROUNDING = 8.0
 """Least noise of inverse depth, in units of the rounding of the depth."""
 _LEAST_ROUNDING = 1e-7
-"""And as a share of it, whatever the dtype."""
+"""Least noise of inverse depth as a share of it, whatever the dtype: the rounding of float32."""
 
 
 class WindowPlanes(NamedTuple):

@@ -17,15 +17,13 @@ from torchrg.io.las import check_las, count_las, open_las, write_las
 from torchrg.io.merge import merge_streams
 from torchrg.io.npy import (
     ARCHIVE_DAMAGES,
-    count_npy,
-    count_npz,
     open_npy,
     open_npz,
     write_npy,
     write_npz,
 )
-from torchrg.io.pcd import count_pcd, open_pcd, write_pcd
-from torchrg.io.ply import count_ply, open_ply, write_ply
+from torchrg.io.pcd import open_pcd, write_pcd
+from torchrg.io.ply import open_ply, write_ply
 from torchrg.io.stream import (
     POINTS_A_CHUNK,
     SILENT,
@@ -62,15 +60,15 @@ class Format(NamedTuple):
             damaged. Where columns can be without names, these come third.
         write: Writes a cloud, going through its chunks once or several times. Raises FormatError if
             the format cannot hold it.
-        count: Number of points by the header, from path, open file and size; an estimate where the
-            header does not say. May raise anything of a damaged file.
+        count: Number of points, from the open file and its size, of a format whose table cannot
+            say it at once. May raise anything of a damaged file. None where the table can.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
         takes_columns: Whether columns can be without names.
     """
 
     open: Callable[..., Table]
     write: Callable[[Path, CloudStream], None]
-    count: Callable[[Path, BinaryIO, int], int]  # type: ignore[assignment]
+    count: Callable[[BinaryIO, int], int] | None = None  # type: ignore[assignment]
     check: Callable[[Path, Cloud | CloudStream | None], None] | None = None
     takes_columns: bool = False
 
@@ -78,10 +76,10 @@ class Format(NamedTuple):
 RESULT_FIELDS = ("labels", "normals", "curvature")
 """What a segmentation writes of each point beside the fields of the cloud."""
 FORMATS: dict[str, Format] = {
-    ".npz": Format(open_npz, write_npz, count_npz),
-    ".npy": Format(open_npy, write_npy, count_npy, takes_columns=True),
-    ".ply": Format(open_ply, write_ply, count_ply),
-    ".pcd": Format(open_pcd, write_pcd, count_pcd),
+    ".npz": Format(open_npz, write_npz),
+    ".npy": Format(open_npy, write_npy, takes_columns=True),
+    ".ply": Format(open_ply, write_ply),
+    ".pcd": Format(open_pcd, write_pcd),
     ".las": Format(open_las, write_las, count_las, check_las),
     ".laz": Format(open_las, write_las, count_las, check_las),
     ".e57": Format(open_e57, write_e57, count_e57, check_e57),
@@ -332,8 +330,11 @@ def estimate_points(path: Path) -> int:
         3
     """
     try:
+        size, found = path.stat().st_size, _format_of(path)
+        if found.count is None:
+            return found.open(path, size).num_points or 0
         with path.open("rb") as stream:
-            return _format_of(path).count(path, stream, path.stat().st_size)
+            return found.count(stream, size)
     except (OSError, FormatError, *ARCHIVE_DAMAGES):
         return 0
 

@@ -7,10 +7,12 @@ Of what a file holds beside points, names and poses of scans and the coordinate 
 """
 
 import re
+import sys
 import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits
+from torchrg.io.columns import Spelling, flatten_cloud
 from torchrg.io.fields import Columns
 from torchrg.io.files import DAMAGES, asking_system, atomic_path, check_promise, refusing
 from torchrg.io.stream import CloudStream, Table
@@ -37,7 +39,7 @@ _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _SPELLING = Spelling(normals=_NORMALS, color=_COLOR)
 _PLAIN = ("intensity", "rowIndex", "columnIndex", "returnIndex", "returnCount")
 _STANDARD = {*_NORMALS, *_COLOR, *_PLAIN}
-"""Names that the standard knows; others go into an extension."""
+"""Names of fields that the standard knows. All others go into an extension."""
 _EXTENSIONS = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "torchrg": "urn:torchrg:point-fields",
@@ -48,7 +50,7 @@ _ENDS = ("Minimum", "Maximum")
 _PAGE_BYTES = 1024
 """The standard's page, the last four bytes of which are the CRC-32C of the others."""
 _BYTES_PER_POINT = 12
-"""A guess: three coordinates of 32 bits. The header is XML somewhere in the file."""
+"""Bytes of a point to guess their number by the size of a file: three coordinates of 32 bits."""
 _Block = dict[str, NDArray[Any]]
 """Columns of a scan by name."""
 
@@ -147,9 +149,10 @@ def write_e57(path: Path, stream: CloudStream) -> None:
     If the cloud came from an E57 file, its scans are written with their poses, otherwise one is.
     """
     pye57 = _pye57("write")
-    plan = _plan(path, stream)
-    summaries = [_Summary(group.scan) for group in plan.groups]
-    for number, block in _scan_blocks(path, stream, plan):
+    groups, is_numbered = _groups(path, stream)
+    summaries = [_Summary(group.scan) for group in groups]
+    give_blocks = partial(_scan_blocks, path, stream, groups, is_numbered=is_numbered)
+    for number, block in give_blocks():
         summaries[number].add(block)
     errors = (pye57.libe57.E57Exception, ValueError, RuntimeError)
     with (
@@ -158,10 +161,10 @@ def write_e57(path: Path, stream: CloudStream) -> None:
         _writing(pye57.libe57, beside) as image,
     ):
         scans = _write_header(pye57.libe57, image, stream.header.get(SYSTEM, ""))
-        for number, blocks in groupby(_scan_blocks(path, stream, plan), key=itemgetter(0)):
-            scan, summary = plan.groups[number].scan, summaries[number]
+        for number, blocks in groupby(give_blocks(), key=itemgetter(0)):
             points = (block for _, block in blocks)
-            _write_points(pye57.libe57, image, scans, scan, summary, points)
+            scan = groups[number].scan
+            _write_points(pye57.libe57, image, scans, scan, summaries[number], points)
 
 
 @contextmanager
@@ -203,8 +206,8 @@ def _write_header(libe57: Any, image: Any, system: str) -> Any:  # noqa: ANN401
     return scans
 
 
-def count_e57(path: Path, stream: BinaryIO, size: int) -> int:
-    """Return about the number of points, by the size of the file."""
+def count_e57(stream: BinaryIO, size: int) -> int:
+    """Return about the number of points by the size: opening a file checks all of its pages."""
     return size // _BYTES_PER_POINT
 
 
@@ -231,7 +234,7 @@ def _pye57(verb: str) -> Any:  # noqa: ANN401
     return require("pye57", extra="e57", purpose=f"{verb} E57 files")
 
 
-class Scan(NamedTuple):
+class ScanPose(NamedTuple):
     """A scan of an E57 file: its name, and how its points were moved to where they are.
 
     The rotation is a quaternion w x y z of any length, where zero turns nothing; the translation is
@@ -247,14 +250,14 @@ class Scan(NamedTuple):
     @property
     def is_moved(self) -> bool:
         """Whether the pose changes anything; if not, points keep their bits."""
-        return (self.rotation, self.translation) != (Scan().rotation, Scan().translation)
+        return (self.rotation, self.translation) != (ScanPose().rotation, ScanPose().translation)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The rotation as a matrix, shape ``(3, 3)``."""
         from scipy.spatial.transform import Rotation
 
-        w, x, y, z = self.rotation if any(self.rotation) else Scan().rotation
+        w, x, y, z = self.rotation if any(self.rotation) else ScanPose().rotation
         matrix: NDArray[np.float64] = Rotation.from_quat([x, y, z, w]).as_matrix()
         return matrix
 
@@ -292,12 +295,12 @@ def _turned(points: NDArray[np.floating], matrix: NDArray[np.float64]) -> NDArra
     return turned
 
 
-def _scan_of(header: Any) -> Scan:  # noqa: ANN401
+def _scan_of(header: Any) -> ScanPose:  # noqa: ANN401
     """Return the name and the pose of a scan."""
     name = header["name"].value() if "name" in header.scan_fields else ""
     if not header.has_pose():
-        return Scan(name)
-    return Scan(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
+        return ScanPose(name)
+    return ScanPose(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
 
 
 def _read_points(pye57: Any, file: Any, header: Any, chunk_size: int) -> Iterator[_Block]:  # noqa: ANN401
@@ -341,7 +344,7 @@ def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
     return "f" if single else "d"
 
 
-def _to_world(path: Path, block: _Block, scan: Scan) -> _Block:
+def _to_world(path: Path, block: _Block, scan: ScanPose) -> _Block:
     """Move the points of a scan by its pose, and give the fields the names of columns."""
     if all(axis in block for axis in _AXES):
         points = np.stack([block.pop(axis) for axis in _AXES], axis=1)
@@ -376,70 +379,62 @@ def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _Group(NamedTuple):
-    """Points that become a scan: which, and how many."""
+    """Points that become a scan, and how many they are at most."""
 
-    scan: Scan
+    scan: ScanPose
     count: int  # type: ignore[assignment]
 
 
-class _Plan(NamedTuple):
-    """What has to be known of all points before they are cut into scans.
+def _groups(path: Path, stream: CloudStream) -> tuple[list[_Group], bool]:
+    """Return the scans that a cloud is cut into, and whether its field ``scan`` numbers them.
 
-    If the scans say where points belong, the field ``scan`` says no more and is left out.
+    They are the scans that it came from if the field numbers these in order, which a pass over the
+    points tells. The field says no more then, and is left out.
     """
-
-    groups: list[_Group]
-    limits: dict[str, Limits]
-    names_scan: bool
-
-
-def _plan(path: Path, stream: CloudStream) -> _Plan:
-    """Look at all points; they are those of the cloud's scans if ``scan`` numbers them in order."""
     scans = stream.header.get("scans", ())
-    limits: dict[str, Limits] = {}
-    counts, is_numbered, last, total = np.zeros(len(scans), np.int64), len(scans) > 1, 0, 0
+    if len(scans) < 2:
+        return [_Group(scans[0] if scans else ScanPose(), sys.maxsize)], False
+    counts, last = np.zeros(len(scans), np.int64), 0
+    for chunk in stream:
+        number = flatten_cloud(path, chunk, _SPELLING).get("scan", np.full(1, -1))
+        bounds = np.searchsorted(number, np.arange(len(scans) + 1))
+        counts += np.diff(bounds)
+        is_sorted = number[0] >= last and (number[1:] >= number[:-1]).all()
+        if not is_sorted or bounds[0] != 0 or bounds[-1] != len(chunk):
+            return [_Group(ScanPose(), sys.maxsize)], False
+        last = number[-1]
+    return [_Group(scan, int(count)) for scan, count in zip(scans, counts, strict=True)], True
+
+
+def _scan_blocks(
+    path: Path, stream: CloudStream, groups: Sequence[_Group], *, is_numbered: bool
+) -> Iterator[tuple[int, _Block]]:
+    """Give the columns of each chunk in the frame of its scan, cut where the next scan begins.
+
+    Raises:
+        FormatError: If a field is not of numbers that E57 holds.
+    """
+    number, left = 0, groups[0].count
     for chunk in stream:
         columns = flatten_cloud(path, chunk, _SPELLING)
-        merge_limits(limits, columns)
-        total += len(chunk)
-        number = columns.get("scan")
-        if is_numbered and number is not None:
-            bounds = np.searchsorted(number, np.arange(len(scans) + 1))
-            counts += np.diff(bounds)
-            is_sorted = number[0] >= last and (number[1:] >= number[:-1]).all()
-            is_numbered = bool(is_sorted and bounds[0] == 0 and bounds[-1] == len(chunk))
-            last = number[-1]
-        else:
-            is_numbered = False
-    for name, (_, high) in limits.items():
-        if high >= 2**63:
-            raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
-    groups = [_Group(scans[0] if len(scans) == 1 else Scan(), total)]
-    if is_numbered:
-        groups = [_Group(scan, int(count)) for scan, count in zip(scans, counts, strict=True)]
-    return _Plan(groups, limits, is_numbered)
-
-
-def _scan_blocks(path: Path, stream: CloudStream, plan: _Plan) -> Iterator[tuple[int, _Block]]:
-    """Give the columns of each chunk in the frame of its scan, cut where the next scan begins."""
-    number, left = 0, plan.groups[0].count
-    for chunk in stream:
-        columns = flatten_cloud(path, chunk, _SPELLING, plan.limits)
-        if plan.names_scan:
+        for name, column in columns.items():
+            if column.dtype == np.uint64 and (column >= 2**63).any():
+                raise FormatError(f"{path}: expected field {name} below 2^63; leave it out.")
+        if is_numbered:
             del columns["scan"]
         start = 0
         while start < len(chunk):
             while left == 0:
                 number += 1
-                left = plan.groups[number].count
+                left = groups[number].count
             stop = min(start + left, len(chunk))
             block = {name: column[start:stop] for name, column in columns.items()}
-            yield number, _to_scan(path, block, plan.groups[number].scan)
+            yield number, _to_scan(path, block, groups[number].scan)
             left -= stop - start
             start = stop
 
 
-def _to_scan(path: Path, block: _Block, scan: Scan) -> _Block:
+def _to_scan(path: Path, block: _Block, scan: ScanPose) -> _Block:
     """Move points back to the frame of their scan, and give the fields the standard's names."""
     points = scan.to_scan(np.stack([block.pop(axis) for axis in "xyz"], axis=1))
     scan.turn_normals(block, back=True)
@@ -470,7 +465,7 @@ class _Summary:
         lacks: Columns that the scan came without and that are still zero.
     """
 
-    def __init__(self, scan: Scan) -> None:
+    def __init__(self, scan: ScanPose) -> None:
         self.longest = 0
         self.lacks = set(scan.lacks)
         self.limits: dict[str, tuple[Any, Any]] = {}
@@ -498,7 +493,7 @@ def _write_points(
     libe57: Any,  # noqa: ANN401
     image: Any,  # noqa: ANN401
     scans: Any,  # noqa: ANN401
-    scan: Scan,
+    scan: ScanPose,
     summary: _Summary,
     blocks: Iterator[_Block],
 ) -> None:
@@ -539,7 +534,7 @@ def _write_points(
     writer.close()
 
 
-def _facts(scan: Scan, names: Sequence[str], summary: _Summary) -> dict[str, Any]:
+def _facts(scan: ScanPose, names: Sequence[str], summary: _Summary) -> dict[str, Any]:
     """Return what is said about a scan as a whole: identity, pose, limits."""
     nothing = (0.0, 0.0)
     facts: dict[str, Any] = {

@@ -27,8 +27,10 @@ DAMAGES = (
 )
 """What libraries raise on damaged files beside their own errors, found by flipping bytes."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a full disk, and of a user who may not fill it further."""
 _MORE_BYTES = 1 << 20
-"""More than a library writes at a time, so that they do not fit where its last did not."""
+"""Bytes that are tried on a disk that may be full. They are more than a library writes at a time,
+and do not fit where its last ones did not."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
 """What the names have in common that :func:`atomic_path` writes under here."""
 

@@ -28,11 +28,9 @@ from torchrg.io.files import (
     first_line,
     refusing,
 )
-from torchrg.io.stream import CloudStream, Table
+from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Table
 from torchrg.structures import Cloud
 
-_POINTS_AT_ONCE = 1 << 20
-"""So that memory grows with the points that are really there, whatever a header promises."""
 _SPELLING = Spelling(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True
 )
@@ -41,18 +39,21 @@ _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 _FIRST_LAYERED_FORMAT = 6
 """Point formats from here on are compressed field by field."""
 _PACKING = ("laszip encoded", "copc")
-"""Whose records say how the points lie in the file."""
+"""Owners of the records that say how the points lie in the file."""
 _RANGE_BITS = 0b110
-"""Options of an extra dimension: its least value is said, and its largest."""
+"""Bits of the options of an extra dimension that promise its least and its largest value."""
 _UNFIT = "_value"
 """Ends the name of an extra dimension whose values the standard one of that name cannot hold."""
 _UNFIT_DESCRIPTION = "more than the standard one holds"
-"""Of such a dimension, so that one of another program with such a name keeps it; 32 bytes."""
-_LARGEST_INTEGER = 2**31 - 1
+"""Description of such a dimension, of at most 32 bytes. It tells ours from a dimension that another
+program gave such a name."""
+LARGEST_INTEGER = 2**31 - 1
+"""Largest coordinate of a LAS file, in steps of its scale from its offset."""
 _VERSION_AT, _RECORDS_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 100, 107, 235, 247
 """Places in the header: minor version, number of records, of points, extended records, and the
 number of points of 64 bits that version 1.4 has beside the old one, which may be 0 there."""
 _DATE_AT, _DATE_BYTES = 90, 4
+"""Place in the header of the day and the year of creation, and how many bytes they are."""
 
 
 def open_las(path: Path, size: int) -> Table:
@@ -93,7 +94,8 @@ def open_las(path: Path, size: int) -> Table:
         }
 
     naming = Naming(facts, names)
-    return Table(read, header.point_count, _POINTS_AT_ONCE, naming, header={"las": header})
+    # By chunks, memory grows with the points that are there, whatever the header promises.
+    return Table(read, header.point_count, POINTS_A_CHUNK, naming, header={"las": header})
 
 
 @contextmanager
@@ -222,7 +224,7 @@ class _Plan(NamedTuple):
 
 
 def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
-    """Look at all points."""
+    """Look at all points for what the header has to say of them."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     unfit, limits = set[str](), dict[str, Limits]()
     for number, chunk in enumerate(stream):
@@ -245,7 +247,7 @@ def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
         middle = np.rint((low + high) / 2)
         reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
         header.offsets = middle
-        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST_INTEGER)))
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
     plan = _Plan(header, has_date, unfit, limits, own)
     described = {known.dimension.name: known.dimension for known in own}
     standard = set(header.point_format.dimension_names)
@@ -316,8 +318,8 @@ def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401
                 described.options &= ~_RANGE_BITS
 
 
-def count_las(path: Path, stream: BinaryIO, size: int) -> int:
-    """Return the number of points by the header."""
+def count_las(stream: BinaryIO, size: int) -> int:
+    """Return the number of points by the header, for which laspy need not be installed."""
     head = stream.read(_COUNT14_AT + 8)
     (count,) = struct.unpack_from("<I", head, _COUNT_AT)
     if head[_VERSION_AT] >= 4:

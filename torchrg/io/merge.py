@@ -12,19 +12,20 @@ from numpy.typing import NDArray
 from torchrg.errors import FormatError
 from torchrg.io.e57 import SYSTEM
 from torchrg.io.fields import WIDEN
+from torchrg.io.las import LARGEST_INTEGER
 from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.io.stream import CloudStream, Extent
 from torchrg.structures import Cloud
 
 _SUSPICIOUS_RATIO = 100
-"""Of two boxes; tiles of one survey differ less, centimetres and metres by this much."""
-_LARGEST_INTEGER = 2**31 - 1
-"""Of the coordinates of a LAS file, in steps of its scale."""
+"""Ratio of the sizes of two clouds from which on the user is warned. Tiles of one survey differ
+less, and a cloud in centimetres differs from one in metres by this much."""
 _PROJECTION = "LASF_Projection"
-"""Whose records say in which coordinates a LAS file is."""
+"""Owner of the records that say in which coordinates a LAS file is."""
 _OWN_RECORDS = (_PROJECTION, "laszip encoded")
+"""Owners of records that are compared by themselves, or that say how the points lie in the file."""
 _EXTRA_DIMENSIONS = ("LASF_Spec", 4)
-"""Records that follow from what else is in a file: owners, and an owner with a number."""
+"""Owner and number of the record of the extra dimensions, which are compared as fields."""
 _ORIGIN_FACTS = ("system_identifier", "generating_software", "file_source_id", "uuid")
 """What a LAS header says of where one file comes from."""
 _KINDS = {
@@ -254,7 +255,7 @@ def _reason_to_drop(streams: Sequence[CloudStream], clouds: Sequence[Cloud]) -> 
         return "point formats differ"
     offsets, extents = headers[0].offsets, [stream.extent for stream in streams]
     reach = np.max([np.abs([e.low - offsets, e.high - offsets]) for e in extents])
-    if reach > _LARGEST_INTEGER * np.min([header.scales for header in headers]):
+    if reach > LARGEST_INTEGER * np.min([header.scales for header in headers]):
         return "its grid does not reach all points"
     return ""
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -52,8 +52,10 @@ _NOT_PER_POINT = {
 _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
 _BYTES_AT_ONCE = 1 << 20
-"""How much is unpacked together."""
+"""Bytes that are unpacked together, which bounds the memory."""
 _EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+"""Time of every array in an archive, the earliest that there is, so that equal results give equal
+bytes."""
 ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 
 
@@ -116,12 +118,6 @@ def _bare_or_records(path: Path, stream: CloudStream) -> Iterator[NDArray[Any]]:
     for chunk in stream:
         columns = flatten_cloud(path, chunk, spelling, limits)
         yield to_records(columns) if chunk.fields else chunk.coordinates
-
-
-def count_npy(path: Path, stream: IO[bytes], size: int) -> int:
-    """Return the number of rows of an array."""
-    layout = _read_layout(stream)
-    return layout.shape[0] if layout.shape else 0
 
 
 def open_npz(path: Path, size: int) -> Table:
@@ -258,14 +254,6 @@ def _header_of(empty: NDArray[Any], num_rows: int) -> bytes:
     digits = str(num_rows).encode()
     room = b" " * (len(digits) - 1)
     return before + mark[:-2] + digits + b"," + after.removesuffix(room + b"\n") + b"\n"
-
-
-def count_npz(path: Path, stream: BinaryIO, size: int) -> int:
-    """Return the number of rows of the coordinates."""
-    with zipfile.ZipFile(stream) as archive:
-        known = [f"{name}.npy" for name in _COORDINATES if f"{name}.npy" in archive.namelist()]
-        with archive.open(known[0]) as member:
-            return count_npy(path, member, size)
 
 
 def map_folder(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:

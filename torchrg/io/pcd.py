@@ -21,8 +21,9 @@ from torchrg.io.stream import CloudStream, Table, slices
 from torchrg.io.text import LINES_AT_ONCE, read_ascii, words_of
 
 _LONGEST_HEADER = 1 << 16
+"""Bytes of the longest header; a longer one is taken for damage."""
 _LARGEST_RECORD = 1 << 20
-"""Bytes; more is taken for damage."""
+"""Bytes of the largest point; a larger one is taken for damage."""
 _PADDING = "_"
 _TYPES = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
@@ -31,7 +32,7 @@ DEFAULT_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _SPELLING = Spelling(normals=("normal_x", "normal_y", "normal_z"), vectors=True)
 _PACKED_COLORS = ("rgb", "rgba")
 _LARGEST_LZF_RATIO = 88
-"""A reference of three bytes in LZF stands for at most 264 bytes."""
+"""Most bytes that one byte of LZF becomes: three bytes refer to at most 264."""
 _Fields = dict[str, NDArray[Any]]
 
 
@@ -97,11 +98,6 @@ def write_pcd(path: Path, stream: CloudStream) -> None:
         ]
 
     write_records(path, header, map(_packed, flatten_stream(path, stream, _SPELLING)))
-
-
-def count_pcd(path: Path, stream: BinaryIO, size: int) -> int:
-    """Return the number of points that the header promises."""
-    return _read_header(path, stream).num_points
 
 
 class _Header(NamedTuple):

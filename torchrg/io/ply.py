@@ -44,10 +44,12 @@ _READ_TYPES = _TYPES | {
 }
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
+"""Bytes of the longest header; a longer one is taken for damage."""
 _LONGEST_LIST = 1 << 20
-"""Bytes; more is taken for damage."""
+"""Bytes of the longest list; a longer one is taken for damage."""
 _LENGTH, _LIST = " length", " list"
-"""What a list is called in records. Names in a PLY file have no spaces, so these meet none."""
+"""Ends of the names of a list and its length in records. Names in a PLY file have no spaces, so
+that no property is called so."""
 
 
 def open_ply(path: Path, size: int) -> Table:
@@ -109,12 +111,6 @@ def write_ply(path: Path, stream: CloudStream) -> None:
             for columns in chunks
         ),
     )
-
-
-def count_ply(path: Path, stream: BinaryIO, size: int) -> int:
-    """Return the number of vertices."""
-    elements = _read_header(path, stream).elements
-    return {element.name: element.num_records for element in elements}["vertex"]
 
 
 def _storable(path: Path, name: str, column: NDArray[Any], limits: Limits | None) -> NDArray[Any]:

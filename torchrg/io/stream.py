@@ -28,7 +28,7 @@ from torchrg.io.fields import (
 from torchrg.structures import Cloud, origin_of_box
 
 POINTS_A_CHUNK = 1 << 20
-"""Points of a chunk: tens of megabytes, and few enough calls for each that they do not count."""
+"""Points of a chunk. They take tens of megabytes, and calls for each chunk cost next to nothing."""
 SILENT: dict[str, Any] = {"over": "ignore", "invalid": "ignore"}
 """Files may hold any bits as numbers: values that overflow or signal are kept, not reported."""
 

@@ -35,7 +35,7 @@ _COUNTED_BYTES = 1 << 16
 """How much of a file is read to tell how long its lines are."""
 _COMMENTS = ("#", "//")
 _MOST_DIGITS = 18
-"""Of a count of points; longer ones fit no file."""
+"""Most digits of a number of points; no file has room for more points."""
 
 
 class _Form(NamedTuple):
@@ -116,7 +116,7 @@ def write_text(path: Path, stream: CloudStream) -> None:
             file.writelines(_format_table(columns.values()))
 
 
-def count_text(path: Path, stream: BinaryIO, size: int) -> int:
+def count_text(stream: BinaryIO, size: int) -> int:
     """Return about the number of lines, by the length of the first."""
     sample = stream.read(_COUNTED_BYTES)
     return round(sample.count(b"\n") * size / max(len(sample), 1))

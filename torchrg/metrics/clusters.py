@@ -28,11 +28,11 @@ from torchrg.structures import UNLABELED
 _COINCIDENT = 1e-12
 """Radians. Closer centres, or closer directions of two clusters, differ by rounding alone."""
 _MAX_CELLS = 4096
-"""With more cells than this, the closest pair is searched in trees instead of a grid."""
+"""Most cells of a grid in which the closest pair is searched; of more, trees are faster."""
 _FINEST_LEVEL = 50
 """Divisions after which cells are as small as the rounding of coordinates."""
 _QUERIES = 65536
-"""Directions that are looked up in a tree at a time. Each time shortens the search of the next."""
+"""Directions that are looked up in a tree at a time. What is found shortens the next search."""
 
 
 class ClusterScore(NamedTuple):

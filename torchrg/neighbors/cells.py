@@ -90,15 +90,15 @@ def _search_level(
     if (np.ptp(columns, axis=1) / size + 4).prod() > _MAX_KEY:
         return rows
     grid = _make_grid(columns, size, rows)
-    settled = np.zeros(len(points), dtype=bool)
+    answered = np.zeros(len(points), dtype=bool)
 
     def work(cells: NDArray[np.int64]) -> None:
         found = _search_task(grid, cells, k)
-        settled[found[0]] = True
+        answered[found[0]] = True
         store(*found)
 
     map_tasks(work, _make_tasks(grid, k), torch.device("cpu"))
-    return rows[~settled[rows]]
+    return rows[~answered[rows]]
 
 
 class _CellGrid(NamedTuple):

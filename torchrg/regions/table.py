@@ -44,7 +44,7 @@ _WIDE_ENOUGH = 1.05
 _CELL_ANGLE = math.radians(28.0)
 """Angle between cells and rectangle: along a parallel edge all cells would be cut alike."""
 
-_MAX_TILT_DEG = 15.0
+MAX_TILT_DEG = 15.0
 """A floor or ceiling is within this angle of horizontal, a wall of vertical."""
 
 _END_SHARE = 0.15
@@ -231,10 +231,10 @@ def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     height = (planes.center * up).sum(dim=1)
     reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2
     low, high = (height - reach).amin(), (height + reach).amax()
-    horizontal = ~planes.curved & (steepness >= math.cos(math.radians(_MAX_TILT_DEG)))
+    horizontal = ~planes.curved & (steepness >= math.cos(math.radians(MAX_TILT_DEG)))
     largest = torch.where(horizontal, planes.area, 0).amax()
     broad = horizontal & (planes.area >= _LEAST_AREA_SHARE * largest)
-    upright = ~planes.curved & (steepness <= math.sin(math.radians(_MAX_TILT_DEG)))
+    upright = ~planes.curved & (steepness <= math.sin(math.radians(MAX_TILT_DEG)))
     kind[upright & (2 * reach >= _LEAST_WALL_SHARE * (high - low))] = wall
     kind[broad & (height >= high - _END_SHARE * (high - low))] = ceiling
     kind[broad & (height <= low + _END_SHARE * (high - low))] = floor

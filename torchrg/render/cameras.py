@@ -9,9 +9,13 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MARGIN = 0.03  # of the picture on each side
-_NEAREST = 0.25  # distance of the nearest point, in depths of the cloud
-_FLATTEST = 0.25  # ratio of height to width
+_MARGIN = 0.03
+"""Share of the picture that stays free on each side."""
+_NEAREST = 0.25
+"""Least distance from the camera to the nearest point, in depths of the cloud. A nearer camera
+would show what is in front much larger than what is behind."""
+_FLATTEST = 0.25
+"""Least ratio of height to width of a picture whose height is not given."""
 
 
 def make_camera(
@@ -23,8 +27,8 @@ def make_camera(
         world_to_camera: Rigid transform to x right, y down, z forward, shape ``(4, 4)``.
         focal: Focal length in pixels.
         center: Column and row of the principal point; whole numbers are pixel centres.
-        width: Of the picture.
-        height: Of the picture.
+        width: Width of the picture, in pixels.
+        height: Height of the picture, in pixels.
 
     Returns:
         A batch of one camera, float64.
@@ -79,9 +83,9 @@ def fit_camera(
     Args:
         points: What to show, shape ``(N, 3)``, finite.
         axes: Right, down and forward, shape ``(3, 3)``.
-        width: Of the picture, in pixels.
-        height: Of the picture. Default: what the points need, from a quarter of the width to all
-            of it.
+        width: Width of the picture, in pixels.
+        height: Height of the picture. Default: what the points need, from a quarter of the width
+            to all of it.
         field_of_view_deg: Angle over the width; or over the height, if that is larger.
 
     Returns:
@@ -115,9 +119,9 @@ def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "
 
     Args:
         points: What to show, shape ``(N, 3)``, finite; points behind the camera do not count.
-        width: Of the picture, in pixels.
-        height: Of the picture. Default: what the points need, from a quarter of the width to all
-            of it.
+        width: Width of the picture, in pixels.
+        height: Height of the picture. Default: what the points need, from a quarter of the width
+            to all of it.
 
     Returns:
         The camera.
@@ -179,8 +183,8 @@ def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Pro
 
     Args:
         camera: A batch of one.
-        origin: Of the points that will be projected, shape ``(3,)``; taken in float64, so that
-            clouds far from zero keep their precision.
+        origin: Origin of the points that will be projected, shape ``(3,)``; taken in float64, so
+            that clouds far from zero keep their precision.
         finer: Pixels along the side of each pixel of the camera.
 
     Returns:

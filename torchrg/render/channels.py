@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.linalg import unsigned_angle_deg
+from torchrg.metrics.contingency import check_labels, contingency_table
+from torchrg.metrics.labels import match_regions
 from torchrg.render.colors import (
     UNLABELED_GRAY,
     color_curvature,
@@ -17,7 +19,7 @@ from torchrg.render.colors import (
     color_sharp,
     palette_of_planes,
 )
-from torchrg.render.outcomes import OUTCOMES, outcomes_of
+from torchrg.structures import UNLABELED
 
 MODES = {
     "plane": ("planes", "labels"),
@@ -30,6 +32,14 @@ MODES = {
     "normal-error": ("errors of normals", "normals"),
 }
 """Meanings of colours: what a page calls them, and the field that they need."""
+
+OUTCOMES = {
+    "right": ((214, 224, 214), "in the region of their face"),
+    "part": ((245, 170, 40), "in a second region of their face"),
+    "other": ((205, 45, 60), "in the region of another face"),
+    "none": ((50, 95, 190), "in no region"),
+}
+"""What can become of a point: colour, and what it means."""
 
 _OCTAHEDRON_STEPS = 254
 """Steps along the sides of the square onto which directions are mapped: about one degree. An even
@@ -74,7 +84,7 @@ def channels_of(
 
     Args:
         points: Shape ``(n, 3)``, finite; they tell which planes need unlike colours.
-        fields: Of a cloud, of those points; see :class:`torchrg.structures.Cloud`. Labels and
+        fields: Fields of those points; see :class:`torchrg.structures.Cloud`. Labels and
             superpoints are numbered without gaps.
         truth: ``labels`` or ``normals`` of the same points.
         reference: Labels whose planes shall have the same colours, shape ``(n,)``.
@@ -123,8 +133,8 @@ def _of_normals(normals: Tensor) -> Channel:
     square = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     directions = torch.from_numpy(decode_directions(square.astype(np.uint8)))
     colors = color_normals(torch.cat([directions, torch.zeros(1, 3)])).numpy()
-    level = color_normals(torch.tensor([[0.0, 0, 1]]))[0].tolist()
-    legend = [(level, "level"), (colors[-1].tolist(), "no normal")]
+    gray = color_normals(torch.tensor([[0.0, 0, 1]]))[0].tolist()
+    legend = [(gray, "horizontal"), (colors[-1].tolist(), "no normal")]
     return Channel("normal", values, colors, legend)
 
 
@@ -153,6 +163,47 @@ def _of_angles(angles_deg: Tensor) -> Channel:
     ]
     values = (share * _LEVELS).round().numpy().astype(np.uint8)
     return Channel("normal-error", values, colors, legend)
+
+
+def outcomes_of(
+    labels: Tensor | NDArray[np.integer], truth: Tensor | NDArray[np.integer]
+) -> Tensor:
+    """Return what became of each point, as a place in :data:`OUTCOMES`.
+
+    Args:
+        labels: Regions, shape ``(N,)``.
+        truth: Faces, shape ``(N,)``.
+
+    Returns:
+        Shape ``(N,)``, int64: 0 where the region of the point is the partner of its face, 1 where
+        it is another one whose largest part is that face, 2 where it is mostly of other faces, 3
+        where the point is in no region.
+
+    Raises:
+        ShapeError: If a shape or dtype is not as above.
+
+    Example:
+        >>> outcomes_of(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6]))
+        tensor([0, 0, 0, 1, 0, 3])
+    """
+    regions, faces = check_labels("outcomes_of", labels=labels, truth=truth)
+    table = contingency_table(regions, faces)
+    pairs = match_regions(table)
+    partner = torch.full_like(table.region_labels, UNLABELED - 1)
+    partner[table.regions[pairs]] = table.face_labels[table.faces[pairs]]
+    # Overlaps by region, the largest first; the first of each region is that with its main face.
+    order = np.lexsort((-table.overlaps.numpy(), table.regions.numpy()))
+    rows, first = np.unique(table.regions.numpy()[order], return_index=True)
+    main = torch.full_like(table.region_labels, UNLABELED - 1)
+    main[rows] = table.face_labels[table.faces[order[first]]]
+    outcome = torch.full_like(regions, 3)
+    labeled = regions != UNLABELED
+    places = torch.searchsorted(table.region_labels, regions[labeled])
+    own = faces[labeled]
+    outcome[labeled] = torch.where(
+        partner[places] == own, 0, torch.where(main[places] == own, 1, 2)
+    )
+    return outcome
 
 
 def encode_directions(directions: Tensor) -> NDArray[np.uint8]:

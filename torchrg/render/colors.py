@@ -14,7 +14,7 @@ from torchrg.metrics.contingency import check_labels, contingency_table, number_
 from torchrg.metrics.labels import match_regions
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
-from torchrg.regions.adjacency import NearestPoints
+from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
 
 
 def rgb_to_lab(colors: Tensor) -> Tensor:
@@ -51,11 +51,18 @@ def _to_bytes(colors: Tensor) -> Tensor:
 UNLABELED_GRAY = 176
 """Red, green and blue of points that belong to no plane."""
 
-_CALM = ((74.5, 86.0), (24.0, 32.0), 24)  # lightness, chroma, number of hues
+_CALM = ((74.5, 86.0), (24.0, 32.0), 24)
+"""Lightnesses, chromas and number of hues, in CIE Lab, of the colours for large planes."""
 _VIVID = ((56.0, 65.0, 74.5), (44.0, 56.0), 36)
-_LARGE = 0.03  # share of all: planes that get a calm colour
-_ALIKE = 58.0  # squared Lab distance of colours that look about the same
-_ELSEWHERE = 0.005  # how much a plane that is not next to another one counts for it
+"""The same of the colours for small planes, which are easier to see."""
+_LARGE = 0.03
+"""Share of all points from which on a plane is large."""
+_ALIKE = 58.0
+"""Squared distance in CIE Lab of two colours that look about the same."""
+_ELSEWHERE = 0.005
+"""Least weight of a plane that is not beside the one that gets a colour; a neighbour has 1."""
+_GRAY_WEIGHT = 0.05
+"""Weight of the gray of points in no plane, which are nearly everywhere."""
 
 
 def make_palette() -> tuple[Tensor, int]:
@@ -158,7 +165,7 @@ def choose_colors(
     strength = np.clip(8 * share, _ELSEWHERE, 1)
     choices = torch.full_like(sizes, -1).numpy() if fixed is None else fixed.numpy().copy()
     done = choices >= 0
-    field = strength[done] @ repulsion[choices[done]] + 0.05 * repulsion[-1]
+    field = strength[done] @ repulsion[choices[done]] + _GRAY_WEIGHT * repulsion[-1]
     ends = torch.cat([pairs, pairs.flip(1)])
     order = ends[:, 0].argsort(stable=True)
     starts = torch.searchsorted(ends[order, 0], torch.arange(len(sizes) + 1)).tolist()
@@ -176,15 +183,21 @@ def choose_colors(
     return torch.from_numpy(choices)
 
 
-_LEVEL_LIGHTNESS, _UPRIGHT_LIGHTNESS, _CHROMA = 84.0, 60.5, 42.0
-_RAMP = (  # Lab: light gray, yellow, orange, red, violet; darker all the way
+_HORIZONTAL_LIGHTNESS, _UPRIGHT_LIGHTNESS = 84.0, 60.5
+"""Lightness in CIE Lab of horizontal and of upright surfaces: floors are lighter than walls."""
+_CHROMA = 42.0
+"""Chroma in CIE Lab of upright surfaces, which tells their hues apart."""
+_RAMP = (
     (88.4, 0.0, 0.0),
     (84.6, 6.8, 41.2),
     (68.1, 39.9, 53.7),
     (45.1, 60.6, 25.3),
     (19.0, 44.1, -21.7),
 )
+"""Scale of the curvature in CIE Lab: light gray, yellow, orange, red, violet, darker all the way,
+so that it is a scale in print as well."""
 _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
+"""Red, green and blue of regular points, light gray, and of sharp ones, red."""
 
 
 def color_normals(
@@ -192,8 +205,8 @@ def color_normals(
 ) -> Tensor:
     """Colour normals by direction; a normal and its opposite get the same colour.
 
-    Level surfaces are light gray; upright ones are coloured by the direction they face, with
-    perpendicular walls in opposite hues; slanted ones are between.
+    Horizontal surfaces are light gray. Upright ones are coloured by the direction they face, with
+    perpendicular walls in opposite hues. Slanted ones are between.
 
     Args:
         normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero where there is none.
@@ -220,7 +233,7 @@ def color_normals(
     east[axis.abs().argmin()] = 1
     east = torch.nn.functional.normalize(east - (east @ axis) * axis, dim=0)
     x, y, z = (tensor @ side for side in (east, torch.linalg.cross(axis, east), axis))
-    lightness = _UPRIGHT_LIGHTNESS + (_LEVEL_LIGHTNESS - _UPRIGHT_LIGHTNESS) * z * z
+    lightness = _UPRIGHT_LIGHTNESS + (_HORIZONTAL_LIGHTNESS - _UPRIGHT_LIGHTNESS) * z * z
     lab = torch.stack([lightness, _CHROMA * (x * x - y * y), 2 * _CHROMA * x * y], dim=-1)
     missing = (tensor == 0).all(dim=-1, keepdim=True)
     gray = torch.tensor(UNLABELED_GRAY, dtype=torch.uint8, device=tensor.device)
@@ -288,8 +301,6 @@ def color_sharp(sharp: Tensor | NDArray[Any]) -> Tensor:
 
 _NEIGHBORHOODS = ((256, 1.0), (48, 0.2))
 """Voxels along the longest side of the cloud whose neighbours touch, and how much they count."""
-_CONTACTS = 9
-"""Neighbours of a voxel that are asked for their planes, itself included."""
 
 
 def color_planes(
@@ -347,8 +358,8 @@ def palette_of_planes(
 ) -> tuple[Tensor, Tensor]:
     """Return each point's row in a palette ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
 
-    Its rows are the labels that occur, ascending, and gray, to which -1 leads as well. Arguments
-    as for :func:`color_planes`, flat.
+    Its rows are the labels that occur, ascending, and gray, which row -1 is as well. The arguments
+    are those of :func:`color_planes`, with one axis.
     """
     fixed = None
     if reference is not None:
@@ -394,5 +405,5 @@ def _touching_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
     if extent == 0:
         return labels.new_zeros((0, 2))
     sample = sample_voxels(points, extent / num_voxels).rows
-    neighbors = search_knn(points[sample], min(_CONTACTS, len(sample)))
+    neighbors = search_knn(points[sample], min(NUM_CONTACTS + 1, len(sample)))
     return NearestPoints(neighbors).contacts(labels[sample])[0]

@@ -1,5 +1,6 @@
 """What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
 
+import math
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from torchrg.linalg.moments import Segments
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
 from torchrg.regions.outline import trace_outline
-from torchrg.regions.table import Rectangles, classify_planes, covered_areas
+from torchrg.regions.table import MAX_TILT_DEG, Rectangles, classify_planes, covered_areas
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import find_outer_surfaces
 from torchrg.render.grid import build_grid, local_spacing, surface_cells
@@ -26,25 +27,29 @@ draws the first ones; along a curve, positions compress to two thirds."""
 PAGE_EXTENT = 10.0
 """The longest side of a cloud on a page: pages do not depend on the unit."""
 _OUTLINE_POINTS = 200_000
-"""Points that tell outlines: enough for a picture."""
+"""Points through which outlines are traced: enough for a picture."""
 _NOT_SHOWN = ("id", "centroid", "axes", "center", "outline")
 """Columns of the plane table that a page draws or does not need."""
 _MAX_SURFACES = 7
 """Outer surfaces that a page can cut away: bits of a byte, the last of which hides planes."""
 _USUAL_RADIUS = 128
+"""Byte of a point with the usual radius, in the middle of what a byte holds."""
 _STEPS_OF_OCTAVE = 16
+"""Steps of the byte in which the radius of a point doubles: one step is 4 percent."""
 _LARGEST_SPACING = 3.0
-"""Radii of points are bytes: steps of their ratio to the usual one, which is bounded both ways."""
-_UPRIGHT = 0.26
-"""Cosine between the normal of a wall and the upward direction: 15 degrees."""
+"""Largest ratio of a point's radius to the usual one, and of the usual one to it."""
+_UPRIGHT = math.sin(math.radians(MAX_TILT_DEG))
+"""Largest cosine between the normal of a wall and the upward direction."""
 _BEYOND = 0.02
 """A point is beyond a wall from this share of the cloud's longest side on."""
 _MOST_BEYOND = 0.03
-"""Share of the points beyond an outer wall: those that a scanner saw through doors and windows."""
+"""Largest share of the points beyond an outer wall: scanners see some through doors and windows."""
 _ALIKE = 0.9
-"""Cosine of the directions of walls that are cut away together."""
-_MOST_WALLS, _WALL_POINTS = 200, 20_000
-"""So many of the largest planes may be outer walls, as so many points of the cloud tell."""
+"""Least cosine between the directions of walls that are cut away together."""
+_MOST_WALLS = 200
+"""So many of the largest planes may be outer walls, which bounds the time."""
+_WALL_POINTS = 20_000
+"""Points of the cloud that tell whether there is anything beyond a wall."""
 
 
 class Frame(NamedTuple):
@@ -73,7 +78,8 @@ class Shown(NamedTuple):
         rows: Those that are shown, by strata, shape ``(n,)``.
         levels: Number of points in the first stratum, in the first two, and so on.
         points: In the axes of the page, shape ``(n, 3)``, float32.
-        fields: Of those points; normals in the axes of the page, labels numbered without gaps.
+        fields: Fields of those points; normals are in the axes of the page, and labels numbered
+            without gaps.
     """
 
     rows: Tensor

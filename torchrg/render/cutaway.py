@@ -81,13 +81,33 @@ class SideView:
         return functional.avg_pool2d(rows, (1, size), 1, (0, size // 2)).view(image.shape)
 
 
-_SPREAD = math.cos(math.radians(12))  # of a group of parallel cells
-_MIN_GROUP = 0.01  # share of the cells
-_FACING = math.cos(math.radians(30))  # of the cells of an outer surface
-_MIN_CEILING_DEPTH, _MIN_WALL_DEPTH = 0.4, 0.2  # of the extent: table tops are no ceilings
-_MIN_CEILING_COVER, _MIN_WALL_COVER = 0.15, 0.35  # of what is seen from a side
-_AROUND = 9  # pixels of the square that votes
-_MIN_WIDTH = 0.27  # share of that square at about the same height
+_SPREAD = math.cos(math.radians(12))
+"""Least cosine between the normal of a cell and the direction of its group. 12 degrees keep the
+cells of a noisy wall in one group."""
+_MIN_GROUP = 0.01
+"""Least share of all cells that makes a group of parallel cells. Smaller groups are furniture."""
+_FACING = math.cos(math.radians(30))
+"""Least cosine between the normal of an outer cell and the side that it closes. 30 degrees keep a
+wall that is slightly bent in one piece."""
+_MIN_CEILING_DEPTH = 0.4
+"""Least share of the cloud's height that lies below a ceiling. Below a table top there is less."""
+_MIN_WALL_DEPTH = 0.2
+"""Least share of the cloud's extent that lies between a wall and what is opposite to it. It is less
+than for a ceiling, because rooms have narrow parts."""
+_MIN_CEILING_COVER = 0.15
+"""Least share of what is seen from above that a ceiling covers. With less of it one looks into the
+rooms anyway."""
+_MIN_WALL_COVER = 0.35
+"""Least share of what is seen from a side that the walls there cover. With less of them one looks
+into the rooms anyway."""
+_AROUND = 9
+"""Side of the square of pixels in which outer cells vote. A pixel is one and a half cells wide, so
+that the square is wider than most windows and recesses."""
+_MIN_WIDTH = 0.27
+"""Least share of that square at about the same height for a vote to count. It is a strip of two and
+a half of its nine pixels; what is narrower, as a ledge, closes no side."""
+_BEHIND = 5
+"""Side, in pixels, of the square in which the farthest point behind a cell is looked for."""
 
 
 class OuterSurface(NamedTuple):
@@ -120,21 +140,23 @@ class OuterSurface(NamedTuple):
 def find_outer_surface(cells: Cells, direction: Tensor, *, is_ceiling: bool) -> OuterSurface | None:
     """Find the walls or the ceiling that close a cloud toward one side.
 
-    A cell is outer if its plane faces that side, nothing is in front of it, and far behind it
-    there is something: the floor below a ceiling, the opposite wall behind a wall. The cells around
-    it at about its height vote, so that windows and recesses are no exceptions. With a ceiling goes
-    all that is above, as in a section of a building. None if what there is covers so little of the
-    side that it does not close it.
+    A cell is outer if its plane faces that side, nothing is in front of it, and there is something
+    far behind it: the floor below a ceiling, or the opposite wall behind a wall. The cells around
+    it at about its height vote, so that windows and recesses are no exceptions. All that is above a
+    ceiling goes with it, as in a section of a building. The result is None if what is found covers
+    so little of the side that it does not close it.
+
+    The shader and the picking of ``page.js`` cut by the same rule, from the bits that
+    :func:`torchrg.render.content.sides_of_planes` gives each plane.
     """
     thickness, view = 1.25 * cells.size, SideView(cells.centers, direction, 1.5 * cells.size)
     height, pixels = cells.centers @ direction, view.pixels(cells.centers)
     top = view.largest(pixels, height)
     low, high = height.quantile(height.new_tensor([0.02, 0.98])).tolist()
     share = _MIN_CEILING_DEPTH if is_ceiling else _MIN_WALL_DEPTH
-    depth_below = top + view.largest_around(view.largest(pixels, -height), 5)
+    depth_below = top + view.largest_around(view.largest(pixels, -height), _BEHIND)
     first = ((cells.normals @ direction).abs() > _FACING) & (height >= top[pixels] - thickness)
     outer = first & (depth_below >= share * (high - low))[pixels]
-
     if not bool(first.any()):
         return None
     pixels, height, outer = pixels[first], height[first], outer[first]
@@ -190,8 +212,11 @@ def _hemisphere(count: int) -> Tensor:
 View = Literal["cutaway", "above", "outside", "sensor"]
 
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
+"""Angles from the normal of the largest walls, in degrees, that are tried. None looks straight at a
+wall, so that two walls of a corner are always seen."""
 LEAST_FACING = {"cutaway": 0.1, "above": 0.7}
-"""Least cosine to the viewer of what is cut away."""
+"""Least cosine between the direction of an outer surface and that toward the viewer for it to be
+cut away, by the view. From above only what lies nearly flat is in the way."""
 
 
 class Viewpoint(NamedTuple):
@@ -279,8 +304,9 @@ def _is_longer(centers: Tensor, heading: Tensor, up: Tensor) -> bool:
 def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: float) -> Tensor:
     """Return the direction at angles about the upward axis and over the horizon."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    level = math.cos(azimuth) * heading + math.sin(azimuth) * torch.linalg.cross(up, heading)
-    turned: Tensor = math.cos(elevation) * level + math.sin(elevation) * up
+    across = torch.linalg.cross(up, heading)
+    horizontal = math.cos(azimuth) * heading + math.sin(azimuth) * across
+    turned: Tensor = math.cos(elevation) * horizontal + math.sin(elevation) * up
     return turned
 
 

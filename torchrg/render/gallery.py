@@ -1,4 +1,4 @@
-"""A picture of each of many scans that leads to its page, and an index of them."""
+"""A picture of each of many scans that links to its page, and an index of them."""
 
 import os
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ class Entry(NamedTuple):
     """A scan of an index.
 
     Attributes:
-        name: Of the scan.
+        name: Name of the scan.
         picture: A file below the folder of the index, with forward slashes.
-        page: As ``picture``.
+        page: Its page, another such file.
         words: What else there is to say.
     """
 

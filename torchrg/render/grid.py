@@ -1,4 +1,4 @@
-"""A sparse grid over a cloud: how dense it is, and small pieces of surface, in linear time."""
+"""A sparse grid over a cloud: how dense it is, and small patches of surface, in linear time."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,16 @@ from torchrg.neighbors.order import gather_bits, spread_bits
 BITS = 16
 """The longest side of a cloud is ``2**BITS`` voxels."""
 
-_FEW = 12  # occupied voxels that tell the density of a surface
-_FEWEST = 5  # that tell a plane
-_FLAT = 0.1  # ratio of the two smallest eigenvalues
-_MOSTLY = 0.6  # of the voxels
+_FEW = 12
+"""Occupied voxels in a cube from which on they tell how dense a surface is."""
+_FEWEST = 5
+"""Occupied voxels in a cube from which on they tell a plane: two more than always lie on one."""
+_FLAT = 0.1
+"""Largest ratio of the two smallest eigenvalues of a cube that is flat."""
+_MOSTLY = 0.6
+"""Share of the voxels in flat cubes from which on a level is fine enough for the noise."""
+_WELL_FILLED = 0.75
+"""Share of the voxels that are in cubes with enough of them, in the levels that are looked at."""
 
 
 class Level(NamedTuple):
@@ -58,7 +64,7 @@ class CloudGrid(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Pieces of surface: what is in the cubes of one level.
+    """Patches of surface: what is in the cubes of one level.
 
     Attributes:
         centers: Means of the occupied voxels, shape ``(C, 3)``, float32, about the grid's origin.
@@ -182,7 +188,7 @@ def surface_cells(grid: CloudGrid, *, max_cells: int = 60_000) -> Cells:
         if number == len(grid.levels) - 1
         or (
             len(level.codes) <= max_cells
-            and level.counts[level.counts >= _FEW].sum() >= 0.75 * level.counts.sum()
+            and level.counts[level.counts >= _FEW].sum() >= _WELL_FILLED * level.counts.sum()
         )
     )
     fits = []

@@ -50,7 +50,7 @@ from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
 
 MAX_POINTS = 1_000_000
-"""Points of a page by default: what a laptop turns fluently. Of more, a random sample is shown."""
+"""Most points of a page by default: as many as a laptop turns fluently."""
 _STEPS = 65535
 """Steps of a position along the longest side of a cloud: two bytes a coordinate."""
 _ASSETS = Path(__file__).parent
@@ -98,13 +98,14 @@ def make_page(
         beside: Another result in the same coordinates, for the right half. If it has the same
             points, planes that are the same in both have the same colour.
         truth: A cloud of the same points, with the true ``labels`` or ``normals``, to show errors.
-        title: Of the page. Default: the names of the files.
+        title: Title of the page. Default: the names of the files.
         color: A key of :data:`torchrg.render.channels.MODES` to begin with. Default: the first
             that there is.
         view: From where to look at first, see :func:`torchrg.render.render_cloud`.
         up: Upward direction. Default: z, for the view of a sensor -y.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
-        max_points: Of more points, a random sample of so many is shown, and the page says so.
+        max_points: Most points of a cloud that are shown; of a larger one it is a random sample,
+            and the page says so.
 
     Returns:
         The page.

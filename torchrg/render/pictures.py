@@ -29,12 +29,23 @@ from torchrg.render.raster import (
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_BLOCK = 131_072  # points in work at a time
-_RADIUS = 1.3  # of a disc, in units of the local spacing: closes surfaces but for a few gaps
-_LARGEST = 4  # times the usual radius, for stray points
-_WIDEST, _ALWAYS = 0.02, 8.0  # largest radius of a disc, in widths of the picture or in pixels
-_GAP = 0.6  # half the width of the gaps that are closed, in disc radii
-_STEEPEST = 0.05  # least cosine of the angle under which a disc is seen
+_POINTS_AT_ONCE = 131_072
+"""Points that are drawn together, which bounds the memory."""
+_RADIUS = 1.3
+"""Radius of a disc in units of the local spacing. Such discs close a surface but for a few gaps."""
+_LARGEST = 4
+"""Largest radius of a disc in units of the usual one, so that stray points stay small."""
+_WIDEST = 0.02
+"""Largest radius of a disc in widths of the picture, which bounds the time of drawing it."""
+_ALWAYS = 8.0
+"""Radius in pixels of the picture that a disc may always have, however small the picture is."""
+_GAP = 0.6
+"""Half the width of the gaps that are closed, in radii of a disc."""
+_STEEPEST = 0.05
+"""Least cosine of the angle under which a disc is seen: 87 degrees. Beyond, slopes get infinite."""
+_FAR_APART = 6
+"""Units of the usual spacing. Points farther from their neighbours are stray ones, and do not
+decide what the picture shows."""
 
 
 def draw_picture(
@@ -52,10 +63,11 @@ def draw_picture(
     Args:
         camera: A batch of one, with the size of the picture.
         grid: The cloud, of at least one finite point.
-        spacing: Of its finite points, shape ``(n,)``.
+        spacing: Distance of each finite point from its neighbours, shape ``(n,)``.
         kept: Which of them to draw, shape ``(n,)``, bool.
-        colors: Of all points, shape ``(N, 3)``, uint8.
-        normals: Of all points, shape ``(N, 3)``. Default: those of small cubes of the cloud.
+        colors: Colours of all points, shape ``(N, 3)``, uint8.
+        normals: Normals of all points, shape ``(N, 3)``. Default: those of small cubes of the
+            cloud.
         supersampling: Pixels along the side of each pixel of the picture.
 
     Returns:
@@ -71,19 +83,19 @@ def draw_picture(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
     cells = surface_cells(grid) if normals is None else None
-    for block in torch.split(places, _BLOCK):
-        rows = grid.rows[block]
+    for some in torch.split(places, _POINTS_AT_ONCE):
+        rows = grid.rows[some]
         if cells is not None:
-            slant = cells.normals[cells.cell_of[block]]
+            slant = cells.normals[cells.cell_of[some]]
         elif normals is not None:
             slant = normals[rows].float()
-        _draw_block(
+        _draw_points(
             buffer,
             project,
-            grid.points[block],
+            grid.points[some],
             colors[rows],
             slant,
-            lengths[block],
+            lengths[some],
             least=supersampling / 2,
         )
     reach = max(1, round(_GAP * min(radius, widest)))
@@ -101,7 +113,7 @@ def _usual_radius(
     project: Projection, points: Tensor, lengths: Tensor, places: Tensor
 ) -> tuple[float, float]:
     """Return the median radius of the discs, in pixels and in the unit of the cloud."""
-    sample = places[:: max(1, len(places) // _BLOCK)]
+    sample = places[:: max(1, len(places) // _POINTS_AT_ONCE)]
     depth = project(points[sample])[0][:, 2]
     sample, depth = sample[depth > 0], depth[depth > 0]
     if len(sample) == 0:
@@ -111,7 +123,7 @@ def _usual_radius(
     )
 
 
-def _draw_block(
+def _draw_points(
     buffer: DepthBuffer,
     project: Projection,
     points: Tensor,
@@ -151,12 +163,6 @@ def _reduce(image: Tensor, size: int, combine: Callable[[Tensor, Tensor], Tensor
     """Combine the pixels of each square of ``size`` a side."""
     parts = [image[row::size, column::size] for row in range(size) for column in range(size)]
     return functools.reduce(combine, parts)
-
-
-if TYPE_CHECKING:
-    from kornia.geometry.camera import PinholeCamera
-
-_FAR_APART = 6  # times the usual spacing: stray points, which do not decide what is shown
 
 
 def render_cloud(
@@ -252,8 +258,8 @@ def render_points(
         colors: Shape ``(N, 3)``, uint8.
         camera: A batch of one camera of kornia, with the size of the picture; for example from
             :func:`torchrg.render.make_camera`.
-        normals: As for :func:`render_cloud`.
-        supersampling: As for :func:`render_cloud`.
+        normals: See :func:`render_cloud`.
+        supersampling: See :func:`render_cloud`.
 
     Returns:
         The picture, shape ``(height, width, 3)``, uint8.

@@ -11,16 +11,28 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_NOTHING = 0xFFFFFF  # white, infinitely far
+_NOTHING = 0xFFFFFF
+"""Key of a pixel in which nothing is drawn: white, and infinitely far away."""
+_LIGHT = (-0.45, -0.7, -0.55)
+"""Direction toward the light in the axes of the camera: from the left, above, and behind it."""
+_DARKEST = 0.62
+"""Brightness of a surface that faces away from the light. Its colour can still be told."""
+_DEEPEST = 0.85
+"""Share of its brightness that a pixel loses in the deepest hollow."""
+_REACHES = ((1, 0.5), (2, 0.3), (3, 0.2))
+"""Distances at which hollows are looked for, in radii of a disc, and how much each counts. Together
+they count 1, and the nearest counts most, so that creases are drawn as thin lines."""
+_NOISE = 0.35
+"""Tangent of a bend over the radius of one disc. A smaller bend is noise and is not shown."""
 
 
 class DepthBuffer:
     """What is nearest in each pixel of a picture.
 
     Args:
-        width: Of the picture.
-        height: Of the picture.
-        max_radius: Of the discs, in pixels; larger ones are drawn as large as this.
+        width: Width of the picture, in pixels.
+        height: Height of the picture, in pixels.
+        max_radius: Largest radius of a disc, in pixels; larger ones are drawn as large as this.
         device: Where to draw.
 
     Example:
@@ -152,7 +164,7 @@ def _largest_around(image: Tensor, reach: int) -> Tensor:
     """Return the largest value in the square around each pixel of an image ``(H, W)``."""
     for axis in (0, 1):
         edges = (reach, reach, 0, 0) if axis else (0, 0, reach, reach)
-        image = torch.nn.functional.pad(image, edges, value=-torch.inf)
+        image = functional.pad(image, edges, value=-torch.inf)
         width = 1
         while width <= 2 * reach:
             step = min(width, 2 * reach + 1 - width)
@@ -160,12 +172,6 @@ def _largest_around(image: Tensor, reach: int) -> Tensor:
             image = torch.maximum(image.narrow(axis, 0, count), image.narrow(axis, step, count))
             width += step
     return image
-
-
-_LIGHT = (-0.45, -0.7, -0.55)  # toward the light: left, above, behind the camera
-_DARKEST = 0.62
-_REACHES = ((1, 0.5), (2, 0.3), (3, 0.2))  # in disc radii, and their weights
-_NOISE = 0.35  # a bend over one disc radius that is not shown, as a tangent
 
 
 def light_colors(colors: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
@@ -220,4 +226,4 @@ def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tens
             hollow.sub_(_NOISE * radius / reach).clamp_(min=0)
             hollow.div_(slope.square_().add_(1).sqrt_())
             darkness.add_(hollow.div_(hollow + 1), alpha=weight / 4)
-    return torch.where(drawn, 1 - 0.85 * darkness, 1.0)
+    return torch.where(drawn, 1 - _DEEPEST * darkness, 1.0)

@@ -1,4 +1,4 @@
-"""Furnished rooms."""
+"""Furnished rooms: the sizes and places of all that is in them, drawn from a seed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -30,9 +30,9 @@ _ROOM = 100
 """Purpose of the random numbers: sizes and places in a room."""
 
 _FLOOR_CELL = (1.85, 1.35)
-"""Metres. A table with room to pass around it."""
+"""Metres along and across a place on the floor: a table with room to pass around it."""
 _WALL_CELL = 1.75
-"""Metres. A window or a cabinet with wall on both sides."""
+"""Metres along a place on a wall: a window or a cabinet with wall on both sides."""
 _CORNER = 0.6
 """Metres that are free at both ends of a wall, for a cabinet on the next wall."""
 _AISLE = 0.75
@@ -80,7 +80,7 @@ class RoomLayout:
     wall_bend: float = 0.04
     """How far the middle of a bent wall bulges into the room."""
     plate_thickness: float = 0.04
-    """Of tables and shelves."""
+    """Thickness of table tops and shelves."""
     panel_thickness: float = 0.015
     """Least thickness of panels; each is up to twice as thick, so that no two are in one plane."""
     heading_deg: float = 0.0
@@ -148,7 +148,7 @@ def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel
     """Build the description of a furnished room, to be sampled or rendered.
 
     Args:
-        seed: Of sizes and places.
+        seed: Seed of sizes and places.
         layout: What is in the room. Default: ``RoomLayout()``.
 
     Returns:

@@ -19,9 +19,9 @@ NoiseDirection = Literal["normal", "isotropic"]
 PLACES, NOISE = range(2)
 """Purposes of the random numbers. Places are the same whatever the noise is."""
 _CLEARANCE = 1e-7
-"""Sizes of the scene. So much in front of a surface must be free for it to be seen."""
+"""Share of the size of a scene that must be free in front of a surface for it to be seen."""
 _SPARE = 1.02
-"""Points that are tried for one that is expected to be needed, which saves repetitions."""
+"""Points that are tried for each one that is expected to be needed, which saves repetitions."""
 
 
 class Scene(NamedTuple):

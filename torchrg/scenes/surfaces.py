@@ -218,7 +218,7 @@ class Ring:
         kind: What it is part of.
         frame: The third axis is the axis of rotation; the middle of the arc is at height zero.
         center: Distance of the middle of the arc from the axis; 0 for a ball.
-        radius: Of the arc.
+        radius: Radius of the arc.
         arc: Angles of the arc, from outwards to upwards.
         sector: Angles about the axis, from the first axis.
 
@@ -349,7 +349,7 @@ class Drum:
 
     Args:
         frame: Its third axis is the axis of the cylinder; the origin is the middle of the base.
-        radius: Of the cylinder.
+        radius: Radius of the cylinder.
         height: Along the third axis.
 
     Example:

@@ -7,8 +7,7 @@
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
 from torchrg.transforms.planes import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
-from torchrg.transforms.sample import CenterCloud, KeepFinite
-from torchrg.transforms.voxels import SampleVoxels
+from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleVoxels
 
 __all__ = [
     "CenterCloud",

@@ -25,8 +25,7 @@ from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
 from torchrg.transforms.planes import GrowRegions, MakeSuperpoints
 from torchrg.transforms.rows import OUR_KEYS, with_listed
-from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform
-from torchrg.transforms.voxels import SampleVoxels
+from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
 _FEATURES = ("curvature", "residual")
 """Entries of one number a point that may become features."""

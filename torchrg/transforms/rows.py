@@ -41,7 +41,8 @@ _HOLDING_ROWS = {
 }
 """Entries that hold numbers of points: who takes points out would have to renumber them."""
 _FEW = 16
-"""Clouds of so few points may have as many rows as a pose or a box: there, names alone count."""
+"""Most points of a cloud in which names alone tell what has a row for each point: a pose or a box
+may have as many rows."""
 
 
 def entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
@@ -72,10 +73,10 @@ def point_keys(
     Raises:
         ConfigError: If it cannot be told of an entry.
     """
-    found, doubtful = _sort_keys(entries, num_points, whole)
-    if doubtful:
+    found, ambiguous = _sort_keys(entries, num_points, whole)
+    if ambiguous:
         raise ConfigError(
-            f"{caller}: cannot tell whether {', '.join(map(str, doubtful))} of the sample has a "
+            f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has a "
             f"row for each of {num_points} points; make it an array and name it in "
             f"{LISTED!r}, or leave it out."
         )
@@ -114,13 +115,13 @@ def _sort_keys(
     by_name = _USUAL_KEYS.union(listed_keys(entries) or ())
     by_length = num_points > _FEW and not _has_chosen_list(entries)
     found: list[str] = []
-    doubtful: list[str] = []
+    ambiguous: list[str] = []
     for key, value in entries.items():
         if is_whole(key, whole) or num_points == 0 or not _is_as_long(value, num_points):
             continue
         is_array = isinstance(value, Tensor | np.ndarray)
-        (found if is_array and (by_length or key in by_name) else doubtful).append(key)
-    return found, doubtful
+        (found if is_array and (by_length or key in by_name) else ambiguous).append(key)
+    return found, ambiguous
 
 
 def is_whole(key: Any, whole: Collection[str] = ()) -> bool:  # noqa: ANN401

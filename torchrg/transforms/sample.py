@@ -6,7 +6,8 @@ treat each cloud by itself.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+import importlib
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from torch import Tensor, nn
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
+from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
-from torchrg.transforms.pyg import is_separable, with_each
 from torchrg.transforms.rows import (
     LISTED,
     OUR_KEYS,
@@ -36,6 +37,11 @@ KEYS = (
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
 """Names that a PyG ``Data`` has instead of ours, unless others are given. PyG makes entries with
 ``index`` in their name refer to the rows of the batch."""
+_MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
+"""Entries that PyG makes when it joins clouds."""
+_NEVER_A_ROW = torch.iinfo(torch.int64).min
+"""Stands for no row in a PyG ``Data``, where -1 would not: it is still negative when PyG has added
+the rows of the clouds before."""
 
 
 class SampleTransform(nn.Module):
@@ -229,3 +235,95 @@ def _middle(cloud: Tensor) -> Tensor:
         return torch.zeros(3, dtype=torch.float64, device=cloud.device)
     low, high = finite.amin(dim=0), finite.amax(dim=0)
     return low + (high - low) / 2
+
+
+class SampleVoxels(SampleTransform):
+    """Keep one point of each voxel, and remember the voxel of every point.
+
+    Reads ``coord`` ``(N, 3)``; reduces every entry with a row for each point to ``(V, ...)``, and
+    adds ``inverse`` ``(N,)``, int64, negative for none: ``restore_points`` takes labels of the
+    voxels back to all points. It names rows of the whole sample, in a batch too; in a PyG ``Data``
+    it is ``inverse_index``, which PyG keeps so when it batches. Where ``inverse`` is there already,
+    it goes on from its points. No voxel crosses the clouds of a batch. See ``sample_voxels``.
+
+    Args:
+        size: Side of a voxel, in the unit of the cloud.
+        keys: Other names for the keys.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 0], [0.04, 0, 0], [0.11, 0, 0]])
+        >>> sample = SampleVoxels(0.1)({"coord": points})
+        >>> len(sample["coord"]), sample["inverse"].tolist()
+        (2, [0, 0, 1])
+    """
+
+    def __init__(self, size: float, *, keys: Mapping[str, str] | None = None) -> None:
+        super().__init__(keys=keys)
+        if not 0 < size < float("inf"):
+            raise ConfigError(f"SampleVoxels: expected size > 0, got {size!r}.")
+        self.size = size
+
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample of voxels."""
+        coord = self.read(sample, "coord")
+        rows, inverse, num_voxels = [], [], 0
+        for cloud in rows_of_clouds(sample, len(coord)):
+            voxels = sample_voxels(coord[cloud], self.size)
+            rows.append(voxels.rows + cloud.start)
+            inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
+            num_voxels += len(voxels.rows)
+        voxel_of = torch.cat(inverse)
+        if not isinstance(sample, Mapping):
+            voxel_of = voxel_of.where(voxel_of >= 0, _NEVER_A_ROW)
+        selected = self.selected(sample, torch.cat(rows), len(coord))
+        found = {self.key(sample, "inverse"): voxel_of} | self.moved_inverse(sample, voxel_of)
+        return self.changed(sample, selected | found)
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return f"size={self.size}"
+
+
+def is_separable(sample: Any) -> bool:  # noqa: ANN401
+    """Return whether a sample is a PyG ``Batch`` that can be taken apart into its clouds.
+
+    One whose points were taken out by hand cannot; it counts as one sample with ``batch``.
+    """
+    slices = getattr(sample, "_slice_dict", None)
+    if not slices or not callable(getattr(sample, "to_data_list", None)):
+        return False
+    return all(
+        int(ends[-1]) == sample[key].shape[sample.__cat_dim__(key, sample[key]) or 0]
+        for key, ends in slices.items()
+        # Matrices stacked along a diagonal have two axes of ends, and no row for a point.
+        if key in sample and isinstance(sample[key], Tensor) and ends.ndim == 1
+    )
+
+
+def with_each(batch: Any, change: Callable[[Any], Any]) -> Any:  # noqa: ANN401
+    """Return a batch of the changed clouds of a batch; the given one is not changed.
+
+    What was added to the batch after it was made stays: rows of points with their clouds, the rest
+    as it is. ``follow_batch`` is kept.
+    """
+    clouds, whole = batch.to_data_list(), {}
+    followed = [key for key in batch._slice_dict if f"{key}_ptr" in batch]  # noqa: SLF001
+    made = {*_MADE_BY_BATCHING, *(f"{key}_{part}" for key in followed for part in ("batch", "ptr"))}
+    for key in set(batch.keys()) - set(batch._slice_dict) - made:  # noqa: SLF001
+        value = batch[key]
+        if isinstance(value, Tensor) and value.ndim and len(value) == batch.num_nodes:
+            for cloud, part in zip(clouds, _parts(value, batch), strict=True):
+                cloud[key] = part
+        else:
+            whole[key] = value
+    join = importlib.import_module("torch_geometric.data").Batch.from_data_list
+    changed = join([change(cloud) for cloud in clouds], follow_batch=followed)
+    for key, value in whole.items():
+        changed[key] = value
+    return changed
+
+
+def _parts(values: Tensor, batch: Any) -> list[Tensor]:  # noqa: ANN401
+    """Return the rows of each cloud of a batch."""
+    counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
+    return list(torch.split(values, counts))
