@@ -7,7 +7,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.made import make_shape
 from torchrg.config import load_config
 from torchrg.neighbors import search_knn
-from torchrg.normals.consensus.noise import survey_noise
+from torchrg.normals.consensus.noise import regional_noise, survey_noise
 from torchrg.normals.patches import fit_points
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.pipeline import segment_planes
@@ -105,8 +105,9 @@ def test_a_step_that_was_rounded_is_no_noise_of_the_region(offset, ramp):
     points, height = ramped_step(offset, ramp, 0.001, 4)
     neighbors = search_knn(points, 50)
     fit = fit_points(points, neighbors, fit_normals_pca)
-    assert survey_noise(points, neighbors, fit).noise[height == 1].median() > 0.0013
-    found = survey_noise(points, neighbors, fit, regional=True).noise
+    local = survey_noise(points, neighbors, fit).noise
+    assert local[height == 1].median() > 0.0013
+    found = torch.minimum(local, regional_noise(local, neighbors))
     assert found.max() < 0.001
     assert found.median() > 0.0007
     assert found.min() > 0.0005

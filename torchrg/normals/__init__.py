@@ -72,7 +72,7 @@ def steps_of(config: NormalsConfig) -> int:
     """Return the :data:`STEPS` of an estimator with its settings: noise of a region takes more.
 
     Example:
-        >>> steps_of(NormalsConfig(noise_scope="regional")) - steps_of(NormalsConfig())
+        >>> steps_of(NormalsConfig("consensus", noise_scope="regional")) - STEPS["consensus"]
         4
     """
     is_regional = config.method == "consensus" and config.noise_scope == "regional"
