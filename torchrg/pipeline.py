@@ -30,7 +30,8 @@ from torchrg.neighbors import (
     search_knn,
 )
 from torchrg.neighbors.tiles import Part, cut_part
-from torchrg.normals import ESTIMATORS, steps_of
+from torchrg.normals import ESTIMATORS, STEPS
+from torchrg.normals.consensus.constants import REGIONAL_STEPS
 from torchrg.regions import partition_points, summarize_planes
 from torchrg.regions.edges import EDGE_STEPS, GrowingCloud
 from torchrg.regions.growth import (
@@ -336,7 +337,8 @@ def estimate_normals(store: Store, block: slice, number: int, config: PipelineCo
     lists, settings = "neighbors", config.normals
     if isinstance(store, FolderStore):
         lists, settings = tiles.wider_neighbors(store, settings)
-    part = _around(store, block, steps_of(settings), lists)
+    steps = STEPS[settings.method] + REGIONAL_STEPS * (settings.noise_scope == "regional")
+    part = _around(store, block, steps, lists)
     points = store.lazy("cloud")[part.rows]
     fit = ESTIMATORS[settings.method](points, part.neighbors, settings, config.chunk_size)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp

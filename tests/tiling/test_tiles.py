@@ -18,7 +18,8 @@ from torchrg.config import NormalsConfig, load_config
 from torchrg.errors import ConfigError, FormatError
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.neighbors.tiles import cut_part
-from torchrg.normals import ESTIMATORS, STEPS, steps_of
+from torchrg.normals import ESTIMATORS, STEPS
+from torchrg.normals.consensus.constants import REGIONAL_STEPS
 from torchrg.pipeline import segment_planes
 from torchrg.regions.growth import checked_cloud, grow
 from torchrg.scenes import make_room
@@ -337,8 +338,9 @@ def test_the_points_around_a_tile_decide_its_normals(method, scope):
     points, config = noisy_cube(4000), NormalsConfig(method=method, k=12, noise_scope=scope)
     neighbors = search_knn(points, 12)
     whole = ESTIMATORS[method](points, neighbors, config, 4000)
+    steps = STEPS[method] + REGIONAL_STEPS * (scope == "regional")
     for start in range(0, 4000, 250):
-        part = cut_part(neighbors.indices, slice(start, start + 10), steps_of(config))
+        part = cut_part(neighbors.indices, slice(start, start + 10), steps)
         found = ESTIMATORS[method](points[part.rows], part.neighbors, config, 4000)
         for one, other in zip(found[:4], whole[:4], strict=True):
             assert torch.equal(one[part.own], other[start : start + 10])

@@ -63,20 +63,10 @@ STEPS = dict.fromkeys(ESTIMATORS, 1) | {
 }
 """Steps from neighbour to neighbour within which the points lie that decide the fit of a point. It
 is 1 where only the point's own neighbourhood decides. Each step of an estimate of the noise adds
-one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles.
+one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles. With the
+noise of a region there are :data:`torchrg.normals.consensus.constants.REGIONAL_STEPS` more.
 ``consensus`` with ``adaptive_k`` looks at the whole cloud, but only for the number of neighbours:
 see :func:`torchrg.normals.consensus.wanted_neighbors`."""
-
-
-def steps_of(config: NormalsConfig) -> int:
-    """Return the :data:`STEPS` of an estimator with its settings: noise of a region takes more.
-
-    Example:
-        >>> steps_of(NormalsConfig("consensus", noise_scope="regional")) - STEPS["consensus"]
-        4
-    """
-    is_regional = config.method == "consensus" and config.noise_scope == "regional"
-    return STEPS[config.method] + is_regional * constants.REGIONAL_STEPS
 
 
 @sequential_operations()
