@@ -35,8 +35,9 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
     that lean do not count. It starts from the plane, level to within 30 degrees, that most area
     agrees with. The x axis is, of the directions of upright planes modulo a right angle, that of
     most area, fitted in the same way; of the four turns that this leaves, the one that turns least
-    about up is taken. Then the lowest plane that is level is at z = 0, and the middle of what all
-    planes take up is at x = y = 0. Where the origin is far, points should be moved in float64.
+    about up is taken. Then the lowest plane that is level is at z = 0, and the middle of what
+    planes with sides along the axes take up is at x = y = 0. Where the origin is far, points should
+    be moved in float64.
 
     Args:
         seg: A segmentation, or its plane table.
@@ -210,10 +211,13 @@ def _horizontal(direction: Tensor, axis: Tensor) -> Tensor:
 
 def _origin(planes: Planes, rotation: Tensor) -> Tensor:
     """Return what becomes the origin, in turned coordinates: middle in x and y, lowest in z."""
-    sides = planes.extent.cpu().double()[:, :, None] * planes.axes.cpu().double() / 2
-    reach = (sides @ rotation.T).abs().sum(dim=1)
+    axes = planes.axes.cpu().double() @ rotation.T
+    reach = (planes.extent.cpu().double()[:, :, None] * axes).abs().sum(dim=1) / 2
     center = planes.center.cpu().double() @ rotation.T
-    low, high = (center - reach).amin(dim=0), (center + reach).amax(dim=0)
+    # The box of a rectangle that stands across the room is larger than what it holds.
+    straight = (axes.abs().amax(dim=2) > math.cos(math.radians(_NEAR_DEG))).all(dim=1)
+    used = straight if bool(straight.any()) else torch.ones_like(straight)
+    low, high = (center - reach)[used].amin(dim=0), (center + reach)[used].amax(dim=0)
     upright = (planes.normal.cpu().double() @ rotation[2]).abs().clamp(max=1)
     area = planes.area.cpu().double()
     level = (upright.acos() < math.radians(_NEAR_DEG)) & (area > _LEAST_SHARE * area.sum())
