@@ -8,7 +8,6 @@ the cloud; in a folder it is a tile.
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import tiles
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import sequential_operations
-from torchrg.config import PipelineConfig, SuperpointsConfig, load_config
+from torchrg.config import (
+    GrowingConfig,
+    NormalsConfig,
+    PipelineConfig,
+    SuperpointsConfig,
+    load_config,
+)
 from torchrg.errors import ShapeError
 from torchrg.neighbors import (
     canonical_order,
@@ -29,12 +33,13 @@ from torchrg.neighbors import (
     sample_voxels,
     search_knn,
 )
-from torchrg.neighbors.tiles import Part, cut_part
+from torchrg.neighbors.tiles import Part
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.normals.consensus.constants import REGIONAL_STEPS
 from torchrg.regions import partition_points, summarize_planes
 from torchrg.regions.edges import EDGE_STEPS, GrowingCloud
 from torchrg.regions.growth import (
+    GrowthEdges,
     GrowthOrder,
     by_column,
     checked_cloud,
@@ -43,7 +48,6 @@ from torchrg.regions.growth import (
     growth_order,
     label_regions,
 )
-from torchrg.store import FolderStore
 from torchrg.structures import (
     UNLABELED,
     Cloud,
@@ -52,6 +56,7 @@ from torchrg.structures import (
     Segmentation,
     Superpoints,
 )
+from torchrg.tiles import FIT, TileStore, Work
 
 BYTES_PER_POINT = 1_100
 """Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
@@ -110,8 +115,47 @@ class MemoryStore:
         for name in names:
             del self._values[name]
 
+    # The cloud is one block, as it is one of many tiles of a folder.
+    in_one_block = True
 
-Store = MemoryStore | FolderStore
+    def run_blocks(self, name: str, work: Work, config: PipelineConfig) -> None:
+        """Run a step on the cloud."""
+        work(self, slice(0, self.known("order")["num_points"]), 0, config)
+
+    def choose_blocks(self, points: Tensor, k: int, config: PipelineConfig) -> list[int]:
+        """Return where blocks end: the only one at the end of the cloud."""
+        return [0, len(points)]
+
+    def search_neighbors(self, block: slice, k: int) -> None:
+        """Search the nearest neighbours of all points."""
+        points = self.get("cloud")
+        found = torch.empty(0, 1, dtype=torch.int32, device=points.device)
+        if len(points):
+            found = search_knn(points, k, canonical=True).indices
+        self.save("neighbors", found)
+
+    def widen_neighbors(self, config: PipelineConfig) -> None:
+        """Do nothing: the estimator sees the whole cloud, and measures its noise itself."""
+
+    def neighbors_for_normals(self, config: NormalsConfig) -> tuple[str, NormalsConfig]:
+        """Return the array of the neighbours that normals are estimated from, and settings."""
+        return "neighbors", config
+
+    def around(self, block: slice, steps: int, lists: str = "neighbors") -> Part:
+        """Return the cloud, around which there is nothing."""
+        return Part(block, block, Neighbors(self.get(lists)))
+
+    def keep_edges(self, found: GrowthEdges, part: Part, block: slice, number: int) -> None:
+        """Keep the edges of all points."""
+        self.save("edges", found)
+
+    def grow(self, order: GrowthOrder, config: GrowingConfig) -> NDArray[np.int32]:
+        """Grow along the edges of all points."""
+        lists = self.get("neighbors").cpu().numpy()
+        return grow_along(self.get("edges"), order, lists, config)
+
+
+Store = MemoryStore | TileStore
 """Where the arrays of a run are."""
 
 
@@ -127,7 +171,7 @@ def segment_planes(
     """Segment a cloud into planes: neighbours, normals, regions, plane table.
 
     A cloud that does not fit into memory is segmented tile by tile, with its arrays in files of a
-    :class:`torchrg.store.FolderStore`. Neighbours and edges, by far the most, stay on disk; the
+    :class:`torchrg.tiles.TileStore`. Neighbours and edges, by far the most, stay on disk; the
     rest takes about 100 bytes of memory a point, and each tile 2 kB a point of its own. Called
     again with the same folder it goes on from the last tile that was done, however the last call
     ended, be it with the power: what the disk has lost is made again.
@@ -170,10 +214,10 @@ def segment_planes(
         >>> segment_planes(grid, load_config("classic"), voxel=2.0).planes.count.tolist()
         [400]
         >>> import tempfile
-        >>> from torchrg.store import FolderStore
+        >>> from torchrg.tiles import TileStore
         >>> chunks = (Cloud(some.numpy()) for some in grid.split(150))
         >>> with tempfile.TemporaryDirectory() as work:
-        ...     store = FolderStore(work, tile_size=100)
+        ...     store = TileStore(work, tile_size=100)
         ...     segment_planes(chunks, load_config("classic"), store=store).planes.count.tolist()
         [400]
     """
@@ -186,28 +230,18 @@ def segment_planes(
     begin = on_stage or (lambda stage: None)
     store.begin(config={**dataclasses.asdict(config), "chunk_size": None}, voxel=voxel)
 
-    def in_blocks(step: str, work: Callable[..., None]) -> None:
-        if isinstance(store, FolderStore):
-            tiles.run_tiles(store, step, work, config)
-        else:
-            work(store, slice(*store.known("order")["bounds"]), 0, config)
-
     begin("neighbors")
     store.once("points", lambda: store.save_points(points))
     store.once("order", lambda: sort_points(store, config, voxel))
-    in_blocks("neighbors", search_neighbors)
+    store.run_blocks("neighbors", search_neighbors, config)
 
     begin("normals")
-    if isinstance(store, FolderStore) and tiles.adapts(config.normals):
-        # A tile does not tell the noise of the cloud, which in memory the estimator finds itself.
-        in_blocks("noise", tiles.measure_noise)
-        store.once("width", partial(tiles.choose_width, store, config))
-        in_blocks("wider_neighbors", tiles.search_wider)
-    in_blocks("normals", estimate_normals)
+    store.widen_neighbors(config)
+    store.run_blocks("normals", estimate_normals, config)
 
     begin("regions")
     store.once("curvature", lambda: sort_by_curvature(store, config))
-    in_blocks("edges", find_edges)
+    store.run_blocks("edges", find_edges, config)
     store.once("growth", lambda: grow_regions(store, config))
     store.once("regions", lambda: finish_regions(store, config))
 
@@ -305,9 +339,7 @@ def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> No
         places = torch.cat([order.argsort(), order.new_tensor([UNLABELED])])
         store.save("inverse", places[voxels.inverse])
     num_points, k = len(rows), max(min(config.normals.k, len(rows)), 1)
-    bounds = [0, num_points]
-    if isinstance(store, FolderStore):
-        bounds = tiles.choose_tiles(store, points[rows].numpy(), k, config)
+    bounds = store.choose_blocks(points[rows], k, config)
     store.save("rows", rows)
     store.save("cloud", points[rows])
     store.note("order", num_points=num_points, k=k, bounds=bounds)
@@ -315,34 +347,18 @@ def sort_points(store: Store, config: PipelineConfig, voxel: float | None) -> No
 
 def search_neighbors(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
     """Search the nearest neighbours of the points of a block."""
-    if isinstance(store, FolderStore):
-        tiles.search_neighbors(store, block, "neighbors", store.known("order")["k"])
-        return
-    points = store.get("cloud")
-    found = torch.empty(0, 1, dtype=torch.int32, device=points.device)
-    if len(points):
-        found = search_knn(points, store.known("order")["k"], canonical=True).indices
-    store.write("neighbors", block.start, found)
-
-
-def _around(store: Store, block: slice, steps: int, lists: str = "neighbors") -> Part:
-    """Return a block with all points that so many steps from neighbour to neighbour lead to."""
-    if isinstance(store, FolderStore):
-        return cut_part(store.lazy(lists), block, steps)
-    return Part(block, block, Neighbors(store.get(lists)))
+    store.search_neighbors(block, store.known("order")["k"])
 
 
 def estimate_normals(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
     """Estimate normals and curvature of the points of a block."""
-    lists, settings = "neighbors", config.normals
-    if isinstance(store, FolderStore):
-        lists, settings = tiles.wider_neighbors(store, settings)
+    lists, settings = store.neighbors_for_normals(config.normals)
     steps = STEPS[settings.method] + REGIONAL_STEPS * (settings.noise_scope == "regional")
-    part = _around(store, block, steps, lists)
+    part = store.around(block, steps, lists)
     points = store.lazy("cloud")[part.rows]
     fit = ESTIMATORS[settings.method](points, part.neighbors, settings, config.chunk_size)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    for name, values in zip(tiles.FIT, (*fit[:4], sharp), strict=True):
+    for name, values in zip(FIT, (*fit[:4], sharp), strict=True):
         store.write(name, block.start, values[part.own])
 
 
@@ -368,7 +384,7 @@ def _order(store: Store) -> GrowthOrder:
 
 def find_edges(store: Store, block: slice, number: int, config: PipelineConfig) -> None:
     """Find the edges that regions grow along from the points of a block."""
-    part = _around(store, block, EDGE_STEPS)
+    part = store.around(block, EDGE_STEPS)
     points, normals, curvature, valid, residual_rms = (
         store.lazy(name)[part.rows]
         for name in ("cloud", "normals", "curvature", "valid", "residual_rms")
@@ -383,22 +399,15 @@ def find_edges(store: Store, block: slice, number: int, config: PipelineConfig) 
         config.growing,
         _order(store),
         chunk_size=config.chunk_size,
-        whole=isinstance(store, MemoryStore),
+        whole=store.in_one_block,
     )
-    if isinstance(store, FolderStore):
-        tiles.keep_edges(store, found, part, block, number)
-    else:
-        store.save("edges", found)
+    store.keep_edges(found, part, block, number)
 
 
 def grow_regions(store: Store, config: PipelineConfig) -> None:
     """Grow the regions of the whole cloud along the edges of its points."""
     order = _order(store)
-    if isinstance(store, FolderStore):
-        roots = tiles.grow_on_disk(store, order, config)
-    else:
-        lists = store.get("neighbors").cpu().numpy()
-        roots = grow_along(store.get("edges"), order, lists, config.growing)
+    roots = store.grow(order, config.growing)
     store.save("roots", torch.from_numpy(roots).to(store.lazy("curvature").device))
     store.remove("edges")
     store.note("growth")

@@ -12,14 +12,13 @@ import numpy as np
 
 from torchrg.config import load_config
 from torchrg.pipeline import segment_planes
-from torchrg.store import FolderStore
 from torchrg.structures import Cloud
-from torchrg.tiles import TileTask
+from torchrg.tiles import TileStore, TileTask
 
 
 def main(path, folder, writes):
     """Segment, and note each tile that is done in a log beside the folder."""
-    write, run, left = FolderStore.write, TileTask.run, [writes]
+    write, run, left = TileStore.write, TileTask.run, [writes]
 
     def counted_write(files, *given):
         left[0] -= 1
@@ -33,10 +32,10 @@ def main(path, folder, writes):
             log.write(f"{task.name}\n")
         return written
 
-    FolderStore.write, TileTask.run = counted_write, noted_run
+    TileStore.write, TileTask.run = counted_write, noted_run
     points = np.load(path)
     seg = segment_planes(
-        [Cloud(points)], load_config("classic"), store=FolderStore(folder, tile_size=600)
+        [Cloud(points)], load_config("classic"), store=TileStore(folder, tile_size=600)
     )
     np.savez(f"{folder}.npz", labels=seg.labels, normals=seg.normals, area=seg.planes.area)
 

@@ -33,14 +33,14 @@ if what == "scan":
     segment_planes(points, config)
     print(peak_memory())
     sys.exit()
-from torchrg.store import FolderStore
+from torchrg.tiles import TileStore
 peaks, stages = {}, ["points"]
 def note(stage, done, of):
     peaks[stages[-1]] = max(peaks.get(stages[-1], 0), peak_memory())
     stages.append(stage)
     reset_peak_memory()
 reset_peak_memory()
-store = FolderStore(folder, tile_size=num_points // 2, on_progress=note)
+store = TileStore(folder, tile_size=num_points // 2, on_progress=note)
 segment_planes([Cloud(points.numpy())], config, store=store)
 note("done", 1, 1)
 in_tiles = ("neighbors", "normals", "edges")

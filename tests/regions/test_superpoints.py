@@ -8,34 +8,24 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from tests.made.cameras import KINECT_LAYOUT
 from torchrg import make_superpoints, read_cloud, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import score_partition
 from torchrg.regions import partition_points, superpoints
-from torchrg.scenes import RoomLayout, make_room
+from torchrg.scenes import make_room
 
 CONFIG = SuperpointsConfig(strengths=(0.3, 1.0, 4.0), min_size=4)
 
 PLACE_SPACINGS = 5
 """So few that places count in a cloud of 100 points."""
 
-OFFICE = RoomLayout(
-    size=(5.4, 4.4, 2.6),
-    num_doors=1,
-    num_windows=1,
-    num_cabinets=1,
-    num_tables=2,
-    num_boxes=1,
-    num_pillars=0,
-    num_small_boxes=2,
-)
-
 
 @pytest.fixture(scope="module")
 def room():
     """Points, true normals, and true faces with every fifth point, and small faces, left out."""
-    scene = make_room(6000, noise=0.003, seed=2, layout=OFFICE)
+    scene = make_room(6000, noise=0.003, seed=2, layout=KINECT_LAYOUT)
     small = torch.bincount(scene.labels)[scene.labels] < 50
     planes = torch.where(small | (torch.arange(6000) % 5 == 0), -1, scene.labels)
     return scene.points, scene.normals, planes
@@ -365,7 +355,7 @@ def test_arguments_are_checked(room):
 
 
 def test_a_made_room_is_parted_at_its_objects():
-    scene = make_room(20_000, noise=0.003, seed=5, layout=OFFICE)
+    scene = make_room(20_000, noise=0.003, seed=5, layout=KINECT_LAYOUT)
     found = make_superpoints(scene.points, config=SuperpointsConfig(strengths=(0.1,)))
     score = score_partition(found.labels, scene.objects[scene.labels], scene.points)
     assert score.count < 400

@@ -23,9 +23,8 @@ from torchrg.normals.consensus.constants import REGIONAL_STEPS
 from torchrg.pipeline import segment_planes
 from torchrg.regions.growth import checked_cloud, grow
 from torchrg.scenes import make_room
-from torchrg.store import FolderStore
 from torchrg.structures import Cloud
-from torchrg.tiles import TileTask
+from torchrg.tiles import TileStore, TileTask
 
 STAGES = (
     *("points", "order", "neighbors", "normals", "curvature", "edges"),
@@ -84,7 +83,7 @@ def assert_same(found, expected):
 def segment(points, folder, config, size, *, on_stage=None, identity=None, **options):
     """Segment points that come in three chunks, in tiles."""
     chunks = (Cloud(part) for part in np.array_split(points, 3))
-    store = FolderStore(folder, identity, tile_size=size, on_progress=on_stage)
+    store = TileStore(folder, identity, tile_size=size, on_progress=on_stage)
     return segment_planes(chunks, config, store=store, **options)
 
 
@@ -135,9 +134,9 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
         step = getattr(pipeline, name)
         counted = lambda *given, step=step: (step(*given), done.append(step.__name__))  # noqa: E731
         monkeypatch.setattr(f"torchrg.pipeline.{name}", counted)
-    save = FolderStore.save_points
+    save = TileStore.save_points
     monkeypatch.setattr(
-        FolderStore, "save_points", lambda *given: (save(*given), done.append("points"))
+        TileStore, "save_points", lambda *given: (save(*given), done.append("points"))
     )
     ends = ((stage, count) for stage in STAGES for count in (0, 1))
     # Every second stage begins, and ends the run with its first tile or with none.
@@ -153,8 +152,8 @@ def test_a_run_that_ended_early_goes_on_where_it_was(tmp_path, monkeypatch):
             continue
     assert_same(segment(points, tmp_path, config, 500), whole)
     assert len(done) == len(set(done)) > 12
-    assert_same(segment_planes([], config, store=FolderStore(tmp_path)), whole)
-    FolderStore(tmp_path).remove_all()
+    assert_same(segment_planes([], config, store=TileStore(tmp_path)), whole)
+    TileStore(tmp_path).remove_all()
     assert not tmp_path.exists()
 
 
@@ -189,7 +188,7 @@ def test_what_the_disk_has_lost_is_made_again(damage, tmp_path):
     whole = segment_planes(Cloud(points).points, config)
     for name in ("points", "rows", "boxes_low", "neighbors", "normals", "edges_1"):
         begun(points, tmp_path / name, config, "growth")
-        damage(FolderStore(tmp_path / name).path(name))
+        damage(TileStore(tmp_path / name).path(name))
         assert_same(segment(points, tmp_path / name, config, 500), whole)
     segment(points, tmp_path / "all", config, 300)
     for path in (tmp_path / "all").glob("[!t]*"):
@@ -202,9 +201,9 @@ def test_points_that_are_lost_are_not_taken_from_another_cloud(tmp_path):
     segment(wall(400), tmp_path, config, 300)
     zero_rows(tmp_path / "points.npy")
     with pytest.raises(FormatError, match=r"points\.npy: is damaged, and the points .* are others"):
-        segment_planes([], config, store=FolderStore(tmp_path))
+        segment_planes([], config, store=TileStore(tmp_path))
     segment(wall(400), tmp_path, config, 300)
-    segment_planes([], config, store=FolderStore(tmp_path))
+    segment_planes([], config, store=TileStore(tmp_path))
 
 
 def test_a_record_that_is_damaged_is_one_line_or_made_again(tmp_path):
@@ -243,7 +242,7 @@ def test_an_array_that_is_lost_during_the_work_is_one_line(tmp_path):
         message = rf"{name}\.npy: is damaged: .*; run the same again, or remove .*{stage} and begin"
         with pytest.raises(FormatError, match=message):
             segment(points, tmp_path / stage, config, 300, on_stage=lose)
-        FolderStore(tmp_path / stage).remove_all()
+        TileStore(tmp_path / stage).remove_all()
 
 
 def test_what_others_have_put_among_the_arrays_stays(tmp_path):
@@ -257,7 +256,7 @@ def test_what_others_have_put_among_the_arrays_stays(tmp_path):
     segment(points, tmp_path, config, 300)
     (tmp_path / "normals.npy").unlink()
     (tmp_path / "normals.npy").symlink_to(tmp_path / "theirs.npy")
-    FolderStore(tmp_path).remove_all()
+    TileStore(tmp_path).remove_all()
     assert {path.name for path in tmp_path.iterdir()} == {"theirs.npy", "normals.npy"}
     assert (tmp_path / "theirs.npy").read_text() == "theirs"
 
@@ -289,7 +288,7 @@ def test_work_of_other_settings_or_files_is_refused(tmp_path):
 
 
 def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path, monkeypatch):
-    files = FolderStore(tmp_path / "a")
+    files = TileStore(tmp_path / "a")
     files.begin()
     files.reserve("a.npy")
     with (
@@ -312,7 +311,7 @@ def test_noise_of_the_whole_cloud_decides_the_number_of_neighbors(noise, most, e
     config = dataclasses.replace(config, normals=normals)
     whole = segment_planes(Cloud(points).points, config)
     assert_same(segment(points, tmp_path, config, 900), whole)
-    assert FolderStore(tmp_path).known("width")["k"] == expected
+    assert TileStore(tmp_path).known("width")["k"] == expected
 
 
 def test_a_tile_has_points(tmp_path):
@@ -361,6 +360,6 @@ def test_the_points_around_a_tile_decide_its_edges(preset, tmp_path):
     cloud = checked_cloud(config.growing, points, *fit[:2], neighbors, fit.valid, fit.residual_rms)
     roots = grow(cloud, config.growing, 4000)
     assert len(np.unique(roots)) > 20
-    np.testing.assert_array_equal(FolderStore(tmp_path).get("roots"), roots)
+    np.testing.assert_array_equal(TileStore(tmp_path).get("roots"), roots)
     if cloud.reach is not None:
         assert bool(cloud.reach.isinf().any() and cloud.reach.isfinite().any())

@@ -20,9 +20,9 @@ from torchrg.config import PipelineConfig
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import marked_parts, remove_leftovers
 from torchrg.pipeline import segment_planes
-from torchrg.store import TILE_SIZE, FolderStore, Written, make_folder, run_in_turn
+from torchrg.store import TILE_SIZE, Written, make_folder, run_in_turn
 from torchrg.structures import Cloud, Segmentation
-from torchrg.tiles import BYTES_PER_TILE_POINT, TileTask
+from torchrg.tiles import BYTES_PER_TILE_POINT, TileStore, TileTask
 
 _SMALLEST_TILE = 20_000
 """Least number of points of a tile. With fewer, most of the work is on the points around it."""
@@ -134,7 +134,7 @@ def segmented_in_tiles(
         if start is None and workers > 1:
             start = partial(run_local, workers=workers, lock=lock)
         try:
-            store = FolderStore(
+            store = TileStore(
                 folder,
                 {"inputs": inputs, "versions": describe_versions(), **named},
                 tile_size=tile_size,
@@ -143,7 +143,7 @@ def segmented_in_tiles(
             )
             yield segment_planes(chunks, settings, voxel=voxel, store=store)
         except BaseException:
-            if not FolderStore(folder).is_begun:
+            if not TileStore(folder).is_begun:
                 _remove_work(folder, lock)
             raise
         _remove_work(folder, lock)
@@ -162,7 +162,7 @@ def _check_outside(folder: Path, files: Sequence[Path]) -> None:
 def _remove_work(folder: Path, lock: DirectoryLock) -> None:
     """Remove what the work has made, and its folder unless something else is in it."""
     lock.remove()
-    FolderStore(folder).remove_all()
+    TileStore(folder).remove_all()
 
 
 @dataclass(frozen=True)

@@ -140,11 +140,8 @@ def label_regions(
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
             labels = number_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
-        contacts, tolerance = (
-            NearestPoints(cloud.neighbors).contacts(labels),
-            config.facet_tolerance,
-        )
-        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
+        contacts = NearestPoints(cloud.neighbors).contacts(labels)
+        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=config.facet_tolerance)
         labels = number_by_size(labels, least)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), config.min_size)
