@@ -238,3 +238,14 @@ def test_points_are_counted_without_reading_them(tmp_path, suffix):
     assert estimate_points(path) == pytest.approx(780, rel=0 if suffix != ".xyz" else 0.02)
     path.write_bytes(path.read_bytes()[:20] if suffix != ".xyz" else b"")
     assert estimate_points(path) == 0
+
+
+def test_names_of_columns_are_for_files_that_take_them(tmp_path):
+    scene = tmp_path / "in" / "room"
+    scene.mkdir(parents=True)
+    np.save(scene / "coord.npy", grid())
+    source = FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", columns=("x", "y", "z"))
+    with pytest.raises(ConfigError, match=r"expected text or \.npy for --columns"):
+        source.list_scans()
+    np.savetxt(tmp_path / "in" / "hall.txt", grid())
+    assert [scan.name for scan in source.list_scans()] == ["hall", "room"]

@@ -89,6 +89,9 @@ class FolderSource:
                 f"{self.out}: expected a directory outside {self.root} for the results of "
                 f"{file.name}; choose another."
             )
+        files = (scene.path for scene in scenes if not scene.path.is_dir())
+        if self.columns is not None and not any(map(takes_columns, files)):
+            raise ConfigError("expected text or .npy for --columns, got files that name their own.")
         return [self._scan(scene) for scene in scenes]
 
     def _scan(self, scene: SceneFiles) -> Scan:

@@ -16,11 +16,11 @@ from torchrg.batch.scans import check_finite
 from torchrg.cli import console
 from torchrg.cli.loop import run_each
 from torchrg.errors import ConfigError
-from torchrg.io import atomic_path, check_output, read_cloud, write_cloud
+from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
 from torchrg.pipeline import segment_planes
-from torchrg.regions.axes import align_axes, move_planes
-from torchrg.structures import Cloud, Segmentation
+from torchrg.regions.axes import align_axes, move_cloud, move_planes
+from torchrg.structures import Segmentation
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     begin = time.perf_counter()
     names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
     cloud = read_cloud(source, columns=names.of(source))
-    console.note_input(f"{source}", cloud, target, _results(arguments))
+    console.note_input(f"{source}", cloud, target, RESULT_FIELDS if arguments.segment else ())
     for note in check_finite(cloud):
         console.warn(f"{source}: {note}.")
     check_output(target, dataclasses.replace(cloud, header={}))
@@ -106,35 +106,6 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
         f"{seconds:.1f} s -> {target}"
     )
-
-
-def _results(arguments: Arguments) -> tuple[str, ...]:
-    """Return the names of what is written of each point beside the fields of the cloud."""
-    return ("labels", "normals", "curvature") if arguments.segment else ()
-
-
-def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
-    """Return a cloud after a rigid motion ``(4, 4)`` of its coordinates and normals.
-
-    What its file says about places, as a viewpoint or a coordinate system, is left out. Points that
-    are not finite stay as they are.
-
-    Example:
-        >>> cloud = Cloud(np.array([[1.0, 2, 3]]), {"normals": np.array([[1.0, 0, 0]])})
-        >>> quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        >>> moved = move_cloud(cloud, quarter.double())
-        >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
-        ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
-    """
-    rotation, coordinates, kept = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
-    # Far from the origin most digits are those of the place, which a turn would spread over all.
-    shift = motion[:3, 3].numpy() + rotation @ cloud.origin
-    coordinates[kept] = (cloud.coordinates[kept] - cloud.origin) @ rotation.T + shift
-    fields = dict(cloud.fields)
-    for name in ("normals", "normals_input"):
-        if name in fields:
-            fields[name] = (fields[name] @ rotation.T).astype(fields[name].dtype)
-    return dataclasses.replace(cloud, coordinates=coordinates, fields=fields, header={})
 
 
 def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Segmentation:

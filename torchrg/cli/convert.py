@@ -1,7 +1,6 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,6 @@ from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
 from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.config import DEFAULT_PRESET, DepthConfig
-from torchrg.datasets.folder import files_below
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
 from torchrg.io.files import check_place, make_folder
@@ -102,7 +100,7 @@ class FolderArguments(CloudArguments):
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        names = console.ColumnNames.parse(self.columns, _places_below(root)).names
+        names = console.ColumnNames.parse(self.columns, None).names
         return FolderSource(
             root,
             self.settings.resolved,
@@ -111,13 +109,6 @@ class FolderArguments(CloudArguments):
             columns=names,
             suffixes=self.suffixes,
         )
-
-
-def _places_below(root: Path) -> list[Path] | None:
-    """Return the files below a folder without a word on links, None where there is no folder."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return files_below(root) if root.is_dir() else None
 
 
 @dataclass(frozen=True)

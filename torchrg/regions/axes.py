@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from torchrg.errors import ConfigError
 from torchrg.linalg.eigen import eigh3_of_few
 from torchrg.regions.fit import with_table_sign
-from torchrg.structures import Planes, Segmentation
+from torchrg.structures import Cloud, Planes, Segmentation
 
 _MOST_TILT_DEG = 30.0
 """A room is tilted by less, so that no wall is taken for its floor."""
@@ -133,6 +134,31 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
         axes=turned(planes.axes).to(dtype),
         outline=outline,
     )
+
+
+def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
+    """Return a cloud after a rigid motion ``(4, 4)`` of its coordinates and normals.
+
+    What its file says about places, as a viewpoint or a coordinate system, is left out. Points that
+    are not finite stay as they are.
+
+    Example:
+        >>> import numpy as np
+        >>> cloud = Cloud(np.array([[1.0, 2, 3]]), {"normals": np.array([[1.0, 0, 0]])})
+        >>> quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        >>> moved = move_cloud(cloud, quarter.double())
+        >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
+        ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
+    """
+    rotation, coordinates, kept = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
+    # Far from the origin most digits are those of the place, which a turn would spread over all.
+    shift = motion[:3, 3].numpy() + rotation @ cloud.origin
+    coordinates[kept] = (cloud.coordinates[kept] - cloud.origin) @ rotation.T + shift
+    fields = dict(cloud.fields)
+    for name in ("normals", "normals_input"):
+        if name in fields:
+            fields[name] = (fields[name] @ rotation.T).astype(fields[name].dtype)
+    return replace(cloud, coordinates=coordinates, fields=fields, header={})
 
 
 def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:
