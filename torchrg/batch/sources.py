@@ -4,9 +4,11 @@ A new kind is a :class:`~torchrg.batch.scans.Source` here, its arguments in ``to
 and a test.
 """
 
+import dataclasses
+import json
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,32 +20,104 @@ from torch import Tensor
 from torchrg._optional import require
 from torchrg.batch.scans import Scan, check_finite, write_results
 from torchrg.batch.task import Converted
-from torchrg.config import PipelineConfig
+from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets import (
     S3DIS,
     FolderOfClouds,
+    ScanNet,
     SceneFiles,
     read_pointcept_scene,
     read_room,
+    read_scannet_scan,
     write_pointcept_scene,
 )
+from torchrg.datasets.layouts import layout_scan, write_layout
+from torchrg.datasets.pointcept import GIVEN_ARRAYS
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_depth
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import make_intrinsics, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
+from torchrg.io.npy import map_folder
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.structures import Cloud, Segmentation
 
-_COPIED = ("coord", "color", "strength", "segment", "instance")
+_COPIED = tuple(name for name in GIVEN_ARRAYS if name != "normal")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
 """Width and height in the header of a PNG, and the byte at which they begin."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CloudSource:
+    """What sources of clouds share: what is written of each, and in which layout.
+
+    Args:
+        superpoint: Whether superpoints are written too; every layout but ``"pointcept"`` has them.
+        layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
+        partition: How superpoints are made.
+        level: Which of their levels is written.
+    """
+
+    superpoint: bool = False
+    layout: str = "pointcept"
+    partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
+    level: int = 0
+
+    def described(self, **options: Any) -> dict[str, Any]:  # noqa: ANN401
+        """Return these settings, as far as they are not the usual ones, after others."""
+        described = {**options, "superpoint": self.superpoint}
+        if self.layout != "pointcept":
+            described["layout"] = self.layout
+        if (self.partition, self.level) != (SuperpointsConfig(), 0):
+            described |= {"partition": dataclasses.asdict(self.partition), "level": self.level}
+        return json.loads(json.dumps(described))  # type: ignore[no-any-return]
+
+    def part(
+        self,
+        cloud: Cloud,
+        seg: Segmentation,
+        colors: Tensor | NDArray[np.generic] | None,
+        begin: Callable[[str], None],
+    ) -> NDArray[np.int32] | None:
+        """Return the superpoint of each point of a cloud, None where they are not wanted."""
+        if not self.superpoint and self.layout == "pointcept":
+            return None
+        begin("superpoints")
+        found = make_superpoints(cloud.points, seg, self.partition, colors=colors)
+        return [*found.by_level().values()][self.level]
+
+    def write(
+        self,
+        scan: Scan,
+        folder: Path,
+        cloud: Cloud,
+        given: Mapping[str, Any],
+        seg: Segmentation,
+        parts: NDArray[np.int32] | None,
+    ) -> list[str]:
+        """Write what is ``given`` of each point, and what was found, in the layout."""
+        if self.layout == "pointcept" or parts is None:
+            origin = cloud.origin.tolist()
+            return write_pointcept_scene(folder, given, seg, superpoint=parts, origin=origin)
+        arrays = {name: np.asarray(values) for name, values in given.items()}
+        labels, normals = seg.labels.numpy(), seg.normals.numpy()
+        place = scan.name if scan.item is None else str(scan.item)
+        parted = layout_scan(cloud, scan.name, place, parts, labels, normals, arrays)
+        out = folder.parents[scan.name.count("/")]
+        return write_layout(self.layout, folder, out, parted, seg.planes, cloud.origin)
+
+    def notes(self, cloud: Cloud) -> tuple[str, ...]:
+        """Return what a user should know about a cloud in the layout."""
+        if self.layout == "pointcept" or not cloud.origin.any():
+            return ()
+        place = " ".join(f"{value:.12g}" for value in cloud.origin)
+        return (f"coordinates are written about {place}, as they are far from the origin",)
+
+
 @dataclass(frozen=True)
-class FolderSource:
+class FolderSource(CloudSource):
     """Every readable cloud below a folder; folders in Pointcept's layout are clouds too.
 
     Files: ``coord``, ``normal``, ``curvature`` and ``plane`` as ``.npy``, ``color`` too where the
@@ -56,7 +130,6 @@ class FolderSource:
         settings: How to segment.
         out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
             no other folder below it can be.
-        superpoint: Whether superpoints are written as ``superpoint.npy`` too.
         columns: Names for the columns of text and of bare ``.npy`` arrays; see
             :func:`torchrg.read_cloud`.
         suffixes: Which files are clouds. Default: all that can be read.
@@ -65,7 +138,6 @@ class FolderSource:
     root: Path
     settings: PipelineConfig
     out: Path
-    superpoint: bool = False
     columns: tuple[str, ...] | None = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
     bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4 + 4
@@ -77,19 +149,18 @@ class FolderSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        described = {"kind": "folder", "superpoint": self.superpoint}
+        described = self.described(kind="folder")
         return described if self.columns is None else described | {"columns": list(self.columns)}
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
         scenes = FolderOfClouds(self.root, suffixes=self.suffixes).scenes
-        file = next((scene.path for scene in scenes if not scene.path.is_dir()), None)
-        if file is not None and self.in_place:
+        files = [scene.path for scene in scenes if not scene.path.is_dir()]
+        if self.in_place and (files or self.layout != "pointcept"):
+            what = f"the results of {files[0].name}" if files else f"layout {self.layout}"
             raise ConfigError(
-                f"{self.out}: expected a directory outside {self.root} for the results of "
-                f"{file.name}; choose another."
+                f"{self.out}: expected a directory outside {self.root} for {what}; choose another."
             )
-        files = (scene.path for scene in scenes if not scene.path.is_dir())
         if self.columns is not None and not any(map(takes_columns, files)):
             raise ConfigError("expected text or .npy for --columns, got files that name their own.")
         return [self._scan(scene) for scene in scenes]
@@ -111,42 +182,32 @@ class FolderSource:
         is_file = first.parent.relative_to(self.root).as_posix() != scan.name
         if is_file:
             cloud = read_cloud(first, columns=self.columns if takes_columns(first) else None)
+            given = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
         else:
-            sample = read_pointcept_scene(first.parent)
+            sample, given = read_pointcept_scene(first.parent), map_folder(first.parent, _COPIED)
             # Pointcept's colours are 0 to 255 in any type.
             colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
             cloud = Cloud(sample["coord"].numpy(), colors, source=str(first.parent))
-        warnings = (*cloud.notes, *check_finite(cloud))
+        warnings = (*cloud.notes, *check_finite(cloud), *self.notes(cloud))
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         color = cloud.fields.get("color")
-        parts = _superpoints(cloud, seg, color, begin) if self.superpoint else None
+        parts = self.part(cloud, seg, color, begin)
         begin("write")
-        origin = cloud.origin.tolist()
         if is_file:
-            if others := [name for name in cloud.fields if name != "color"]:
-                warnings += (f"left out: {', '.join(others)}",)
+            others = [name for name in cloud.fields if name != "color"]
+            warnings += (f"left out: {', '.join(others)}",) if others else ()
+        if is_file and self.layout == "pointcept":
             found = {"color": color, "superpoint": parts}
             fields = {name: values for name, values in found.items() if values is not None}
+            origin = cloud.origin.tolist()
             files = write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
         else:
-            kept = {name: sample[name] for name in _COPIED if name in sample}
-            files = write_pointcept_scene(folder, kept, seg, superpoint=parts, origin=origin)
+            files = self.write(scan, folder, cloud, given, seg, parts)
         return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
 
 
-def _superpoints(
-    cloud: Cloud,
-    seg: Segmentation,
-    colors: Tensor | NDArray[np.generic] | None,
-    begin: Callable[[str], None],
-) -> NDArray[np.int32]:
-    """Return the superpoint of each point of a cloud, in the type of Pointcept's files."""
-    begin("superpoints")
-    return make_superpoints(cloud.points, seg, colors=colors).by_level()["superpoints"]
-
-
 @dataclass(frozen=True)
-class S3DISSource:
+class S3DISSource(CloudSource):
     """The rooms of S3DIS, ``ROOT/Area_i/<room>/Annotations/*.txt``.
 
     Writes ``OUT/Area_i/<room>`` as :func:`torchrg.datasets.write_pointcept_scene` does.
@@ -156,20 +217,18 @@ class S3DISSource:
         settings: How to segment.
         areas: Numbers of the areas.
         class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
-        superpoint: Whether superpoints are written as ``superpoint.npy`` too.
     """
 
     root: Path
     settings: PipelineConfig
     areas: tuple[int, ...]
     class_order: str = "pointcept"
-    superpoint: bool = False
     in_place: ClassVar[bool] = False
     bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
-        return {"kind": "s3dis", "class_order": self.class_order, "superpoint": self.superpoint}
+        return self.described(kind="s3dis", class_order=self.class_order)
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -184,19 +243,62 @@ class S3DISSource:
         cloud = Cloud(room.coord, source=scan.name)
         notes = [
             *check_finite(cloud),
+            *self.notes(cloud),
             *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
             *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
         ]
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
-        parts = _superpoints(cloud, seg, room.color, begin) if self.superpoint else None
+        parts = self.part(cloud, seg, room.color, begin)
         begin("write")
-        arrays, origin = room._asdict(), cloud.origin.tolist()
-        files = write_pointcept_scene(folder, arrays, seg, superpoint=parts, origin=origin)
+        arrays = {name: getattr(room, name) for name in ("coord", "color", "segment", "instance")}
+        files = self.write(scan, folder, cloud, arrays, seg, parts)
         repairs = tuple(
             f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
             for r in room.report.repairs
         )
         return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, tuple(notes))
+
+
+@dataclass(frozen=True)
+class ScanNetSource(CloudSource):
+    """The scans of ScanNet or ScanNet++; see :class:`torchrg.datasets.ScanNet`.
+
+    Writes ``OUT/<split>/<scan>`` as :func:`torchrg.datasets.write_pointcept_scene` does.
+
+    Args:
+        root: The folder that holds ``scans`` or ``data``.
+        settings: How to segment.
+    """
+
+    root: Path
+    settings: PipelineConfig
+    in_place: ClassVar[bool] = False
+    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 3 * 8 + 4 + 4 + 4
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and what else decides results."""
+        return self.described(kind="scannet")
+
+    def list_scans(self) -> list[Scan]:
+        """Return the scans in natural order."""
+        return [
+            Scan(name, files, estimate_points(mesh), mesh.parent.relative_to(self.root).as_posix())
+            for name, mesh, files in ScanNet(self.root).scenes
+        ]
+
+    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
+        """Read, segment and write one scan."""
+        begin("read")
+        given = read_scannet_scan(scan.inputs[0], self.root)
+        cloud = Cloud(given["coord"], source=str(scan.inputs[0]))
+        notes = (*check_finite(cloud), *self.notes(cloud))
+        if "instance" not in given and not scan.name.startswith("test/"):
+            notes += ("no labels: annotations or the table of their words are missing",)
+        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
+        parts = self.part(cloud, seg, given.get("color"), begin)
+        begin("write")
+        files = self.write(scan, folder, cloud, given, seg, parts)
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=notes)
 
 
 def find_areas(root: Path) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 import tyro
@@ -21,7 +21,7 @@ from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
 from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
 from torchrg.cli.ending import fail as fail
 from torchrg.cli.ending import warn as warn
-from torchrg.config import DEFAULT_PRESET, PipelineConfig, load_config
+from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
@@ -135,6 +135,10 @@ ColumnsFlag = Annotated[
 """Type of the argument --columns."""
 
 
+Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "npy"]
+"""Type of the argument --layout."""
+
+
 @dataclass(frozen=True)
 class ColumnNames:
     """What the flag --columns says: names for the columns of files that have none of their own.
@@ -165,6 +169,31 @@ class ColumnNames:
 
 SettingsFlags = Annotated[PlaneSettings, tyro.conf.arg(name="")]
 """Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
+
+
+def spell_counts(argv: Sequence[str], flag: str) -> list[str]:
+    """Return arguments in which numbers after a flag of superpoints have a flag of their own.
+
+    Example:
+        >>> spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"], "--superpoints")
+        ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
+    """
+    spelled: list[str] = []
+    for argument in argv:
+        is_after = spelled[-1:] == [flag]
+        given, _, numbers = argument.rpartition("=") if "=" in argument else ("", "", argument)
+        if re.fullmatch(r"\d+(,\d+)*", numbers) and (is_after or given == flag):
+            spelled += [given] * bool(given) + ["--partition.counts", *numbers.split(",")]
+        else:
+            spelled.append(argument)
+    return spelled
+
+
+def check_level(level: int, config: SuperpointsConfig) -> None:
+    """Refuse a level that superpoints do not have."""
+    if not 0 <= level < config.num_levels:
+        most = config.num_levels - 1
+        raise ConfigError(f"expected --level from 0 to {most}, the levels there are, got {level}.")
 
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
@@ -258,7 +287,8 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     """Return where the result of each input goes.
 
     One input goes to the file ``out``, a cloud or of the given suffix, or under its own name into
-    an existing directory; several need a directory, which is made.
+    an existing directory; several need a directory, which is made. With an empty suffix each result
+    is a directory.
 
     Raises:
         FormatError: If there is no input, two results would share a name, or one cannot be
@@ -267,10 +297,10 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
     if not inputs:
         raise FormatError("expected at least one input file, got none.")
     given = out.suffix.lower()
-    if len(inputs) == 1 and not out.is_dir():
+    if suffix and len(inputs) == 1 and not out.is_dir():
         check_place(out) if given == suffix else check_output(out)
         return [out]
-    if given in (suffix, *FORMATS) and not out.is_dir():
+    if given and given in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
@@ -282,7 +312,7 @@ def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -
                 "one place; give them different directories."
             )
     make_folder(out)
-    for result in results:
+    for result in results if suffix else []:
         check_place(result)
     return results
 

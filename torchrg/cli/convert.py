@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 from tqdm import tqdm
@@ -22,11 +22,17 @@ from torchrg.batch.run import (
     write_report,
 )
 from torchrg.batch.scans import Job, Source
-from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
+from torchrg.batch.sources import (
+    FolderSource,
+    RGBDSource,
+    S3DISSource,
+    ScanNetSource,
+    find_areas,
+)
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
 from torchrg.cli.loop import finish, run_with_bar, tell_failure
-from torchrg.config import DEFAULT_PRESET, DepthConfig
+from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
 from torchrg.io.files import check_place, make_folder
@@ -78,10 +84,25 @@ class CloudArguments(Arguments):
     """Directory for a picture and a page of each scan that is done, and for index.html, in which
     the pictures are links to the pages (pip install 'torchrg[view]'). Default: none are made."""
     superpoint: bool = False
-    """Write superpoints as superpoint.npy too: a partition of all points, for networks on them."""
+    """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
+    in each level: --superpoint 1000,300."""
+    level: int = 0
+    """Which level of the superpoints is written, 0 the finest."""
+    layout: console.Layout = "pointcept"
+    """Files to write. pointcept: a folder for each scan. The others have superpoints and planes
+    where these programs look for them: scannet: segs.json, for Mask3D's own preprocessing, SAI3D
+    and others. mmdet3d: OneFormer3D, UniDet3D, ESAM. spformer. isbnet: and Open3DIS, SphericalMask.
+    mask3d: what it trains on. npy: folders of bare arrays."""
+    partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
     usual_preset: ClassVar[str] = DEFAULT_PRESET
     """Settings to start from where no flag names any."""
+
+    @property
+    def output(self) -> dict[str, Any]:
+        """What is written of each cloud, as sources take it."""
+        names = ("superpoint", "layout", "partition", "level")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -105,9 +126,9 @@ class FolderArguments(CloudArguments):
             root,
             self.settings.resolved,
             out,
-            self.superpoint,
             columns=names,
             suffixes=self.suffixes,
+            **self.output,
         )
 
 
@@ -127,7 +148,24 @@ class S3DISArguments(CloudArguments):
     def source(self, root: Path, out: Path) -> Source:
         """Return the rooms of the areas."""
         areas = self.areas or find_areas(root)
-        return S3DISSource(root, self.settings.resolved, areas, self.class_order, self.superpoint)
+        return S3DISSource(root, self.settings.resolved, areas, self.class_order, **self.output)
+
+
+@dataclass(frozen=True)
+class ScanNetArguments(CloudArguments):
+    """Convert ScanNet or ScanNet++ as released into Pointcept's layout, with normals and planes.
+
+    Points are the vertices of the meshes. Results are in OUT/train, val and test, by the lists of
+    the data set in ROOT, ROOT/splits or ROOT/meta_data. segment200 needs the table
+    scannetv2-labels.combined.tsv there; labels of ScanNet++ need its metadata. Settings are those
+    of the preset scannet unless told otherwise.
+    """
+
+    usual_preset: ClassVar[str] = "scannet"
+
+    def source(self, root: Path, out: Path) -> Source:
+        """Return the scans."""
+        return ScanNetSource(root, self.settings.resolved, **self.output)
 
 
 @dataclass(frozen=True)
@@ -153,6 +191,7 @@ class RGBDArguments(Arguments):
 KINDS: dict[str, type[Arguments]] = {
     "s3dis": S3DISArguments,
     "folder": FolderArguments,
+    "scannet": ScanNetArguments,
     "rgbd": RGBDArguments,
 }
 """Arguments by the name of the kind of data set."""
@@ -161,9 +200,12 @@ OVERVIEW = f"""usage: torchrg convert {{{",".join(KINDS)}}} ROOT OUT ...
 
 Normals, curvature and plane labels of every scan of a data set.
 
-  s3dis   the rooms of S3DIS as released, into Pointcept's layout
-  folder  every cloud below a folder
-  rgbd    depth frames, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any
+  s3dis    the rooms of S3DIS as released, into Pointcept's layout
+  folder   every cloud below a folder
+  scannet  the scans of ScanNet or ScanNet++ as released, into Pointcept's layout
+  rgbd     depth frames, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any
+
+Superpoints where other programs look for them: --layout.
 
 torchrg convert s3dis --help says more."""
 
@@ -173,7 +215,7 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else console.USAGE_ERROR)
-    kind, *rest = argv
+    kind, *rest = console.spell_counts(argv, "--superpoint")
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     start = KINDS[kind](root=tyro.MISSING, out=tyro.MISSING)
@@ -206,6 +248,14 @@ def _check(arguments: Arguments) -> None:
     console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
     if _pages_of(arguments) is not None:
         check_library()
+    if isinstance(arguments, CloudArguments):
+        console.check_level(arguments.level, arguments.partition)
+        has_superpoints = arguments.superpoint or arguments.layout != "pointcept"
+        usual = (SuperpointsConfig(), 0)
+        if not has_superpoints and (arguments.partition, arguments.level) != usual:
+            raise ConfigError("expected --superpoint with --partition or --level; add it.")
+        if arguments.pages is not None and arguments.layout != "pointcept":
+            raise ConfigError("expected --pages with --layout pointcept, which pages are made of.")
 
 
 def _pages_of(arguments: Arguments) -> Path | None:

@@ -1,7 +1,6 @@
 """``torchrg segment``: plane labels of scans."""
 
 import dataclasses
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,8 @@ from tqdm import tqdm
 
 from torchrg.batch.memory import PROCESS_BYTES, available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
-from torchrg.batch.scans import check_finite
+from torchrg.batch.scans import Scan, check_finite, write_results
+from torchrg.batch.sources import CloudSource
 from torchrg.batch.task import Reports, Task
 from torchrg.batch.tiles import (
     choose_tile_size,
@@ -51,7 +51,7 @@ from torchrg.render.gallery import (
 )
 from torchrg.render.page import MAX_POINTS
 from torchrg.result import Result
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import Cloud, Segmentation, Superpoints
 
 STAGES = ("neighbors", "normals", "regions", "planes")
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
@@ -81,6 +81,11 @@ class Arguments:
     """Add superpoints, a partition of all points: the finest as "superpoints", the coarser ones as
     "superpoints_1" and so on. Numbers say how many of each: --superpoints 1000,300. The picture
     shows them instead of the planes. Colours of the cloud play a part."""
+    level: int = 0
+    """Which level of the superpoints --layout takes, 0 the finest."""
+    layout: console.Layout | None = None
+    """Write the files of other programs into the directory OUT instead, as torchrg convert
+    --layout; superpoints are added. Of a tree of scans, convert keeps their labels too."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: int | None = None
     """Threads to use. Default: as torch decides, usually one a core."""
@@ -106,15 +111,20 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _refuse_images(argv)
-    argv = _spell_counts(argv)
+    argv = console.spell_counts(argv, "--superpoints")
     start = Arguments(
         inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
     )
     arguments = console.parse(Arguments, argv, prog="torchrg segment", default=start)
+    if arguments.layout not in (None, "pointcept"):
+        arguments = dataclasses.replace(arguments, superpoints=True)
     if not arguments.superpoints and arguments.partition != SuperpointsConfig():
         raise ConfigError(
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
+    console.check_level(arguments.level, arguments.partition)
+    if arguments.level and arguments.layout is None:
+        raise ConfigError("expected --layout with --level, as other files hold all levels.")
     console.use_threads(arguments.threads)
     console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
     if arguments.voxel is not None and not arguments.voxel > 0:
@@ -122,7 +132,8 @@ def run(argv: list[str]) -> int:
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
     console.ColumnNames.parse(arguments.columns, arguments.inputs)
     firsts = tuple(sources[0] for sources in clouds if sources)
-    outputs = console.output_paths(firsts, arguments.out)
+    suffix = ".npz" if arguments.layout is None else ""
+    outputs = console.output_paths(firsts, arguments.out, suffix=suffix)
     console.check_apart(outputs, arguments.inputs)
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
@@ -147,24 +158,6 @@ def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
 def _page_of(picture: Path) -> Path:
     """Return where the page of a picture is."""
     return picture.with_suffix(".html")
-
-
-def _spell_counts(argv: list[str]) -> list[str]:
-    """Return arguments in which numbers after ``--superpoints`` have a flag of their own.
-
-    Example:
-        >>> _spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
-        ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
-    """
-    spelled: list[str] = []
-    for argument in argv:
-        is_after = spelled[-1:] == ["--superpoints"]
-        flag, _, numbers = argument.rpartition("=") if "=" in argument else ("", "", argument)
-        if re.fullmatch(r"\d+(,\d+)*", numbers) and (is_after or flag == "--superpoints"):
-            spelled += [flag] * bool(flag) + ["--partition.counts", *numbers.split(",")]
-        else:
-            spelled.append(argument)
-    return spelled
 
 
 def _refuse_images(argv: list[str]) -> None:
@@ -224,9 +217,10 @@ def _segment_tiles(
 ) -> None:
     """Segment a cloud in tiles, after a line that says so."""
     begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
-    if arguments.superpoints:
+    if arguments.superpoints or arguments.layout is not None:
+        flag = "--superpoints" if arguments.layout is None else "--layout"
         raise ConfigError(
-            f"{source}: expected no --superpoints for a cloud of about {num_points:,} points, "
+            f"{source}: expected no {flag} for a cloud of about {num_points:,} points, "
             f"which takes more than {limit / 1e9:.2f} GB: whether two regions merge depends on the "
             "merges beside them, and so on through the whole cloud, so that no tile tells it; "
             "raise --limit-memory, or leave it out."
@@ -286,10 +280,12 @@ def _check_points(
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
     parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
     first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
-    console.note_input(source, first, target, (*RESULT_FIELDS, *parts))
+    written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
+    console.note_input(source, first, target, written)
     for note in check_finite(cloud):
         console.warn(f"{source}: {note}.")
-    check_output(target, cloud)
+    if arguments.layout is None:
+        check_output(target, cloud)
     return tuple(first.fields)
 
 
@@ -357,7 +353,10 @@ def _segment_whole(
                 voxel=voxel,
             )
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
-    write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
+    if arguments.layout is None:
+        write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
+    else:
+        _write_layout(arguments, target, cloud, seg, parts)
     if picture is not None:
         _draw(arguments, picture, Result.of(cloud, seg, parts))
     if parts is not None:
@@ -365,6 +364,23 @@ def _segment_whole(
         print(f"{source}: superpoints of each level: {found}")
     without = console.without(target, cloud.fields)
     _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
+
+
+def _write_layout(
+    arguments: Arguments, target: Path, cloud: Cloud, seg: Segmentation, parts: Superpoints | None
+) -> None:
+    """Write a result in a layout, its folder ``target``."""
+    part = None if parts is None else [*parts.by_level().values()][arguments.level]
+    given = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
+    if arguments.layout in (None, "pointcept"):
+        fields = given if part is None else {**given, "superpoint": part}
+        origin = cloud.origin.tolist()
+        write_results(target, cloud.coordinates, seg, fields=fields, origin=origin)
+        return
+    source = CloudSource(layout=arguments.layout)
+    for note in source.notes(cloud):
+        console.warn(f"{cloud.source}: {note}.")
+    source.write(Scan(target.name, (), len(cloud)), target, cloud, given, seg, part)
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:

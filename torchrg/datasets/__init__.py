@@ -1,4 +1,4 @@
-"""Data sets: S3DIS as released, any folder of clouds, Pointcept's layout, and RGB-D frames.
+"""Data sets: S3DIS and ScanNet as released, folders of clouds, Pointcept's layout, RGB-D frames.
 
 Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``, ``data[i]`` is a
 sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...), ``transform=`` is
@@ -45,6 +45,7 @@ from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_sce
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
 from torchrg.datasets.s3dis import S3DIS
+from torchrg.datasets.scannet import ScanNet, read_scannet_scan
 
 __all__ = [
     "CLASS_ORDERS",
@@ -55,11 +56,13 @@ __all__ = [
     "Repair",
     "Room",
     "RoomReport",
+    "ScanNet",
     "SceneFiles",
     "Skipped",
     "collate_offset",
     "read_pointcept_area",
     "read_pointcept_scene",
     "read_room",
+    "read_scannet_scan",
     "write_pointcept_scene",
 ]

@@ -1,15 +1,16 @@
 """Scenes in Pointcept's processed layout: a folder of ``.npy`` files for each scene.
 
 ``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
-``instance`` int16 of shape ``(N, 1)``. Beside them torchrg puts ``plane`` int32 of shape ``(N,)``,
-``curvature`` float32 of shape ``(N, 1)`` as Pointcept has features, ``planes.json``, and
-``superpoint`` where it is asked for. Pointcept reads the files it knows and passes over the others;
-``import torchrg.transforms.pointcept`` makes it know these.
+``instance`` int16 of shape ``(N, 1)``, of ScanNet++ ``(N, 3)``; of ScanNet ``segment20``,
+``segment200`` and ``instance`` int64 of shape ``(N,)``. Beside them torchrg puts ``plane`` int32 of
+shape ``(N,)``, ``curvature`` float32 of shape ``(N, 1)`` as Pointcept has features,
+``planes.json``, and ``superpoint`` int32 where it is asked for. Pointcept reads the files it knows
+and passes over the others; ``import torchrg.transforms.pointcept`` makes it know these.
 """
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,14 @@ from torchrg.result import PLANES_FILE, describe_planes
 from torchrg.structures import Segmentation
 
 POINT_ARRAYS = (
-    "coord", "color", "normal", "strength", "segment", "instance",
+    "coord", "color", "normal", "strength", "segment", "segment20", "segment200", "instance",
     "superpoint", "plane", "curvature",
 )  # fmt: skip
 """Arrays of a scene folder that have a row for each point."""
-_LABELS = ("segment", "instance", "superpoint", "plane")
+GIVEN_ARRAYS = POINT_ARRAYS[:8]
+"""Those that come with the points."""
+_SCANNET = ("segment20", "segment200")
+_LABELS = ("segment", *_SCANNET, "instance", "superpoint", "plane")
 _FEATURES = ("strength", "curvature")
 """Arrays of numbers that have two axes in files, whatever they have elsewhere."""
 
@@ -45,7 +49,8 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
 
     Returns:
         Those of :data:`POINT_ARRAYS` that are there; labels as int64 of shape ``(N,)``. The others
-        are mapped from the files copy-on-write; ``curvature`` has shape ``(N,)``.
+        are mapped from the files copy-on-write; ``curvature`` has shape ``(N,)``. Of points with
+        several labels the first is taken.
 
     Raises:
         FormatError: If there are no coordinates, a file is damaged, or lengths differ.
@@ -58,7 +63,7 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
     if "curvature" in sample:
         sample["curvature"] = sample["curvature"].reshape(-1)
     return {
-        name: values.reshape(-1).long() if name in _LABELS else values
+        name: values.reshape(len(values), -1)[:, 0].long() if name in _LABELS else values
         for name, values in sample.items()
     }
 
@@ -80,8 +85,8 @@ def write_pointcept_scene(
     Args:
         folder: The scene, ``OUT/Area_i/<room>``; it is made.
         sample: ``coord`` ``(N, 3)`` and any of ``color``, ``normal``, ``strength``, ``segment``,
-            ``instance``, as tensors or arrays. Without ``normal`` those of the segmentation are
-            written.
+            ``segment20``, ``segment200``, ``instance``, as tensors or arrays. Without ``normal``
+            those of the segmentation are written.
         segmentation: What :func:`torchrg.segment_planes` said about ``coord``.
         superpoint: Superpoint of each point, shape ``(N,)``, to be written as ``superpoint`` too,
             which ScanNet's data sets have. Default: none are.
@@ -102,8 +107,8 @@ def write_pointcept_scene(
     # What only torchrg makes is never kept: one from elsewhere is in the way.
     kept = {
         name
-        for name in arrays.keys() - {"plane", "curvature", "superpoint"} - owned
-        if (place / f"{name}.npy").exists()
+        for name in arrays.keys() - {"plane", "curvature", "superpoint"}
+        if f"{name}.npy" not in owned and (place / f"{name}.npy").exists()
     }
     _check_kept(place, arrays, kept)
     new = {name: values for name, values in arrays.items() if name not in kept}
@@ -113,34 +118,54 @@ def write_pointcept_scene(
 def write_arrays(
     place: Path, arrays: Mapping[str, NDArray[Any]], planes: Mapping[str, Any]
 ) -> list[str]:
-    """Write arrays by name as ``.npy`` and the table of planes, beside what others have there.
+    """Write arrays by name as ``.npy`` and the table of planes; see :func:`write_files`."""
+    return write_files(place, {f"{name}.npy": values for name, values in arrays.items()}, planes)
 
-    What an earlier call wrote, as ``planes.json`` says, is replaced or removed; nothing else is.
-    All files are complete before the first appears.
+
+def write_files(
+    place: Path, contents: Mapping[str, NDArray[Any] | bytes], planes: Mapping[str, Any]
+) -> list[str]:
+    """Write files and the table of planes of a scene, beside what others have there.
+
+    What an earlier call wrote, as ``planes.json`` says, is replaced, and arrays that it wrote and
+    this one does not are removed; nothing else is. All files are complete before the first appears.
+
+    Args:
+        place: Folder of the scene; it is made.
+        contents: Bytes, or arrays to be written as ``.npy``, by their paths from there.
+        planes: The table.
 
     Returns:
         Names of the files written.
 
     Raises:
-        FormatError: If a file from elsewhere is in the way, or the folder cannot be written.
+        FormatError: If a file from elsewhere is in the way, or a folder cannot be written.
     """
-    owned = _owned(place)
-    for name in arrays:
-        path = place / f"{name}.npy"
+    paths = {name: Path(os.path.normpath(place / name)) for name in contents}
+    owned = _owned(place, contents)
+    # Those of another layout stay, and are known again when it is asked for.
+    others = [name for name in _written(place) if "/" in name and name not in contents]
+    for name, path in paths.items():
         if name not in owned and os.path.lexists(path):
             raise FormatError(f"{path}: was not written by torchrg; move it away to have another.")
-    make_folder(place)
-    for name in owned - set(arrays):
-        (place / f"{name}.npy").unlink(missing_ok=True)
+    for folder in {place, *(path.parent for path in paths.values())}:
+        make_folder(folder)
+    for name in owned - set(contents):
+        (place / name).unlink(missing_ok=True)
     with ExitStack() as stack:
         # Files take their places in reverse: the claim on them first, the coordinates last.
-        for name, values in arrays.items():
-            beside = stack.enter_context(atomic_path(place / f"{name}.npy"))
+        for name, content in contents.items():
+            beside = stack.enter_context(atomic_path(paths[name], within=place))
             with beside.open("wb") as stream:
-                npy_format.write_array(stream, values, allow_pickle=False)
+                if isinstance(content, bytes):
+                    stream.write(content)
+                else:
+                    npy_format.write_array(stream, content, allow_pickle=False)
         claim = stack.enter_context(atomic_path(place / PLANES_FILE))
-        claim.write_text(json.dumps({"written": [*arrays], **planes}, indent=1), encoding="utf-8")
-    return [*(f"{name}.npy" for name in arrays), PLANES_FILE]
+        written = [name.removesuffix(".npy") if "/" not in name else name for name in contents]
+        written += others
+        claim.write_text(json.dumps({"written": written, **planes}, indent=1), encoding="utf-8")
+    return [*contents, PLANES_FILE]
 
 
 def _arrays_of(
@@ -152,17 +177,19 @@ def _arrays_of(
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of a scene in Pointcept's types."""
     found: dict[str, Any] = {"normal": segmentation.normals}
-    found |= {name: sample[name] for name in POINT_ARRAYS[:6] if name in sample}
+    found |= {name: sample[name] for name in GIVEN_ARRAYS if name in sample}
     found |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
     if superpoint is not None:
         found["superpoint"] = superpoint
     dtypes = {"color": np.uint8, "plane": np.int32, "superpoint": np.int32}
-    arrays = {}
+    arrays: dict[str, NDArray[Any]] = {}
     for name in (name for name in POINT_ARRAYS if name in found):
         values = as_tensor("write_pointcept_scene", name, found[name]).detach().cpu().numpy()
         check_rows(place / f"{name}.npy", values, segmentation.labels.shape)
-        if name in ("segment", "instance"):
-            arrays[name] = _short(values).reshape(-1, 1)
+        if name in _SCANNET or (name == "instance" and not found.keys().isdisjoint(_SCANNET)):
+            arrays[name] = values.astype(np.int64)
+        elif name in ("segment", "instance"):
+            arrays[name] = _short(values).reshape(len(values), -1)
         elif name in _FEATURES:
             arrays[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), -1)
         else:
@@ -177,13 +204,19 @@ def _short(labels: NDArray[Any]) -> NDArray[Any]:
     return labels.astype(np.int16 if fit else np.int32)
 
 
-def _owned(place: Path) -> set[str]:
-    """Return the names of the arrays that torchrg wrote here."""
+def _owned(place: Path, others: Collection[str] = ()) -> set[str]:
+    """Return the files that torchrg wrote here: arrays, and those of others that it names."""
+    names = {name if name in others else f"{name}.npy" for name in _written(place)}
+    return names & {*(f"{name}.npy" for name in POINT_ARRAYS), *others}
+
+
+def _written(place: Path) -> list[str]:
+    """Return what ``planes.json`` says that torchrg wrote."""
     try:
         written = json.loads((place / PLANES_FILE).read_text(encoding="utf-8"))["written"]
-        return set(written) & set(POINT_ARRAYS)
+        return sorted(set(written))
     except (FileNotFoundError, NotADirectoryError):
-        return set()
+        return []
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise FormatError(
             f"{place / PLANES_FILE}: expected a table of planes that torchrg wrote, got another "

@@ -36,7 +36,7 @@ _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> Iterator[Path]:
     """Give a path to write to that takes the place of ``path`` once the block has ended well.
 
     The file is written beside its final place, flushed to the disk, and moved there in one step;
@@ -45,9 +45,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Args:
         path: Where the file shall be. A symbolic link is followed.
+        within: Folder on the same disk in which it is written before. Default: that of ``path``.
 
     Yields:
-        The path to write to, in the same folder.
+        The path to write to.
 
     Raises:
         FormatError: If the folder does not exist, or the file cannot be written.
@@ -65,7 +66,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path))
     name = f".{target.stem}.{_mark.get() or make_mark()}{secrets.token_hex(4)}{target.suffix}"
-    beside = target.with_name(name)
+    beside = (target.parent if within is None else within) / name
     check_place(path)
     try:
         yield beside

@@ -1,0 +1,351 @@
+"""ScanNet and ScanNet++ as they are released: vertices of a mesh, and what each of them is of.
+
+The points are the vertices; faces are left out. Annotations name groups of segments, and a segment
+is a set of vertices.
+"""
+
+import csv
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
+from torchrg.errors import ConfigError, FormatError
+from torchrg.io import read_cloud
+from torchrg.io.files import refusing
+
+MESH, MESH_PLUSPLUS = "_vh_clean_2.ply", "mesh_aligned_0.05.ply"
+"""End of the name of a scan's mesh in ScanNet, and the whole name in ScanNet++."""
+CATEGORIES = "scannetv2-labels.combined.tsv"
+"""Table of ScanNet that numbers the words of its annotations."""
+CLASSES = (
+    "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf",
+    "picture", "counter", "desk", "curtain", "refrigerator", "shower curtain", "toilet", "sink",
+    "bathtub", "otherfurniture",
+)  # fmt: skip
+"""Names of the 20 classes of the benchmark, by number."""
+NYU_IDS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 24, 28, 33, 34, 36, 39)
+"""Categories of NYU40 that are these classes, by number."""
+_RANGES_200 = (
+    "1-11 13-19 21-24 26-29 31-36 38-42 44-52 54-59 62-80 82 84 86-90 93 95-107 110 112 115 116 "
+    "118 120-122 125 128 130-132 134 136 138-141 145 148 154-157 159 161 163 165 166 168-170 177 "
+    "180 185 188 191 193 195 202 208 213 214 221 229 230 232 233 242 250 261 264 276 283 286 300 "
+    "304 312 323 325 331 342 356 370 392 395 399 408 417 488 540 562 570 572 581 609 748 776 1156 "
+    "1163-1176 1178-1191"
+)
+IDS_200 = tuple(
+    number
+    for first, _, last in (words.partition("-") for words in _RANGES_200.split())
+    for number in range(int(first), int(last or first) + 1)
+)
+"""Numbers in :data:`CATEGORIES` that are the classes of ScanNet200, by number."""
+_SPLITS = {
+    "train": ("scannetv2_train.txt", "nvs_sem_train.txt"),
+    "val": ("scannetv2_val.txt", "nvs_sem_val.txt"),
+    "test": ("scannetv2_test.txt", "sem_test.txt"),
+}
+"""Files that list the scans of each split, one a line."""
+_PLACES = ("", "splits", "meta_data", "metadata/semantic_benchmark")
+"""Folders below the root in which such files, and tables of classes, are looked for."""
+_MOST_LABELS = 3
+"""Objects that a vertex of ScanNet++ may be of at once."""
+_NONE = -1
+
+
+class ScanNet(SceneDataset):
+    """The scans of ScanNet, ``ROOT/scans/<scan>/<scan>_vh_clean_2.ply``, or of ScanNet++.
+
+    Of ScanNet++ the meshes are ``ROOT/data/<scan>/scans/mesh_aligned_0.05.ply``. Splits are those
+    of the lists of the data set (``scannetv2_train.txt``, ``nvs_sem_train.txt`` and so on) in
+    ``ROOT``, ``ROOT/splits`` or ``ROOT/meta_data``. A scan on none of them, and one without
+    annotations where there are no lists, is in ``test``.
+
+    A sample has ``coord`` ``(N, 3)`` float32 in metres as the mesh has them, ``color`` ``(N, 3)``
+    uint8, ``axis_align_matrix`` ``(4, 4)`` float64, the motion that sets the scan upright, where
+    it is known, and ``name``, as in ``train/scene0000_00``. With annotations: ``segment`` ``(N,)``
+    int64, a place in ``classes``, and ``instance`` ``(N,)`` int64, the number of the object; -1 for
+    none. Where the table ``scannetv2-labels.combined.tsv`` is found beside the lists, also
+    ``segment200``, a place in :data:`IDS_200`. Vertices of ScanNet++ that are of several objects
+    have the smallest.
+
+    Args:
+        root: The folder that holds ``scans`` or ``data``, or the scans themselves.
+        split: ``"train"``, ``"val"`` or ``"test"``. Default: all.
+        transform: Called with each sample.
+
+    Attributes:
+        scenes: Name, mesh and input files of each scan, in natural order.
+        classes: Names of the classes by number.
+
+    Raises:
+        FormatError: If there is no such folder, or no scan in it.
+        ConfigError: If the split is unknown.
+
+    References:
+        [1] A. Dai et al. ScanNet: richly-annotated 3D reconstructions of indoor scenes. CVPR, 2017.
+        [2] C. Yeshwanth et al. ScanNet++: a high-fidelity dataset of 3D indoor scenes. ICCV, 2023.
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str | None = None,
+        *,
+        transform: Callable[[Mapping[str, Any]], Any] | None = None,
+    ) -> None:
+        if split is not None and split not in _SPLITS:
+            raise ConfigError(
+                f"ScanNet: expected split to be one of {', '.join(_SPLITS)}, got {split!r}."
+            )
+        self.root = Path(root)
+        self.transform = transform
+        check_folder(self.root)
+        scenes = [_scene(self.root, mesh) for mesh in _meshes(self.root)]
+        if not scenes:
+            raise FormatError(
+                f"{root}: expected scans as <scan>/<scan>{MESH} or <scan>/scans/{MESH_PLUSPLUS}, "
+                "got none; pass the folder that holds scans or data."
+            )
+        lists = _lists(self.root)
+        named = [scene._replace(name=f"{_split(scene, lists)}/{scene.name}") for scene in scenes]
+        self.scenes = [
+            scene for scene in named if split is None or scene.name.startswith(f"{split}/")
+        ]
+        is_plus = any(scene.path.name == MESH_PLUSPLUS for scene in scenes)
+        self.classes = tuple(_classes_plus(self.root)) if is_plus else CLASSES
+
+    def read_sample(self, index: int) -> dict[str, Any]:
+        """Return the sample of a scan."""
+        name, mesh, _ = self.scenes[index]
+        arrays = read_scannet_scan(mesh, self.root)
+        arrays.pop("category", None)
+        if "segment20" in arrays:
+            arrays["segment"] = arrays.pop("segment20")
+        sample: dict[str, Any] = {key: torch.from_numpy(values) for key, values in arrays.items()}
+        for key in {"segment", "segment200", "instance"} & set(arrays):
+            sample[key] = sample[key].reshape(len(arrays["coord"]), -1)[:, 0].long()
+        return {**sample, "name": name}
+
+
+def read_scannet_scan(mesh: Path, root: Path) -> dict[str, NDArray[Any]]:
+    """Read a scan of ScanNet or ScanNet++ from the raw release; nothing is written.
+
+    Args:
+        mesh: The mesh of the scan.
+        root: Folder of the data set, in which tables of classes are looked for.
+
+    Returns:
+        ``coord`` ``(N, 3)`` float32, ``color`` ``(N, 3)`` uint8 and, where they are known,
+        ``axis_align_matrix`` ``(4, 4)`` float64 and labels as Pointcept stores them: of ScanNet
+        ``segment20``, ``segment200``, ``instance`` ``(N,)`` int64, and ``category``, the number in
+        NYU40, 0 for none; of ScanNet++ ``segment`` and ``instance`` ``(N, 3)`` int16, the smallest
+        object first.
+
+    Raises:
+        FormatError: If a file is damaged, or is of another number of vertices.
+    """
+    cloud = read_cloud(mesh)
+    arrays: dict[str, NDArray[Any]] = {"coord": cloud.coordinates.astype(np.float32)}
+    if "color" in cloud.fields:
+        arrays["color"] = cloud.fields["color"]
+    if mesh.name == MESH_PLUSPLUS:
+        return arrays | _labels_plus(mesh, root, len(cloud))
+    files = _files_of(mesh)
+    if "text" in files:
+        arrays |= _alignment(files["text"])
+    return arrays | _labels(files, root, len(cloud))
+
+
+def _meshes(root: Path) -> Iterator[Path]:
+    """Yield the mesh of each scan in natural order."""
+    for folder in (root, *listed(root)):
+        for scan in listed(folder) if folder.is_dir() else ():
+            for mesh in (scan / f"{scan.name}{MESH}", scan / "scans" / MESH_PLUSPLUS):
+                if mesh.is_file():
+                    yield mesh
+
+
+def _scene(root: Path, mesh: Path) -> SceneFiles:
+    """Return a scan with its input files, named without its split."""
+    is_plus = mesh.name == MESH_PLUSPLUS
+    name = mesh.parent.parent.name if is_plus else mesh.parent.name
+    tables = ("map_benchmark.csv", "top100.txt") if is_plus else (CATEGORIES,)
+    found = [path for table in tables if (path := _find(root, table))]
+    return SceneFiles(name, mesh, (mesh, *_files_of(mesh).values(), *found))
+
+
+def _files_of(mesh: Path) -> dict[str, Path]:
+    """Return the files beside a mesh that are there, by what they are."""
+    folder = mesh.parent
+    if mesh.name == MESH_PLUSPLUS:
+        names = {"segments": "segments.json", "groups": "segments_anno.json"}
+    else:
+        scan = mesh.name.removesuffix(MESH)
+        names = {
+            "segments": f"{mesh.stem}.0.010000.segs.json",
+            "groups": f"{scan}.aggregation.json",
+            "categories": f"{mesh.stem}.labels.ply",
+            "text": f"{scan}.txt",
+        }
+    return {key: folder / name for key, name in names.items() if (folder / name).is_file()}
+
+
+def _find(root: Path, name: str) -> Path | None:
+    """Return a file of the data set in one of the places where it may be."""
+    return next((path for place in _PLACES if (path := root / place / name).is_file()), None)
+
+
+def _lists(root: Path) -> dict[str, str]:
+    """Return the split of each scan that is on a list."""
+    found = ((split, _find(root, name)) for split, names in _SPLITS.items() for name in names)
+    return {
+        name: split
+        for split, path in found
+        if path is not None
+        for name in path.read_text(encoding="utf-8").split()
+    }
+
+
+def _split(scene: SceneFiles, lists: Mapping[str, str]) -> str:
+    """Return the split of a scan."""
+    if lists:
+        return lists.get(scene.name, "test")
+    return "train" if "groups" in _files_of(scene.path) else "test"
+
+
+def _alignment(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the motion in the text of a scan, if there is one."""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        name, _, numbers = line.partition("=")
+        if name.strip() == "axisAlignment":
+            with refusing(f"{path}: expected 16 numbers as axisAlignment, got: ", ValueError):
+                matrix = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
+            return {"axis_align_matrix": matrix}
+    return {}
+
+
+def _labels(files: Mapping[str, Path], root: Path, count: int) -> dict[str, NDArray[Any]]:
+    """Return the labels of a scan of ScanNet."""
+    table = _find(root, CATEGORIES)
+    words = {} if table is None else _read_categories(table)
+    found: dict[str, NDArray[Any]] = {}
+    if "groups" in files and "segments" in files:
+        instance = np.full(count, _NONE, dtype=np.int64)
+        numbers = np.zeros((count, 2), dtype=np.int64)
+        for group, rows in _groups(files, count):
+            instance[rows] = group["id"]
+            numbers[rows] = words.get(group["label"], (0, 0))
+        found["instance"] = instance
+        if words:
+            found |= {"category": numbers[:, 0], "segment200": _places(numbers[:, 1], IDS_200)}
+    if "categories" in files:
+        given = read_cloud(files["categories"]).fields.get("labels")
+        if given is None or given.shape != (count,):
+            raise FormatError(
+                f"{files['categories']}: expected a label of each of {count:,} vertices, got "
+                f"{'none' if given is None else f'{len(given):,}'}; fetch it again."
+            )
+        found["category"] = given.astype(np.int64)
+    if "category" in found:
+        found["segment20"] = _places(found["category"], NYU_IDS)
+    return found
+
+
+def _labels_plus(mesh: Path, root: Path, count: int) -> dict[str, NDArray[Any]]:
+    """Return the labels of a scan of ScanNet++, in which a vertex may be of several objects."""
+    files, classes = _files_of(mesh), _classes_plus(root)
+    table = _find(root, "map_benchmark.csv")
+    if not {"segments", "groups"} <= files.keys() or not classes or table is None:
+        return {}
+    renamed = _read_mapping(table)
+    segment = np.full((count, _MOST_LABELS), _NONE, dtype=np.int16)
+    instance = segment.copy()
+    sizes = np.full(segment.shape, np.inf)
+    used = np.zeros(count, dtype=np.int64)
+    for group, rows in _groups(files, count):
+        label = classes.get(renamed.get(group["label"], ""))
+        rows = rows[used[rows] < _MOST_LABELS]
+        if label is None or not len(rows):
+            continue
+        place = (rows, used[rows])
+        segment[place], instance[place], sizes[place] = label, group["objectId"], len(rows)
+        used[rows] += 1
+    every, smallest = np.arange(count), sizes.argmin(axis=1)
+    for labels in (segment, instance):
+        first = labels[:, 0].copy()
+        labels[:, 0] = labels[every, smallest]
+        labels[every, smallest] = np.where(smallest > 0, first, labels[:, 0])
+    return {"segment": segment, "instance": instance}
+
+
+def _groups(
+    files: Mapping[str, Path], count: int
+) -> Iterator[tuple[dict[str, Any], NDArray[np.integer]]]:
+    """Yield each object of an annotation with the rows of its vertices."""
+    segments = np.array(_read_json(files["segments"], "segIndices"), dtype=np.int64)
+    if segments.shape != (count,):
+        raise FormatError(
+            f"{files['segments']}: expected a segment of each of {count:,} vertices, got "
+            f"{len(segments):,}; fetch it again."
+        )
+    groups = _read_json(files["groups"], "segGroups")
+    message = f"{files['groups']}: expected objects with label and segments, got: "
+    for group in groups:
+        with refusing(message, LookupError, ValueError, TypeError, repair="; fetch it again"):
+            known = {"label": str(group["label"]), "id": int(group.get("id", _NONE))}
+            known["objectId"] = int(group.get("objectId", _NONE))
+            rows = np.flatnonzero(np.isin(segments, np.array(group["segments"], dtype=np.int64)))
+        yield known, rows
+
+
+def _read_json(path: Path, key: str) -> Any:  # noqa: ANN401
+    """Return the list that a file has under a key."""
+    message = f"{path}: expected JSON with {key}, got: "
+    with refusing(message, ValueError, LookupError, TypeError, repair="; fetch it again"):
+        return json.loads(path.read_text(encoding="utf-8"))[key]
+
+
+def _read_categories(path: Path) -> dict[str, tuple[int, int]]:
+    """Return the numbers in NYU40 and ScanNet200 of each word of an annotation."""
+    numbers: dict[str, tuple[int, int]] = {}
+    message = f"{path}: expected columns raw_category, nyu40id and id, got: "
+    with refusing(message, LookupError, ValueError), path.open(encoding="utf-8") as stream:
+        for row in csv.DictReader(stream, delimiter="\t"):
+            pair = (int(float(row["nyu40id"] or 0)), int(float(row["id"] or 0)))
+            numbers.setdefault(row["raw_category"], pair)
+    return numbers
+
+
+def _read_mapping(path: Path) -> dict[str, str]:
+    """Return the class of the benchmark of each word of an annotation; words of none are absent."""
+    classes: dict[str, str] = {}
+    message = f"{path}: expected columns class and semantic_map_to, got: "
+    with refusing(message, LookupError), path.open(encoding="utf-8") as stream:
+        for row in csv.DictReader(stream):
+            target = row["semantic_map_to"]
+            if target and target != "None":
+                classes[row["class"]] = target
+            elif not target:
+                classes.setdefault(row["class"], row["class"])
+    return classes
+
+
+def _classes_plus(root: Path) -> dict[str | None, int]:
+    """Return the numbers of the classes of ScanNet++ by name, none where there is no list."""
+    path = _find(root, "top100.txt")
+    lines = [] if path is None else path.read_text(encoding="utf-8").splitlines()
+    return {name.strip(): number for number, name in enumerate(filter(str.strip, lines))}
+
+
+def _places(numbers: NDArray[np.integer], known: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return the place of each number in a list, -1 for those that are not in it."""
+    places = np.full(max(int(numbers.max(initial=0)), *known) + 1, _NONE, dtype=np.int64)
+    places[list(known)] = np.arange(len(known))
+    found: NDArray[np.int64] = places[np.maximum(numbers, 0)]
+    return found
