@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torchrg.io import read_cloud, write_cloud
     from torchrg.neighbors import search_knn
     from torchrg.normals import estimate_normals
-    from torchrg.pipeline import make_superpoints, segment_planes
+    from torchrg.pipeline import make_superpoints, segment_mesh, segment_planes
     from torchrg.regions import align_axes, grow_regions
     from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud
@@ -30,6 +30,7 @@ else:
         "read_cloud": "io",
         "read_result": "result",
         "search_knn": "neighbors",
+        "segment_mesh": "pipeline",
         "segment_planes": "pipeline",
         "write_cloud": "io",
     }
@@ -83,6 +84,7 @@ __all__ = [
     "robust",
     "scenes",
     "search_knn",
+    "segment_mesh",
     "segment_planes",
     "transforms",
     "write_cloud",

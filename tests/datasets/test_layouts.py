@@ -175,8 +175,8 @@ def expected_objects(room):
 
 def check_points(room, coord, color):
     assert coord.dtype == color.dtype == np.float32
-    assert np.allclose(coord, room.coord - room.coord.mean(axis=0), atol=1e-5)
-    assert np.abs(coord.mean(axis=0)).max() < 1e-5
+    assert np.allclose(coord, room.coord - room.coord.mean(axis=0, dtype=float), atol=1e-5)
+    assert np.abs(coord.mean(axis=0, dtype=float)).max() < 1e-5
     assert np.allclose(color, room.color / 127.5 - 1, atol=1e-6)
     coord += 1  # Programs change them in place.
 
