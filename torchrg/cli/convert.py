@@ -44,22 +44,23 @@ MOST_ROWS = 300
 class Arguments:
     """What every kind of data set has."""
 
-    root: Annotated[Path, tyro.conf.Positional]
+    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
     """Directory of the data set. It is only read."""
-    out: Annotated[Path, tyro.conf.Positional]
-    """Directory for the results, a folder for each scan; it is made. What is done there already is
-    not done again."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Directory for the results, with a folder for each scan. It is made where there is none, and
+    what is done there already is not done again."""
     workers: int | None = None
-    """Scans at a time. Default: one for each core; on a cluster, as many as it takes."""
+    """Number of scans at a time. Default: one for each core; on a cluster, as many as fit."""
     engine: Literal["local", "ray"] = "local"
-    """Processes of this machine, or tasks on Ray (pip install 'torchrg[ray]')."""
+    """Where scans are worked on: in processes of this machine (local), or as tasks of a Ray cluster
+    (ray; pip install 'torchrg[ray]')."""
     ray_address: str | None = None
-    """Ray cluster to use, "auto" for the one of this machine; every node sees both directories
-    under these paths. Default: one that is started for the time of the command."""
+    """Address of the Ray cluster, "auto" for the one of this machine. Every node has to see ROOT
+    and OUT under the same paths. Default: a cluster that is started for the command."""
     limit_memory: float | None = None
-    """Gigabytes that all scans at a time may take. Default: 80 % of what is free."""
+    """Gigabytes of memory that all scans at a time may take. Default: 80 % of what is free."""
     only: str | None = None
-    """Convert the scans whose names match, as in a shell: "Area_5/*"."""
+    """Pattern for the names of the scans to convert, as in a shell: "Area_5/*"."""
     force: bool = False
     """Convert what is done already, too."""
     dry_run: bool = False
@@ -93,6 +94,10 @@ class FolderArguments(CloudArguments):
     Clouds are files of --suffixes and folders in Pointcept's layout; with ROOT for OUT, the latter
     are completed in place. The results of ROOT/a/b.ply are in OUT/a/b. Links are followed, and each
     file is converted once.
+
+    Examples:
+        torchrg convert folder scans results --dry-run
+        torchrg convert folder scans results --workers 4 --pages pages
     """
 
     columns: console.ColumnsFlag = None
@@ -125,6 +130,11 @@ class S3DISArguments(CloudArguments):
     """Convert S3DIS as it is released into Pointcept's layout, with normals and planes.
 
     Settings are those of the preset s3dis unless told otherwise.
+
+    Examples:
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --dry-run
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --workers 4 --superpoint
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --areas 5 --pages pages
     """
 
     areas: tuple[int, ...] = ()
@@ -141,12 +151,17 @@ class S3DISArguments(CloudArguments):
 
 @dataclass(frozen=True)
 class RGBDArguments(Arguments):
-    """Convert depth frames: normals, curvature and plane labels as images, a table of planes."""
+    """Convert depth frames: normals, curvature and plane labels as images, a table of planes.
+
+    Examples:
+        torchrg convert rgbd frames results --intrinsics 525,525,319.5,239.5 --depth-scale 1000
+        torchrg convert rgbd rgbd_dataset_freiburg1_xyz results --layout tum
+    """
 
     layout: Literal["tum", "icl-nuim", "scannet", "7-scenes", "images"] = "images"
-    """Shape of the folder; images are all .png and .npy below it, of one camera."""
+    """Data set whose folders ROOT has; images are all .png and .npy below it, of one camera."""
     intrinsics: str | None = None
-    """fx,fy,cx,cy of the camera in pixels. Default: those of the layout; images have none."""
+    """Camera, as fx,fy,cx,cy in pixels. Default: that of the layout; images have none."""
     depth_scale: float | None = None
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)

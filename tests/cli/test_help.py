@@ -1,0 +1,114 @@
+"""What ``--help`` prints can be read, and all of it is true."""
+
+import importlib
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from torchrg.cli import COMMANDS, console, convert, help, main
+from torchrg.cli.segment import _spell_counts
+
+KINDS = {
+    f"torchrg {name}": importlib.import_module(f"torchrg.cli.{name}").Arguments
+    for name in COMMANDS
+    if name != "convert"
+} | {f"torchrg convert {name}": kind for name, kind in convert.KINDS.items()}
+QUICK = """
+import sys, torchrg.cli
+try:
+    torchrg.cli.main(sys.argv[1:])
+finally:
+    print("loaded:", *({"torch", "numpy", "tyro"} & set(sys.modules)))
+"""
+
+
+def help_of(prog, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([*prog.split()[1:], "--help"])
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("prog", KINDS)
+def test_help_has_no_markup_and_stays_in_its_lines(prog, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "90")
+    text = help_of(prog, capsys)
+    assert "`" not in text
+    assert ":func:" not in text
+    assert ":class:" not in text
+    flags = [line for line in text.splitlines() if line.startswith(("  --", "  torchrg", "usage"))]
+    assert all(len(line) <= 90 for line in text.splitlines() if line not in flags)
+
+
+@pytest.mark.parametrize("prog", KINDS)
+def test_each_argument_is_told_once_in_sentences(prog, capsys):
+    text = help_of(prog, capsys)
+    flags = list(help.list_flags(KINDS[prog]))
+    assert len({flag.name for flag in flags}) == len(flags)
+    for flag in flags:
+        assert text.count(f"\n  {flag.spelling}\n") == 1
+        assert flag.text[0].isupper() or flag.text.startswith("x,y")
+        assert flag.text.endswith(".")
+        assert not flag.text.startswith(("They ", "And ", "That ", "This ", "Those "))
+
+
+@pytest.mark.parametrize("prog", KINDS)
+def test_flags_are_those_that_are_understood(prog):
+    parser_only = {"h", "help"}
+    known = subprocess_free_names(KINDS[prog], prog)
+    shown = {
+        word.removeprefix("--")
+        for flag in help.list_flags(KINDS[prog])
+        for word in flag.spelling.replace(",", " ").split()
+        if word.startswith("--")
+    }
+    assert shown - parser_only <= known
+
+
+def subprocess_free_names(kind, prog):
+    """Return the names of flags that tyro knows, from its own help."""
+    import contextlib
+    import io
+    import re
+
+    import tyro
+
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        tyro.cli(kind, args=["--help"], prog=prog)
+    return set(re.findall(r"--([a-z][\w.-]*)", out.getvalue()))
+
+
+@pytest.mark.parametrize("prog", KINDS)
+def test_examples_are_understood(prog, capsys):
+    kind = KINDS[prog]
+    examples = help.example_lines(kind)
+    assert examples
+    assert help_of(prog, capsys).rstrip().endswith(examples[-1])
+    for line in examples:
+        assert line.startswith(f"{prog} ")
+        arguments = shlex.split(line)[len(prog.split()) :]
+        console.parse(kind, _spell_counts(arguments), prog=prog)
+
+
+def test_what_is_needed_has_names(capsys):
+    assert main(["convert", "s3dis"]) == 2
+    error = capsys.readouterr().err
+    assert "ROOT" in error
+    assert "OUT" in error
+    assert help_of("torchrg convert s3dis", capsys).startswith(
+        "usage: torchrg convert s3dis ROOT OUT [options]\n"
+    )
+
+
+def test_settings_of_the_preset_are_shown(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["segment", "--preset", "classic", "--help"])
+    assert "Default: pca." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version", "segmnet"])
+def test_quick_answers_load_nothing_heavy(argument):
+    done = subprocess.run([sys.executable, "-c", QUICK, argument], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "loaded:"
