@@ -1,13 +1,18 @@
 """What ``--help`` prints can be read, and all of it is true."""
 
+import contextlib
 import importlib
+import io
+import re
 import shlex
 import subprocess
 import sys
 
 import pytest
+import tyro
 
-from torchrg.cli import COMMANDS, console, convert, help, main
+from torchrg.cli import COMMANDS, console, convert, main
+from torchrg.cli.help import example_lines, list_flags
 from torchrg.cli.segment import _spell_counts
 
 KINDS = {
@@ -44,7 +49,7 @@ def test_help_has_no_markup_and_stays_in_its_lines(prog, capsys, monkeypatch):
 @pytest.mark.parametrize("prog", KINDS)
 def test_each_argument_is_told_once_in_sentences(prog, capsys):
     text = help_of(prog, capsys)
-    flags = list(help.list_flags(KINDS[prog]))
+    flags = list(list_flags(KINDS[prog]))
     assert len({flag.name for flag in flags}) == len(flags)
     for flag in flags:
         assert text.count(f"\n  {flag.spelling}\n") == 1
@@ -55,25 +60,18 @@ def test_each_argument_is_told_once_in_sentences(prog, capsys):
 
 @pytest.mark.parametrize("prog", KINDS)
 def test_flags_are_those_that_are_understood(prog):
-    parser_only = {"h", "help"}
-    known = subprocess_free_names(KINDS[prog], prog)
+    known = names_that_tyro_knows(KINDS[prog], prog)
     shown = {
         word.removeprefix("--")
-        for flag in help.list_flags(KINDS[prog])
+        for flag in list_flags(KINDS[prog])
         for word in flag.spelling.replace(",", " ").split()
         if word.startswith("--")
     }
-    assert shown - parser_only <= known
+    assert shown <= known
 
 
-def subprocess_free_names(kind, prog):
-    """Return the names of flags that tyro knows, from its own help."""
-    import contextlib
-    import io
-    import re
-
-    import tyro
-
+def names_that_tyro_knows(kind, prog):
+    """Return the names of flags, from the help of the parser itself."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         tyro.cli(kind, args=["--help"], prog=prog)
@@ -83,7 +81,7 @@ def subprocess_free_names(kind, prog):
 @pytest.mark.parametrize("prog", KINDS)
 def test_examples_are_understood(prog, capsys):
     kind = KINDS[prog]
-    examples = help.example_lines(kind)
+    examples = example_lines(kind)
     assert examples
     assert help_of(prog, capsys).rstrip().endswith(examples[-1])
     for line in examples:

@@ -1,6 +1,7 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 from tqdm import tqdm
 
+from torchrg.batch.costs import estimate_costs
 from torchrg.batch.local import run_local
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import spare_memory
@@ -31,7 +33,7 @@ from torchrg.config import DEFAULT_PRESET, DepthConfig
 from torchrg.datasets.folder import files_below
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
-from torchrg.io.files import check_place, make_folder
+from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import read_result
@@ -210,7 +212,9 @@ def run(argv: list[str]) -> int:
     with console.warnings_as_lines():
         jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)
     if arguments.dry_run:
-        print(format_plan(_look_at(jobs, arguments)))
+        plan = _look_at(jobs, arguments)
+        print(format_plan(plan), _say_costs(plan, out, arguments), sep="\n")
+        check_room(plan)
         return 0
     make_folder(out)
     check_place(out / REPORT)
@@ -248,9 +252,7 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
     check_room(plan)
-    given = arguments.limit_memory
-    limit = spare_memory() if given is None else int(given * 1e9)
-    jobs, workers = plan.to_convert, arguments.workers
+    jobs, (workers, limit) = plan.to_convert, _workers_and_memory(arguments)
     for job in jobs:
         if job.memory > limit:
             console.warn(
@@ -291,7 +293,10 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     """Write and print the report, and return the exit code."""
-    print(format_report(report, unit=unit))
+    if report.with_status("kept") == list(report.scans):
+        print("nothing to do")
+    else:
+        print(format_report(report, unit=unit))
     for scan in report.scans:
         tell_failure(scan)
     try:
@@ -310,11 +315,36 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
 
 def format_plan(plan: Plan) -> str:
     """Return what a plan would do: a row for each scan that is to be converted."""
+    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
+    if not plan.to_convert:
+        return sums
     rows = [
         [job.name, plan.reasons[job.name], f"{job.scan.num_points:,}"] for job in plan.to_convert
     ]
-    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
     return "\n".join([console.format_table(["scan", "why", "points (about)"], rows), sums])
+
+
+def _say_costs(plan: Plan, out: Path, arguments: Arguments) -> str:
+    """Return what a plan would take, in words, or that there is nothing to do."""
+    if not plan.to_convert:
+        return "nothing to do"
+    workers, limit = _workers_and_memory(arguments)
+    costs = estimate_costs(plan, workers=workers or console.num_cores(), limit=limit)
+    minutes = math.ceil(costs.seconds / 60)
+    spent = f"{minutes / 60:,.1f} hours" if minutes > 90 else f"{minutes} min"
+    free = free_space(out) / 1e9
+    return (
+        f"disk: about {costs.disk / 1e9:,.3f} GB of {free:,.1f} that are free\n"
+        f"memory: about {costs.memory / 1e9:,.1f} GB for {costs.workers} at a time, "
+        f"within {limit / 1e9:,.1f}\n"
+        f"time: about {spent} on this machine, if it does nothing else"
+    )
+
+
+def _workers_and_memory(arguments: Arguments) -> tuple[int | None, int]:
+    """Return how many scans may run at a time, and the bytes that they may take."""
+    given = arguments.limit_memory
+    return arguments.workers, spare_memory() if given is None else int(given * 1e9)
 
 
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
