@@ -311,6 +311,4 @@ def _print_scans(scans: dict[str, Scores]) -> None:
 
 def _spelled(value: float | None) -> str:
     """Return a number with four places at most."""
-    if value is None:
-        return "none"
-    return f"{value:.4f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+    return "none" if value is None else f"{value:.4f}".rstrip("0").rstrip(".")
