@@ -25,36 +25,40 @@ class NormalsConfig:
     """How normals and curvature are estimated."""
 
     method: NormalMethod = "paper"
-    """Estimator: one of the single fits of all points, or two stages (paper, consensus)."""
+    """Estimator of the normals: one fit at every point (pca, jet, irls, fastmcd, mve, detmcd,
+    detmm), or PCA and a second fit at sharp points (paper, consensus)."""
     k: int = 50
-    """Number of neighbours, the point itself included. Smaller clouds use what they have."""
+    """Number of neighbours of a point, the point itself included. More resist noise, fewer keep
+    narrow faces. A cloud of fewer points uses all of them."""
     sharp_rule: Literal["qn", "percentile"] = "qn"
-    """Rule for sharp feature points: Qn of the angles to the neighbours' normals (eq. 9), or
-    their 25th percentile (Algorithm 1)."""
+    """How a point is tested for being sharp: by Qn of the angles between its normal and those of
+    its neighbours (qn, eq. 9), or by their 25th percentile (percentile, Algorithm 1)."""
     sharp_angle_deg: float = 5.0
-    """A point is sharp when its rule gives more than this angle."""
+    """A point is sharp when the rule for sharp points gives more than this angle."""
     support_fraction: float = 0.5
-    """Share of the neighbours that the MCD fits, in [0.5, 1]: 0.5 resists most outliers, 0.75 is
-    the default of LIBRA, MATLAB's DetMCD."""
+    """Share of the neighbours that the MCD fits, in [0.5, 1]. With 0.5 it resists most outliers;
+    0.75 is the default of LIBRA, MATLAB's DetMCD."""
     mcd_scaling: Literal["consistency", "quantile"] = "consistency"
-    """What DetMCD multiplies its raw scatter by: the factor for normal points, or one by which its
-    h-th smallest squared distance is the chi-square quantile of h of k (LIBRA)."""
+    """Factor that DetMCD multiplies its raw scatter by: the one for normally distributed points
+    (consistency), or the one that makes its h-th smallest squared distance the chi-square quantile
+    of h of k (quantile, as in LIBRA)."""
     mcd_inliers: Literal["raw", "reweighted"] = "raw"
-    """Distances of DetMCD that are cut: those to the raw fit, or those to the reweighted one
-    (LIBRA)."""
+    """Fit from which DetMCD takes the distances that tell outliers: the raw one (raw), or the
+    reweighted one (reweighted, as in LIBRA)."""
     inlier_quantile: float = 0.975
-    """Neighbours within this chi-square quantile of the robust fit are inliers."""
+    """A neighbour is an inlier of a robust fit when its squared distance is within this quantile of
+    the chi-square distribution."""
     irls_decay: float = 1.05
-    """Factor, above 1, by which the scale of irls shrinks in a step: its authors' is 1.01, which
-    takes five times as long."""
+    """Factor, above 1, by which the scale of irls shrinks in each step. The authors of irls use
+    1.01, which takes five times as long as 1.05."""
     adaptive_k: int | None = None
     """Largest number of neighbours that consensus may use in noisy clouds, where k are too few to
     tell faces apart. None: always k."""
-
     noise_scope: Literal["local", "regional"] = "local"
-    """What consensus takes for the noise about a point: what it finds there, or at most what it
-    finds in the region around, within four neighbourhoods. Where a reconstruction has rounded a
-    step between parallel faces into a ramp, the ramp looks like noise to the points on it."""
+    """Noise about a point, as consensus sees it: what is found at the point (local), or at most
+    what is found in the region around it, within four neighbourhoods (regional). Regional is for
+    reconstructions, which round a step between parallel faces into a ramp that looks like noise to
+    the points on it."""
 
     def __post_init__(self) -> None:
         _require(self, "k", ">= 3", self.k >= 3)
@@ -71,64 +75,70 @@ class GrowingConfig:
     """How regions grow; the defaults are the paper's."""
 
     max_angle_deg: float = 5.0
-    """A neighbour joins when the angle between the normals is at most this."""
+    """A neighbour joins a region when the angle between the two normals is at most this. Larger
+    values join more."""
     curvature_quantile: float = 0.95
-    """The curvature limit is this quantile of the curvatures of all valid points."""
+    """Quantile of the curvatures of all valid points that is the curvature limit for seeds."""
     seed_rule: Literal["curvature", "increment"] = "increment"
-    """A point that joined grows further when its curvature (PCL), or the difference of its
-    curvature to that of the point it joined (the paper), is at most the curvature limit."""
+    """When a point that joined becomes a seed, from which the region grows on: when its own
+    curvature is at most the limit (curvature, as in PCL), or when the difference to the curvature
+    of the point it joined is (increment, as in the paper)."""
     connectivity: float | None = 0.75
-    """Two points are connected when they share at least this fraction of their k neighbours.
-    None: not tested."""
+    """Two points are connected when they share at least this fraction of their k neighbours. None:
+    not tested."""
     connectivity_scope: Literal["region", "seed"] = "seed"
-    """What an unconnected neighbour may not do: join the region (Algorithm 2 as printed), or only
-    become a seed (the paper's text), which it is once a seed of its region that is connected to it
-    reaches it, at the claim or later."""
+    """What a neighbour that is not connected may not do: join the region (region, Algorithm 2 as
+    printed), or only become a seed (seed, the paper's text). In the latter case it becomes one as
+    soon as a seed of its region that is connected to it reaches it."""
     coplanarity: bool = True
-    """Whether a neighbour joins only if its distance to the seed's plane is at most
-    median + 2 Qn of those of the neighbourhood (eq. 11)."""
+    """Whether a neighbour joins only if its distance to the plane of the seed is at most median + 2
+    Qn of the distances in the neighbourhood (eq. 11)."""
     coplanarity_scope: Literal["all", "connected"] = "all"
-    """Which neighbours that median and Qn are taken over: all, or those left by the
-    connectivity test (Algorithm 2)."""
+    """Neighbours over which the median and Qn of the coplanarity test are taken: all of them (all),
+    or those that are connected (connected, Algorithm 2)."""
     coplanarity_floor: float = 0.005
-    """Least value of that Qn, as a fraction of the distance to the farthest neighbour: exact and
-    quantised surfaces, where most residuals are equal, have Qn = 0."""
+    """Least value of Qn in the coplanarity test, as a fraction of the distance to the farthest
+    neighbour. On exact and quantised surfaces most residuals are equal, and Qn alone is 0."""
     plane_reach: float | None = None
     """Two points join only if each is within this many times the other's residual of the other's
-    plane: faces never join across a thin plate. Takes the place of eq. 11 but where a fit is exact
-    (residual below ``coplanarity_floor``). Needs the residuals of the normals. None: not tested."""
+    plane, so that faces never join across a thin plate. The test takes the place of eq. 11 but
+    where a fit is exact (a residual below coplanarity_floor), and needs normals with residuals.
+    None: not tested."""
     max_distance: float | None = None
-    """A neighbour farther than this does not join, in the unit of the cloud: the k nearest
-    neighbours reach across gaps where points are few. None: not tested."""
+    """A neighbour farther than this does not join, in the unit of the cloud. Where points are few,
+    the k nearest neighbours reach across gaps, and this keeps them apart. None: not tested."""
     min_size: int = 50
-    """Smaller regions are not labelled. With ``absorb`` the points at their borders count."""
+    """Regions of fewer points are not labelled. With absorb, points at the borders of a region
+    count as well."""
     cut_bridges: bool = False
-    """Whether regions of several faces that a few points join are split: faces 12 degrees apart,
-    floors with furniture on them. Takes ``consensus`` about a twentieth more time."""
+    """Whether a region of several faces that only a few points join is split, as faces 12 degrees
+    apart and floors with furniture on them are. It takes consensus about a twentieth more time."""
     facet_tolerance: float | None = None
-    """After growth, regions that touch and lie within this distance of one plane, root mean square,
-    become one, in the unit of the cloud: points drawn from a mesh lie exactly on its facets, of
-    which a flat face has several. None: they do not."""
+    """After growth, regions that touch become one when they lie within this root mean square
+    distance of one plane, in the unit of the cloud. It is for points drawn from a mesh, which lie
+    exactly on its facets, of which a flat face has several. None: they stay apart."""
     max_plane_residual: float | None = None
-    """After growth, points farther from the plane of their region than this many times its
-    thickness lose their label. None: they keep it."""
+    """After growth, a point loses its label when it is farther from the plane of its region than
+    this many times the thickness of the region. None: it keeps the label."""
     absorb: bool = False
-    """Whether points without a region, those of regions that are too small included, then join a
-    flat region that they touch and whose plane they are on."""
+    """Whether points without a region, and those of regions that are too small, join a flat region
+    that they touch and whose plane they are on."""
     absorb_reach: float = 3.0
-    """They are on it when they are within this many times its thickness."""
+    """With absorb, a point is on the plane of a region when it is within this many times the
+    thickness of the region."""
     absorb_angle_deg: float = 45.0
-    """And when their normal is within this angle of the plane's."""
+    """With absorb, a point joins only if its normal is within this angle of the normal of the
+    plane."""
     refine_borders: bool = False
-    """Whether points where regions touch then go to the one that explains them best: of two planes
-    within reach by the line in which these meet. Only with ``absorb``. Most of all in faces a few
-    centimetres wide."""
+    """Whether points where regions touch go to the region that explains them best. Between two
+    planes within reach, the line in which they meet decides. It needs absorb, and matters most for
+    faces a few centimetres wide."""
     merge_coplanar: bool = False
-    """Whether regions that touch and lie on one plane then become one, those included that lie
-    within the noise of a larger one, as the residuals of the normals tell it."""
+    """Whether regions that touch and lie on one plane become one. A region within the noise of a
+    larger one, as the residuals of the normals tell it, is included."""
     merge_tolerance: float = 1.2
-    """They lie on one plane when neither is thicker about it than this many times what it is about
-    its own."""
+    """With merge_coplanar, two regions lie on one plane when neither is thicker about it than this
+    many times its thickness about its own plane."""
 
     def __post_init__(self) -> None:
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
@@ -154,9 +164,10 @@ class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Axis that points up: planes are then floor, ceiling, wall or other. None: not told apart."""
+    """Axis that points up. With it the table calls each plane a floor, ceiling, wall or other.
+    None: planes are not told apart."""
     outline: bool = False
-    """Whether to trace the outline of each plane; needs shapely."""
+    """Whether the outline of each plane is traced; this needs shapely."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +179,8 @@ class PipelineConfig:
     growing: GrowingConfig = field(default_factory=GrowingConfig)
     """How regions grow."""
     chunk_size: int = CHUNK_SIZE
-    """Points handled at a time; bounds the memory of each stage, never changes a result."""
+    """Number of points that are handled at a time. It bounds the memory of each stage and never
+    changes a result."""
     planes: PlanesConfig = field(default_factory=PlanesConfig)
     """What the table of planes says."""
 
@@ -181,23 +193,23 @@ class SuperpointsConfig:
     """How a cloud is partitioned; see :func:`torchrg.make_superpoints`."""
 
     strengths: tuple[float, ...] = (0.5, 1.5, 4.0, 12.0)
-    """Strength of regularisation of each level, ascending: a region merges with one beside it when
-    that costs at most this, in points of opposite sides of a right angle. Twice the strength leaves
-    about 0.6 times the superpoints."""
+    """Strength of regularisation of each level, ascending. A region merges with one beside it when
+    that costs at most this, counted in points of opposite sides of a right angle. Twice the
+    strength leaves about 0.6 times the superpoints."""
     counts: tuple[int, ...] | None = None
-    """Number of superpoints of each level, descending, in place of strengths. Fewer are found where
-    the cloud has not so many connected parts of the minimum size, and more where more of its parts
-    do not touch. None: strengths decide."""
+    """Number of superpoints of each level, descending, in place of strengths. A cloud with fewer
+    connected parts of the minimum size gives fewer, and one with more parts that do not touch gives
+    more. None: strengths decide."""
     min_size: int = 10
-    """Smaller superpoints join the neighbour that it costs least, in distinct points."""
+    """A superpoint of fewer distinct points joins the neighbour to which that costs least."""
     planes: Literal["pieces", "whole"] = "pieces"
-    """Planes enter as compact pieces, which merge again unless objects meet in the plane, or whole,
-    and are never cut."""
+    """How planes enter: as compact pieces, which merge again unless objects meet in the plane
+    (pieces), or as they are, never cut (whole)."""
     max_extent: float | None = None
-    """Longest side of the box around a superpoint, in the unit of the cloud; whole planes may have
+    """Longest side of the box around a superpoint, in the unit of the cloud. Whole planes may have
     longer ones. None: no limit."""
     color_weight: float = 3.0
-    """What a squared difference of colours in [0, 1] counts, against one of unit normals."""
+    """Weight of a squared difference of colours in [0, 1], against one of unit normals."""
 
     def __post_init__(self) -> None:
         is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths, math.inf)
@@ -226,24 +238,24 @@ class DepthConfig:
     """How planes are found in depth images; see :func:`torchrg.depth.segment_depth`."""
 
     noise: tuple[float, float] | None = None
-    """Noise of the sensor: two numbers a and b, for a standard deviation of a + b z^2 at depth z,
+    """Noise of the sensor, as two numbers a and b for a standard deviation of a + b z^2 at depth z,
     in the unit of the depth. None: estimated from each image."""
     max_depth: float | None = None
-    """Depth beyond this is left out, in the unit of the depth. None: all is used."""
+    """Pixels beyond this depth are left out, in the unit of the depth. None: all are used."""
     max_angle_deg: float = 8.0
-    """A pixel joins the region of the next one when the angle between their normals is at most
-    this."""
+    """A pixel joins the region of the pixel beside it when the angle between their normals is at
+    most this."""
     max_step: float = 1.5
-    """And when the planes of the two differ at either by at most this many standard deviations of
-    the noise."""
+    """A pixel joins the region of the pixel beside it only if the planes of the two differ at
+    either by at most this many standard deviations of the noise."""
     min_size: int = 100
-    """Smaller regions are not labelled, in pixels."""
+    """Regions of fewer pixels are not labelled."""
     absorb_reach: float = 3.0
-    """Pixels at borders join the flat region beside them when they are within this many standard
-    deviations of its plane."""
+    """A pixel at a border joins the flat region beside it when it is within this many standard
+    deviations of the noise of the plane of that region."""
     merge_tolerance: float = 1.2
-    """Flat regions that touch become one when one plane explains both: neither is farther from it
-    than this many times what it is from its own."""
+    """Flat regions that touch become one when one plane explains both, that is when neither is
+    farther from it than this many times its distance from its own plane."""
 
     def __post_init__(self) -> None:
         parts = (1.0,) if self.noise is None else self.noise

@@ -107,8 +107,24 @@ def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tm
 
 def test_a_dry_run_writes_nothing(rooms, tmp_path, capsys):
     assert convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*") == 0
-    assert "1 scans to convert" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "1 scans to convert" in shown
+    assert "disk: about 0.000 GB of " in shown
+    assert "memory: about 0.5 GB for 1 at a time" in shown
+    assert "time: about 1 min on this machine" in shown
     assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_looks_at_the_disk(rooms, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("torchrg.io.files.free_space", lambda _: 1000)
+    assert convert("folder", rooms, tmp_path / "out", "--dry-run") == 2
+    assert "expected 0.2 MB of free disk for 2 scans, got 0.0 MB" in capsys.readouterr().err
+
+
+def test_a_finished_set_has_nothing_to_do(rooms, converted, capsys):
+    for flags in ([], ["--dry-run"]):
+        assert convert("folder", rooms, converted, *flags) == 0
+        assert "nothing to do\n" in capsys.readouterr().out
 
 
 def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, capsys, monkeypatch):

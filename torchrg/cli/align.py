@@ -28,20 +28,25 @@ class Arguments:
     """Set scans upright, with walls along x and y, the lowest floor at z = 0, the middle at 0, 0.
 
     The planes of the scan say where floors and walls are; settings are those of torchrg segment.
+
+    Examples:
+        torchrg align scan.ply --out upright.ply
+        torchrg align scan.ply --out upright.npz --segment --matrix motion.npy
+        torchrg align scan.ply --out upright.ply --up 0 -1 0
     """
 
     inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     matrix: Path | None = None
-    """Also write the motion: .npy holds it as 4 x 4 numbers, .txt as the line axisAlignment of
-    ScanNet. For one input."""
+    """File for the motion of the scan, of one input: .npy holds it as 4 x 4 numbers, .txt as the
+    line axisAlignment of ScanNet."""
     segment: bool = False
     """Write labels, normals, curvature and the table of planes too, as torchrg segment does."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Where up is in the input, to within 30 degrees."""
+    """Direction that points up in the input, to within 30 degrees."""
     threads: int | None = None
-    """Threads to use. Default: as torch decides, usually one a core."""
+    """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 

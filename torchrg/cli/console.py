@@ -21,6 +21,7 @@ from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
 from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
 from torchrg.cli.ending import fail as fail
 from torchrg.cli.ending import warn as warn
+from torchrg.cli.help import format_help
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
@@ -55,6 +56,9 @@ def parse(
     Raises:
         ConfigError: If an argument is wrong, as one line.
     """
+    if not {"-h", "--help"}.isdisjoint(arguments):
+        print(format_help(kind, prog=prog, default=default))
+        raise SystemExit(0)
     stderr = io.StringIO()
     options: dict[str, Any] = {} if default is None else {"default": default}
     try:
@@ -89,10 +93,10 @@ class PlaneSettings:
     """How planes are found: what the preset or the file says, where no flag says otherwise."""
 
     preset: str = DEFAULT_PRESET
-    """Settings to start from: classic, detmm, paper, consensus, or those for a kind of data: s3dis,
-    scannet, laser, rgbd."""
+    """Settings to start from: those of a method (classic, detmm, paper, consensus), or those for a
+    kind of data (s3dis, scannet, laser, rgbd). Flags change them one by one."""
     config: Path | None = None
-    """YAML file with settings that differ from the defaults; replaces the preset."""
+    """YAML file with settings, in place of a preset; what it does not name has its default."""
     resolved: Annotated[PipelineConfig, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=PipelineConfig
     )
@@ -119,8 +123,9 @@ CloudsFlag = Annotated[
     tuple[Path, ...],
     tyro.conf.Positional,
     tyro.conf.arg(
-        help=f"Clouds to read: {' '.join(FORMATS)}. Depth images and organised clouds taken as "
-        "such: see torchrg depth --help."
+        metavar="CLOUD",
+        help=f"Clouds to read, files that end in {' '.join(FORMATS)}. For depth images, and for "
+        "organised clouds taken as images, there is torchrg depth.",
     ),
 ]
 """Type of the argument that names clouds."""

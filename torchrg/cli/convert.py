@@ -1,6 +1,7 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 from tqdm import tqdm
 
+from torchrg.batch.costs import estimate_costs
 from torchrg.batch.local import run_local
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import spare_memory
@@ -35,7 +37,7 @@ from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
-from torchrg.io.files import check_place, make_folder
+from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import read_result
@@ -48,22 +50,23 @@ MOST_ROWS = 300
 class Arguments:
     """What every kind of data set has."""
 
-    root: Annotated[Path, tyro.conf.Positional]
+    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
     """Directory of the data set. It is only read."""
-    out: Annotated[Path, tyro.conf.Positional]
-    """Directory for the results, a folder for each scan; it is made. What is done there already is
-    not done again."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Directory for the results, with a folder for each scan. It is made where there is none, and
+    what is done there already is not done again."""
     workers: int | None = None
-    """Scans at a time. Default: one for each core; on a cluster, as many as it takes."""
+    """Number of scans at a time. Default: one for each core; on a cluster, as many as fit."""
     engine: Literal["local", "ray"] = "local"
-    """Processes of this machine, or tasks on Ray (pip install 'torchrg[ray]')."""
+    """Where scans are worked on: in processes of this machine (local), or as tasks of a Ray cluster
+    (ray; pip install 'torchrg[ray]')."""
     ray_address: str | None = None
-    """Ray cluster to use, "auto" for the one of this machine; every node sees both directories
-    under these paths. Default: one that is started for the time of the command."""
+    """Address of the Ray cluster, "auto" for the one of this machine. Every node has to see ROOT
+    and OUT under the same paths. Default: a cluster that is started for the command."""
     limit_memory: float | None = None
-    """Gigabytes that all scans at a time may take. Default: 80 % of what is free."""
+    """Gigabytes of memory that all scans at a time may take. Default: 80 % of what is free."""
     only: str | None = None
-    """Convert the scans whose names match, as in a shell: "Area_5/*"."""
+    """Pattern for the names of the scans to convert, as in a shell: "Area_5/*"."""
     force: bool = False
     """Convert what is done already, too."""
     dry_run: bool = False
@@ -112,6 +115,10 @@ class FolderArguments(CloudArguments):
     Clouds are files of --suffixes and folders in Pointcept's layout; with ROOT for OUT, the latter
     are completed in place. The results of ROOT/a/b.ply are in OUT/a/b. Links are followed, and each
     file is converted once.
+
+    Examples:
+        torchrg convert folder scans results --dry-run
+        torchrg convert folder scans results --workers 4 --pages pages
     """
 
     columns: console.ColumnsFlag = None
@@ -137,6 +144,11 @@ class S3DISArguments(CloudArguments):
     """Convert S3DIS as it is released into Pointcept's layout, with normals and planes.
 
     Settings are those of the preset s3dis unless told otherwise.
+
+    Examples:
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --dry-run
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --workers 4 --superpoint
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --areas 5 --pages pages
     """
 
     areas: tuple[int, ...] = ()
@@ -159,6 +171,10 @@ class ScanNetArguments(CloudArguments):
     the data set in ROOT, ROOT/splits or ROOT/meta_data. segment200 needs the table
     scannetv2-labels.combined.tsv there; labels of ScanNet++ need its metadata. Settings are those
     of the preset scannet unless told otherwise.
+
+    Examples:
+        torchrg convert scannet scans scannet --dry-run
+        torchrg convert scannet scans superpoints --layout mmdet3d --workers 4
     """
 
     usual_preset: ClassVar[str] = "scannet"
@@ -170,12 +186,17 @@ class ScanNetArguments(CloudArguments):
 
 @dataclass(frozen=True)
 class RGBDArguments(Arguments):
-    """Convert depth frames: normals, curvature and plane labels as images, a table of planes."""
+    """Convert depth frames: normals, curvature and plane labels as images, a table of planes.
+
+    Examples:
+        torchrg convert rgbd frames results --intrinsics 525,525,319.5,239.5 --depth-scale 1000
+        torchrg convert rgbd rgbd_dataset_freiburg1_xyz results --layout tum
+    """
 
     layout: Literal["tum", "icl-nuim", "scannet", "7-scenes", "images"] = "images"
-    """Shape of the folder; images are all .png and .npy below it, of one camera."""
+    """Data set whose folders ROOT has; images are all .png and .npy below it, of one camera."""
     intrinsics: str | None = None
-    """fx,fy,cx,cy of the camera in pixels. Default: those of the layout; images have none."""
+    """Camera, as fx,fy,cx,cy in pixels. Default: that of the layout; images have none."""
     depth_scale: float | None = None
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
@@ -228,7 +249,9 @@ def run(argv: list[str]) -> int:
     with console.warnings_as_lines():
         jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)
     if arguments.dry_run:
-        print(format_plan(_look_at(jobs, arguments)))
+        plan = _look_at(jobs, arguments)
+        print(format_plan(plan), _say_costs(plan, out, arguments), sep="\n")
+        check_room(plan)
         return 0
     make_folder(out)
     check_place(out / REPORT)
@@ -274,9 +297,7 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
     check_room(plan)
-    given = arguments.limit_memory
-    limit = spare_memory() if given is None else int(given * 1e9)
-    jobs, workers = plan.to_convert, arguments.workers
+    jobs, (workers, limit) = plan.to_convert, _workers_and_memory(arguments)
     for job in jobs:
         if job.memory > limit:
             console.warn(
@@ -317,7 +338,10 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     """Write and print the report, and return the exit code."""
-    print(format_report(report, unit=unit))
+    if report.with_status("kept") == list(report.scans):
+        print("nothing to do")
+    else:
+        print(format_report(report, unit=unit))
     for scan in report.scans:
         tell_failure(scan)
     try:
@@ -336,11 +360,36 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
 
 def format_plan(plan: Plan) -> str:
     """Return what a plan would do: a row for each scan that is to be converted."""
+    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
+    if not plan.to_convert:
+        return sums
     rows = [
         [job.name, plan.reasons[job.name], f"{job.scan.num_points:,}"] for job in plan.to_convert
     ]
-    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
     return "\n".join([console.format_table(["scan", "why", "points (about)"], rows), sums])
+
+
+def _say_costs(plan: Plan, out: Path, arguments: Arguments) -> str:
+    """Return what a plan would take, in words, or that there is nothing to do."""
+    if not plan.to_convert:
+        return "nothing to do"
+    workers, limit = _workers_and_memory(arguments)
+    costs = estimate_costs(plan, workers=workers or console.num_cores(), limit=limit)
+    minutes = math.ceil(costs.seconds / 60)
+    spent = f"{minutes / 60:,.1f} hours" if minutes > 90 else f"{minutes} min"
+    free = free_space(out) / 1e9
+    return (
+        f"disk: about {costs.disk / 1e9:,.3f} GB of {free:,.1f} that are free\n"
+        f"memory: about {costs.memory / 1e9:,.1f} GB for {costs.workers} at a time, "
+        f"within {limit / 1e9:,.1f}\n"
+        f"time: about {spent} on this machine, if it does nothing else"
+    )
+
+
+def _workers_and_memory(arguments: Arguments) -> tuple[int | None, int]:
+    """Return how many scans may run at a time, and the bytes that they may take."""
+    given = arguments.limit_memory
+    return arguments.workers, spare_memory() if given is None else int(given * 1e9)
 
 
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:

@@ -55,28 +55,33 @@ class Arguments:
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
     beside it, or as a cloud in camera coordinates. Frames of a sequence are labelled side by side,
     and those that are done already are not done again.
+
+    Examples:
+        torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
+        torchrg depth frames --intrinsics 525,525,319.5,239.5 --depth-scale 5000 --out labels
+        torchrg depth kinect.pcd --out planes.ply
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
     """Depth images (.png of 16 bits, .npy), organised clouds (.pcd), or folders of these."""
     out: Path
-    """File to write: .png, or a cloud by its suffix; for several inputs a directory of .png."""
+    """File to write, .png for labels or a cloud by its suffix; for several inputs a directory."""
     intrinsics: str | None = None
-    """Camera of the depth images: fx,fy,cx,cy in pixels; the middle of the first one is 0,0.
-    Default: for organised clouds, found from the points."""
+    """Camera of the depth images, as fx,fy,cx,cy in pixels, where the middle of the first pixel is
+    0,0. Default: found from the points, for organised clouds."""
     depth_scale: float | None = None
-    """Stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for metres."""
+    """Stored value of one metre: 1000 for depth in millimetres, 5000 for TUM, 1 for metres."""
     picture: Path | None = None
-    """Coloured picture, a .png file; for several inputs a directory. Default: beside labels that
-    are written as .png, with _planes in its name."""
+    """Place of the coloured picture, a .png file; for several inputs a directory. Default: beside
+    labels that are written as .png, with _planes in its name."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found."""
     workers: int | None = None
-    """Processes of one thread each that label frames side by side. Default: one for each core, as
-    far as there are eight frames for each."""
+    """Number of processes of one thread each that label frames side by side. Default: one for each
+    core, as far as there are eight frames for each."""
     threads: int | None = None
-    """Threads to use where there is no second process. Default: as torch decides, usually one a
-    core."""
+    """Number of threads where there is no second process. Default: as torch decides, usually one
+    for each core."""
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,14 @@ millimetres at a thousand kilometres."""
 
 @dataclass(frozen=True)
 class Arguments:
-    """Say what a file holds: points, extent, spacing, duplicates, fields."""
+    """Say what a file holds: points, extent, spacing, duplicates, fields.
 
-    file: Annotated[Path, tyro.conf.Positional]
+    Examples:
+        torchrg info scan.ply
+        torchrg info scan.txt --columns x,y,z,intensity
+    """
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Cloud to read."""
     columns: ColumnsFlag = None
 

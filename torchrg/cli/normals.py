@@ -26,24 +26,32 @@ RESULTS = ("normals", "curvature", "sharp", "valid")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Estimate normals and curvature of scans, and tell sharp feature points."""
+    """Estimate normals and curvature of scans, and tell sharp feature points.
+
+    Examples:
+        torchrg normals scan.pcd --out normals.ply
+        torchrg normals scan.ply --out normals.ply --orient interior
+        torchrg normals scan.ply --out normals.npz --method pca --normals.k 30
+        torchrg normals scan.e57 --out normals.e57 --orient viewpoint --viewpoint 0 0 1.6
+    """
 
     inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     method: NormalMethod | None = None
-    """Estimator; short for --normals.method."""
+    """Estimator of the normals, a short form of --normals.method."""
     orient: Orientation | Literal["none"] = "none"
-    """How to choose the sign of each normal: towards the viewpoint or along an axis, so that
+    """How the sign of each normal is chosen: towards the viewpoint or along an axis, so that
     neighbours agree (consistent), or into the free space of rooms (interior)."""
     viewpoint: tuple[float, float, float] | None = None
-    """Where the scanner stood, in the coordinates of the input; for --orient viewpoint."""
+    """Place of the scanner in the coordinates of the input, for --orient viewpoint."""
     normals: NormalsConfig = dataclasses.field(default_factory=lambda: load_config().normals)
     """How normals and curvature are estimated."""
     chunk_size: int = PipelineConfig.chunk_size
-    """Points handled at a time; bounds memory, never changes a result."""
+    """Number of points that are handled at a time. It bounds the memory and never changes a
+    result."""
     threads: int | None = None
-    """Threads to use. Default: as torch decides, usually one a core."""
+    """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None
 
 

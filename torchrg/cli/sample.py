@@ -14,9 +14,14 @@ from torchrg.structures import Cloud
 
 @dataclass(frozen=True)
 class Arguments:
-    """Make a furnished room with exact labels and normals; the same seed gives the same room."""
+    """Make a furnished room with exact labels and normals; the same seed gives the same room.
 
-    out: Annotated[Path, tyro.conf.Positional]
+    Examples:
+        torchrg sample room.npz
+        torchrg sample room.ply --num-points 1000000 --noise 0.005 --seed 7
+    """
+
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """File to write, its format by suffix."""
     num_points: int = 100_000
     """Number of points."""

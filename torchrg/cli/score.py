@@ -55,12 +55,17 @@ class Arguments:
 
     Two scans, or two folders: then scans of the same name are compared, and the mean over them is
     printed below. A scan is a file, or a folder as torchrg convert writes it.
+
+    Examples:
+        torchrg score planes.npz room.npz
+        torchrg score planes.npz truth.ply --match nearest --json
+        torchrg score results truth --csv scores.csv
     """
 
-    predicted: Annotated[Path, tyro.conf.Positional]
+    predicted: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PREDICTED")]
     """Scan with labels or normals, as torchrg segment and convert write it, or a folder of
     such."""
-    truth: Annotated[Path, tyro.conf.Positional]
+    truth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRUTH")]
     """File with the true labels or normals, or a folder with such a file for each result."""
     match: Literal["rows", "nearest"] = "rows"
     """Which points are compared: those of one row, which must be the same, or each point of the
@@ -306,6 +311,4 @@ def _print_scans(scans: dict[str, Scores]) -> None:
 
 def _spelled(value: float | None) -> str:
     """Return a number with four places at most."""
-    if value is None:
-        return "none"
-    return f"{value:.4f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+    return "none" if value is None else f"{value:.4f}".rstrip("0").rstrip(".")

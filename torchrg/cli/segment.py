@@ -62,49 +62,58 @@ IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 class Arguments:
     """Label the planes of scans, and write labels, normals, curvature and a table of planes.
 
-    Settings come from the preset, then from --config, then from the flags given here.
+    Settings come from the preset or the file of --config, then from the flags given here. The
+    result holds a label for each point, -1 where it is on no plane.
+
+    Examples:
+        torchrg segment scan.pcd --out planes.npz
+        torchrg segment scan.laz --out planes.laz --preset laser --picture planes.png
+        torchrg segment *.ply --out results --picture pictures --pages
+        torchrg segment part1.e57 part2.e57 --merge --out hall.npz --voxel 0.02
+        torchrg segment scan.ply --out parts.npz --superpoints 1000,300
     """
 
     inputs: console.CloudsFlag
     out: Path
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
-    """Picture of the planes to write too, a .png file, or page, a .html file; for several inputs a
-    directory of pictures. Of a cloud in tiles both show a sample of the points."""
+    """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
+    inputs a directory of pictures. Of a cloud in tiles both show a sample of the points."""
     pages: bool = False
-    """Beside each picture in the directory write a page for the browser to turn the cloud in, and
-    index.html, in which the pictures link to their pages (pip install 'torchrg[view]')."""
+    """Write a page for the browser beside each picture in the directory of --picture, and
+    index.html, in which each picture links to its page (pip install 'torchrg[view]')."""
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
     superpoints: bool = False
-    """Add superpoints, a partition of all points: the finest as "superpoints", the coarser ones as
-    "superpoints_1" and so on. Numbers say how many of each: --superpoints 1000,300. The picture
-    shows them instead of the planes. Colours of the cloud play a part."""
+    """Add superpoints, a partition of all points, to the result: the finest as "superpoints", the
+    coarser ones as "superpoints_1" and so on. Numbers say how many there are in each, as in
+    --superpoints 1000,300. Colours of the cloud play a part, and a picture shows superpoints
+    instead of planes."""
     level: int = 0
     """Which level of the superpoints --layout takes, 0 the finest."""
     layout: console.Layout | None = None
-    """Write the files of other programs into the directory OUT instead, as torchrg convert
-    --layout; superpoints are added. Of a tree of scans, convert keeps their labels too."""
+    """Write the files of other programs into the directory OUT instead of one result, as torchrg
+    convert --layout does. Superpoints are added then."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: int | None = None
-    """Threads to use. Default: as torch decides, usually one a core."""
+    """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None
     merge: bool = False
     """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
     limit_memory: float | None = None
-    """Gigabytes that a cloud may take. One that would take more is segmented in tiles on disk, with
-    the same result. Default: half of what is free."""
+    """Gigabytes of memory that a cloud may take. One that would take more is segmented in tiles on
+    disk, with the same result. Default: half of what is free."""
     workdir: Path | None = None
-    """Directory in which such a cloud has a folder for the work on it, some 500 bytes a point,
-    removed when the result is written. A command that ended early goes on from there. Default: the
-    folder is beside the result."""
+    """Directory for the tiles of a cloud that is too large for memory, some 500 bytes a point. They
+    are removed when the result is written; a command that ended early goes on from them. Default:
+    the directory of the result."""
     engine: Literal["local", "ray"] = "local"
-    """Where tiles are worked on: in this process, or as tasks on Ray (pip install
-    'torchrg[ray]')."""
+    """Where tiles are worked on: on this machine (local), or as tasks of a Ray cluster (ray; pip
+    install 'torchrg[ray]')."""
     ray_address: str | None = None
-    """Ray cluster to use, "auto" for the one of this machine; every node sees the working directory
-    under its path. Default: one that is started for the time of the command."""
+    """Address of the Ray cluster, "auto" for the one of this machine. Every node has to see the
+    working directory under the same path. Default: a cluster that is started for the command."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 

@@ -43,24 +43,32 @@ Direction = tuple[float, float, float]
 class Arguments:
     """Draw a cloud, coloured by its planes if it has labels.
 
-    As a PNG file, or as a page for the browser: to turn the cloud, point at planes, and compare.
+    A picture is a PNG file. A page for the browser lets one turn the cloud, point at planes, and
+    compare two results.
+
+    Examples:
+        torchrg view planes.npz --out planes.png
+        torchrg view planes.npz --out planes.html
+        torchrg view planes.npz --out compared.html --beside other.npz --truth room.npz
+        torchrg view scan.ply --out normals.png --color normal --view above
     """
 
-    file: Annotated[Path, tyro.conf.Positional]
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Cloud or result to read."""
     out: Path
-    """Picture to write, a .png file, or page, a .html file (pip install 'torchrg[view]'). A page is
-    one file that opens without a network."""
+    """Picture (.png) or page (.html; pip install 'torchrg[view]') to write. A page is one file that
+    opens without a network."""
     color: PageColorBy | None = None
     """What the colours show, at first on a page, where they can be switched. Default: the planes,
     or the first thing that the file has. Errors need --truth, and a page."""
     view: Literal["cutaway", "above", "outside", "sensor"] = "cutaway"
-    """From outside without ceiling and near walls, from above without ceiling, from outside with
-    everything, or from the origin along z as a depth camera sees it."""
+    """Where the picture is taken from: from outside without ceiling and near walls (cutaway), from
+    above without ceiling (above), from outside with everything (outside), or from the origin along
+    z as a depth camera sees it (sensor)."""
     up: Axis | None = None
     """Axis that points up. Default: z; -y with --view sensor."""
     azimuth_deg: float | None = None
-    """Direction to look from, about the up axis. Default: the one that shows most."""
+    """Angle about the up axis from which to look, in degrees. Default: the one that shows most."""
     width: int = 1600
     """Width in pixels of a picture."""
     beside: Path | None = None

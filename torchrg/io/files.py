@@ -171,13 +171,18 @@ def is_disk_full(error: BaseException | None) -> bool:
     return False
 
 
+def free_space(folder: Path) -> int:
+    """Return the free bytes of the disk on which a folder is, or would be made."""
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    return shutil.disk_usage(existing).free
+
+
 def check_space(folder: Path, needed: int, what: str, *, repair: str = "") -> None:
     """Raise FormatError if the disk of a folder, which need not exist, has not so many bytes free.
 
     ``what`` takes the bytes; ``repair`` is a way out beside more room and another directory.
     """
-    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    free = shutil.disk_usage(existing).free
+    free = free_space(folder)
     if needed > free:
         ways = ["make room", "choose another directory", *([repair] if repair else [])]
         raise FormatError(
