@@ -226,7 +226,7 @@ def segment_planes(
         [400]
     """
     if isinstance(points, Tensor | np.ndarray):
-        points = as_tensor("segment_planes", "points", points)
+        points = as_tensor("segment_planes", "points", points).detach()
         check_shapes("segment_planes", points=(points, "N 3"))
         check_floating("segment_planes", points=points)
     config = load_config() if config is None else config
@@ -308,7 +308,7 @@ def make_superpoints(
         >>> found.labels.unique(return_counts=True)[1].tolist(), found.plane.tolist()
         ([200, 200], [0, 1])
     """
-    tensor = as_tensor("make_superpoints", "points", points)
+    tensor = as_tensor("make_superpoints", "points", points).detach()
     check_shapes("make_superpoints", points=(tensor, "N 3"))
     check_floating("make_superpoints", points=tensor)
     shades = None if colors is None else as_tensor("make_superpoints", "colors", colors)

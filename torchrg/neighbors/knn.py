@@ -270,6 +270,9 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
         [[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]]
     """
     flat = indices.reshape(-1)
+    if points.requires_grad and torch.is_grad_enabled():
+        found = points.index_select(0, flat).view(*indices.shape, 3)
+        return found - found[:, :1]
     patches = points.new_empty((3, *indices.shape))
     for axis in range(3):
         column = points[:, axis].index_select(0, flat).view(indices.shape)
