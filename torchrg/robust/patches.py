@@ -11,7 +11,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._opaque import Arguments, opaque
 from torchrg._parallel import map_chunks
 from torchrg.errors import ConfigError
-from torchrg.linalg import flatness_tolerance, smallest_normal
+from torchrg.linalg import flatness_tolerance, second_moments, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     columns_of_points,
@@ -159,7 +159,8 @@ def _with_gradients(fit: RobustFit, patches: Tensor, weights: Tensor) -> RobustF
     shares = (weights / torch.where(total > 0, total, 1.0))[..., None]
     points = torch.where(shares > 0, patches, 0.0)
     mean = (shares * points).sum(dim=-2, keepdim=True)
-    scatter = (shares * (points - mean)).mT @ (points - mean)
+    offsets = (points - mean).unbind(dim=-1)
+    scatter = second_moments(offsets, shares.squeeze(-1))
     size, own = (
         m.detach().diagonal(dim1=-2, dim2=-1).sum(dim=-1) for m in (fit.covariance, scatter)
     )
