@@ -5,8 +5,10 @@ from functools import partial
 import pytest
 import torch
 from torch import nn
+from torch._dynamo.testing import CompileCounter
 
-from torchrg.errors import ConfigError
+from torchrg import estimate_normals, search_knn, segment_planes
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import covariance, eigh3
 from torchrg.normals import fit_normals_irls, fit_normals_jet, fit_normals_pca, fit_normals_robust
 from torchrg.robust import (
@@ -20,6 +22,7 @@ from torchrg.robust import (
     qn,
     tau,
 )
+from torchrg.transforms import EstimateNormals, SegmentPlanes
 
 
 def normals_of(fit, **settings):
@@ -200,3 +203,50 @@ def test_second_derivatives_of_opaque_functions_are_refused(patches):
     hessian = torch.func.jacrev(torch.func.jacrev(lambda x: qn(x)))
     with pytest.raises(NotImplementedError, match="scale_of_rows: has no second derivatives"):
         hessian(patches[0, :, 0])
+
+
+class Model(nn.Module):
+    """A model with a function of clouds in its middle."""
+
+    def __init__(self, middle):
+        super().__init__()
+        torch.manual_seed(0)
+        self.before, self.middle, self.after = nn.Linear(3, 3), middle, nn.Linear(3, 3)
+
+    def forward(self, points):
+        return self.after(self.middle(self.before(points)))
+
+
+NORMALS, PLANES = EstimateNormals(method="pca", k=8), SegmentPlanes("classic")
+MIDDLES = {
+    "estimate_normals": lambda points: estimate_normals(points, method="pca", k=8).normals,
+    "EstimateNormals": lambda points: EstimateNormals(method="pca", k=8)({"coord": points})[
+        "normal"
+    ],
+    "segment_planes": lambda points: points * (segment_planes(points).labels[:, None] + 1),
+    "SegmentPlanes": lambda points: PLANES({"coord": points})["normal"],
+    "search_knn": lambda points: points[search_knn(points, 3).indices[:, 2]],
+}
+
+
+# Torch's own, when a graph goes on with a tensor in its middle.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")
+@pytest.mark.parametrize("name", MIDDLES)
+def test_functions_of_clouds_break_a_graph_and_the_rest_is_compiled(name):
+    model, points = (
+        Model(MIDDLES[name]),
+        torch.rand(40, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    counter = CompileCounter()
+    found = torch.compile(model, backend=counter)(points)
+    assert torch.equal(found, model(points))
+    found.sum().backward()
+    # One graph before and one behind, with a Linear each.
+    assert counter.frame_count >= 2
+    assert model.before.weight.grad is None or model.before.weight.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("call", [torch.vmap, torch.func.grad, torch.func.jacrev])
+def test_functions_of_clouds_say_where_they_do_not_run(call):
+    with pytest.raises(ShapeError, match="estimate_normals: expected points with values, got"):
+        call(lambda points: estimate_normals(points).normals.sum())(torch.rand(2, 9, 3))

@@ -265,7 +265,7 @@ def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int
     active = apq != 0
     tau = (a[q][q] - a[p][p]) / (2 * torch.where(active, apq, 1.0))
     # tau may overflow to infinity for a negligible apq; then t = 0, as it should be.
-    t = torch.where(tau >= 0, 1.0, -1.0) / (tau.abs() + (1 + tau * tau).sqrt())
+    t = torch.where(tau >= 0, 1.0, -1.0).to(tau.dtype) / (tau.abs() + (1 + tau * tau).sqrt())
     t = torch.where(active, t, 0.0)
     c = 1 / (1 + t * t).sqrt()
     s = t * c

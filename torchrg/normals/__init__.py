@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_points
+from torchrg._opaque import of_clouds
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
@@ -72,6 +73,7 @@ noise of a region there are :data:`torchrg.normals.consensus.constants.REGIONAL_
 see :func:`torchrg.normals.consensus.wanted_neighbors`."""
 
 
+@of_clouds
 @sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],
@@ -119,8 +121,7 @@ def estimate_normals(
         tensor([0., 0., 1.])
     """
     tensor = as_tensor("estimate_normals", "points", points)
-    check_shapes("estimate_normals", points=(tensor, "N 3"))
-    check_floating("estimate_normals", points=tensor)
+    check_points("estimate_normals", tensor)
     settings = config or NormalsConfig()
     changes = {"method": method, "k": k}
     given = {name: value for name, value in changes.items() if value is not None}
