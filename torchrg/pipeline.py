@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_points, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_points, check_shapes
 from torchrg._opaque import of_clouds
 from torchrg._parallel import sequential_operations
 from torchrg.config import (
@@ -372,7 +372,7 @@ def segment_mesh(
         >>> segment_mesh(fold, faces).unique(return_counts=True)[1].tolist()
         [200, 200]
     """
-    tensor = as_tensor("segment_mesh", "vertices", vertices)
+    tensor = as_tensor("segment_mesh", "vertices", vertices).detach()
     check_shapes("segment_mesh", vertices=(tensor, "V 3"))
     check_floating("segment_mesh", vertices=tensor)
     corners = None if faces is None else as_tensor("segment_mesh", "faces", faces)
