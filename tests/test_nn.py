@@ -1,17 +1,21 @@
 """Modules give what the functions give."""
 
+from typing import get_args
+
 import pytest
 import torch
+from torch import nn
 
 from torchrg import nn as modules
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance
-from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, qn
+from torchrg.normals import fit_normals_pca
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
 
 
 def test_modules_are_the_functions(rng):
     patches = torch.randn(6, 30, 3, generator=rng)
-    assert torch.equal(modules.Covariance()(patches)[1], covariance(patches)[1])
+    assert torch.equal(modules.Covariance()(patches), covariance(patches)[1])
     assert torch.equal(modules.Qn()(patches[..., 0]), qn(patches[..., 0]))
     corrected = modules.Qn(finite_sample=True)(patches[..., 0])
     assert torch.equal(corrected, qn(patches[..., 0], finite_sample=True))
@@ -23,6 +27,8 @@ def test_modules_are_the_functions(rng):
         (modules.DetMCD, fit_detmcd, {"support_fraction": 0.75, "starts": "robustbase"}),
         (modules.FastMCD, fit_fastmcd, {"num_starts": 20, "quantile": 0.9}),
         (modules.DetMM, fit_detmm, {"quantile": 0.9, "tuned_for": "location"}),
+        (modules.DetS, fit_dets, {"quantile": 0.9, "starts": "planes", "chunk_size": 3}),
+        (modules.MVE, fit_mve, {"num_starts": 20, "chunk_size": 2}),
     ],
 )
 def test_fits_are_those_of_the_functions(rng, module, function, settings):
@@ -41,10 +47,83 @@ def test_both_decompositions_agree(rng):
 
 
 def test_unknown_decomposition_is_refused():
-    with pytest.raises(ConfigError, match="expected method to be jacobi or linalg, got 'svd'"):
+    with pytest.raises(
+        ConfigError, match="expected method to be one of jacobi, linalg, got 'svd'"
+    ):
         modules.Eigh("svd")
 
 
 def test_settings_are_shown():
     assert repr(modules.Qn(finite_sample=True)) == "Qn(dim=-1, finite_sample=True)"
     assert repr(modules.Eigh()) == "Eigh(method='jacobi')"
+
+
+def thin(rng, count=6):
+    patches = torch.randn(count, 20, 3, generator=rng, dtype=torch.float64)
+    return patches * torch.tensor([1.0, 0.8, 0.01])
+
+
+def test_modules_follow_one_another_from_patches_to_normals(rng):
+    patches = thin(rng)
+    expected = fit_normals_pca(patches).normals
+    for eigh in (modules.Eigh(), modules.Eigh("linalg")):
+        found = nn.Sequential(modules.Covariance(), eigh, modules.Normal())(patches)
+        assert torch.allclose((found * expected).sum(-1).abs(), torch.ones(6).double())
+    robust = nn.Sequential(modules.DetMM(), modules.Eigh(), modules.Normal())(patches)
+    assert ((robust * expected).sum(-1).abs() > 0.999).all()
+
+
+def test_a_model_with_them_learns(rng):
+    torch.manual_seed(0)
+    robust = nn.Sequential(modules.DetMCD(starts="planes"), modules.Eigh(), modules.Normal())
+    model = nn.Sequential(nn.Linear(3, 3), robust, nn.Linear(3, 2)).double()
+    model(thin(rng)).square().sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in model.parameters())
+    assert model[0].weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("method", get_args(modules.Method))
+def test_normals_of_patches_by_every_estimator(rng, method):
+    patches, mask = thin(rng), torch.rand(6, 20, generator=rng) < 0.9
+    module = modules.PatchNormals(method, **({"noise": 0.02} if method == "irls" else {}))
+    found = module(patches, mask)
+    assert (found[:, 2].abs() > 0.99).all()
+    assert torch.equal(module.fit(patches, mask).normals, found)
+    leaf = patches.clone().requires_grad_()
+    (module(leaf) ** 2)[:, 0].sum().backward()
+    assert leaf.grad.isfinite().all()
+    assert f"method='{method}'" in repr(module)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: modules.DetMCD(support_fraction=2), "support_fraction from 0.5 to 1, got 2"),
+        (lambda: modules.DetMCD(starts="nope"), "starts to be one of paper, robustbase, planes, m"),
+        (lambda: modules.DetMCD(chunk_size=0), "chunk_size of at least 1, got 0"),
+        (lambda: modules.FastMCD(num_starts=0), "num_starts of at least 1, got 0"),
+        (lambda: modules.MVE(quantile=1.5), "quantile above 0 and below 1, got 1.5"),
+        (lambda: modules.DetS(starts="nope"), "starts to be one of"),
+        (lambda: modules.DetMM(tuned_for="nope"), "tuned_for to be one of shape, location"),
+        (lambda: modules.Qn(dim=0.5), "Qn: expected dim to be a whole number, got 0.5"),
+        (lambda: modules.PatchNormals("svd"), "method to be one of pca, jet, irls, .*, got 'svd'"),
+        (lambda: modules.PatchNormals("irls"), "expected noise > 0 with method='irls'"),
+        (lambda: modules.PatchNormals("detmcd", start="paper"), "unexpected keyword .* 'start'"),
+        (lambda: modules.PatchNormals("detmm", quantile=2), "quantile above 0 and below 1, got 2"),
+    ],
+)
+def test_wrong_settings_are_refused_when_a_module_is_made(make, message):
+    with pytest.raises(ConfigError, match=message) as info:
+        make()
+    assert "\n" not in str(info.value)
+
+
+def test_a_generator_draws_the_starts(rng):
+    patches = thin(rng)
+    for module in (modules.FastMCD(num_starts=1), modules.MVE(num_starts=1)):
+        first, again, other = (
+            module(patches, generator=torch.Generator().manual_seed(seed)).raw_covariance
+            for seed in (1, 1, 2)
+        )
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)

@@ -68,7 +68,15 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
     for name, tensor in given.items():
         if tensor.dtype not in (torch.float32, torch.float64):
             dtype = str(tensor.dtype).removeprefix("torch.")
-            raise ShapeError(f"{caller}: expected {name} of float32 or float64, got {dtype}.")
+            repair = f"; pass {name}.float()" if tensor.is_floating_point() else ""
+            raise ShapeError(
+                f"{caller}: expected {name} of float32 or float64, got {dtype}{repair}."
+            )
+        if tensor.layout is not torch.strided:
+            raise ShapeError(
+                f"{caller}: expected {name} to be dense, got a sparse tensor; pass "
+                f"{name}.to_dense()."
+            )
     for what in ("dtype", "device"):
         kinds = [str(getattr(tensor, what)).removeprefix("torch.") for tensor in given.values()]
         if len(set(kinds)) > 1:
@@ -76,6 +84,27 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
             raise ShapeError(
                 f"{caller}: expected {names} of one {what}, got {' and '.join(kinds)}."
             )
+
+
+def check_points(caller: str, points: Tensor) -> None:
+    """Check that points are those of a cloud, and say what to do with those of an image.
+
+    Raises:
+        ShapeError: If they are not of shape ``(N, 3)`` and float32 or float64.
+
+    Example:
+        >>> check_points("f", torch.zeros(2, 4, 3))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected points of shape (N, 3), got (2, 4, 3); pass ...
+    """
+    if points.ndim == 3 and points.shape[2] == 3:
+        raise ShapeError(
+            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "
+            "of an image to torchrg.transforms.SegmentDepth, or points.reshape(-1, 3)."
+        )
+    check_shapes(caller, points=(points, "N 3"))
+    check_floating(caller, points=points)
 
 
 def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:

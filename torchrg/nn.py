@@ -1,25 +1,62 @@
-"""Module forms of the batched functions; they hold settings and nothing else."""
+"""Module forms of the batched functions: they hold settings, checked when they are made.
 
+A module takes tensors and gives what the next one takes, so that they stand in a
+:class:`torch.nn.Sequential`, and with other modules in a model:
+
+>>> rng = torch.Generator().manual_seed(0)
+>>> patches = torch.randn(8, 30, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.01])
+>>> normals = nn.Sequential(Covariance(), Eigh(), Normal())(patches)
+>>> bool((normals[:, 2].abs() > 0.99).all())
+True
+>>> robust = nn.Sequential(DetMCD(starts="planes"), Eigh(), Normal())
+>>> model = nn.Sequential(robust, nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 2))
+>>> model(patches).shape
+torch.Size([8, 2])
+
+Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, these to :class:`Eigh`, and this to
+:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator. All have gradients, and run
+under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)`` and ``torch.export``.
+"""
+
+from collections.abc import Callable
 from dataclasses import KW_ONLY, asdict, dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from torchrg._checks import check_choices
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance, eigh3
-from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_fastmcd, qn
+from torchrg.normals import (
+    fit_normals_irls,
+    fit_normals_jet,
+    fit_normals_pca,
+    fit_normals_robust,
+)
+from torchrg.robust import (
+    RobustFit,
+    fit_detmcd,
+    fit_detmm,
+    fit_dets,
+    fit_fastmcd,
+    fit_mve,
+    qn,
+)
 from torchrg.robust.mm import Target
 from torchrg.robust.starts import Starts
 from torchrg.robust.weights import Inliers, Scaling
+from torchrg.structures import NormalFit
 
 
 @dataclass(eq=False, repr=False)
 class _Function(nn.Module):
-    """A function whose settings are attributes, the fields of the class, and shown."""
+    """A function whose settings are attributes, the fields of the class, checked and shown."""
 
     def __post_init__(self) -> None:
         super().__init__()
+        # The function of no patches says what is wrong with the settings.
+        self(torch.empty(0, 4, 3))
 
     def extra_repr(self) -> str:
         """Return the settings as text."""
@@ -27,24 +64,36 @@ class _Function(nn.Module):
 
 
 class Covariance(_Function):
-    """Mean and covariance of patches; see :func:`torchrg.linalg.covariance`.
+    """Covariance of patches; their mean is the other result of :func:`torchrg.linalg.covariance`.
 
     Example:
-        >>> Covariance()(torch.tensor([[0.0, 0], [2, 0], [0, 4], [2, 4]]))[1].diagonal()
+        >>> Covariance()(torch.tensor([[0.0, 0], [2, 0], [0, 4], [2, 4]])).diagonal()
         tensor([1., 4.])
     """
 
-    def forward(self, patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return mean and covariance."""
-        return covariance(patches, mask)
+    def forward(self, patches: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Return covariances ``(*, P, P)`` of patches ``(*, K, P)``."""
+        return covariance(patches, mask)[1]
+
+
+class Eigen(NamedTuple):
+    """What :class:`Eigh` gives.
+
+    Attributes:
+        values: Eigenvalues, ascending, shape ``(*, P)``.
+        vectors: Unit eigenvectors as columns, shape ``(*, P, P)``.
+    """
+
+    values: Tensor
+    vectors: Tensor
 
 
 @dataclass(eq=False, repr=False)
 class Eigh(_Function):
-    """Eigenvalues, ascending, and eigenvectors of symmetric matrices.
+    """Eigenvalues, ascending, and eigenvectors of symmetric matrices, or of robust fits.
 
     Example:
-        >>> Eigh()(torch.diag(torch.tensor([3.0, 1.0, 2.0])))[0]
+        >>> Eigh()(torch.diag(torch.tensor([3.0, 1.0, 2.0]))).values
         tensor([1., 2., 3.])
     """
 
@@ -52,16 +101,29 @@ class Eigh(_Function):
     """:func:`torchrg.linalg.eigh3`, fast for many 3x3 matrices, or :func:`torch.linalg.eigh`."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.method not in ("jacobi", "linalg"):
-            raise ConfigError(f"Eigh: expected method to be jacobi or linalg, got {self.method!r}.")
+        check_choices("Eigh", method=(self.method, Literal["jacobi", "linalg"]))
+        nn.Module.__init__(self)
 
-    def forward(self, matrices: Tensor) -> tuple[Tensor, Tensor]:
-        """Return eigenvalues and eigenvectors."""
-        if self.method == "jacobi":
-            return eigh3(matrices)
-        values, vectors = torch.linalg.eigh(matrices)
-        return values, vectors
+    def forward(self, matrices: Tensor | RobustFit) -> Eigen:
+        """Return eigenvalues and eigenvectors of matrices ``(*, P, P)``; P = 3 for ``jacobi``."""
+        given = matrices.covariance if isinstance(matrices, RobustFit) else matrices
+        return Eigen(*(eigh3(given) if self.method == "jacobi" else torch.linalg.eigh(given)))
+
+
+class Normal(_Function):
+    """Unit normal of the plane of each patch: the eigenvector of the smallest eigenvalue.
+
+    Example:
+        >>> Normal()(Eigh()(torch.diag(torch.tensor([3.0, 1.0, 2.0])))).abs()
+        tensor([0., 1., 0.])
+    """
+
+    def __post_init__(self) -> None:
+        nn.Module.__init__(self)
+
+    def forward(self, eigen: Eigen) -> Tensor:
+        """Return normals ``(*, P)``, of arbitrary sign."""
+        return eigen.vectors[..., 0]
 
 
 @dataclass(eq=False, repr=False)
@@ -76,6 +138,11 @@ class Qn(_Function):
     dim: int = -1
     _: KW_ONLY
     finite_sample: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.dim, int) or isinstance(self.dim, bool):
+            raise ConfigError(f"Qn: expected dim to be a whole number, got {self.dim!r}.")
+        nn.Module.__init__(self)
 
     def forward(self, values: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the scale."""
@@ -98,6 +165,7 @@ class DetMCD(_Function):
     small_sample: bool = False
     scaling: Scaling = "consistency"
     inliers: Inliers = "raw"
+    chunk_size: int = 4096
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
@@ -118,6 +186,7 @@ class FastMCD(_Function):
     quantile: float = 0.975
     num_starts: int = 500
     small_sample: bool = False
+    chunk_size: int = 16
 
     def forward(
         self,
@@ -127,6 +196,51 @@ class FastMCD(_Function):
     ) -> RobustFit:
         """Return the fits; the generator draws the starts."""
         return fit_fastmcd(patches, mask, generator=generator, **asdict(self))
+
+
+@dataclass(eq=False, repr=False)
+class MVE(_Function):
+    """Minimum volume ellipsoid of patches, with the settings of :func:`torchrg.robust.fit_mve`.
+
+    Example:
+        >>> MVE()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
+        tensor(True)
+    """
+
+    support_fraction: float = 0.5
+    _: KW_ONLY
+    quantile: float = 0.975
+    num_starts: int = 500
+    exhaustive: bool = False
+    chunk_size: int = 64
+
+    def forward(
+        self,
+        patches: Tensor,
+        mask: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> RobustFit:
+        """Return the fits; the generator draws the sets."""
+        return fit_mve(patches, mask, generator=generator, **asdict(self))
+
+
+@dataclass(eq=False, repr=False)
+class DetS(_Function):
+    """Deterministic S-estimator of patches, with settings of :func:`torchrg.robust.fit_dets`.
+
+    Example:
+        >>> DetS()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
+        tensor(True)
+    """
+
+    _: KW_ONLY
+    quantile: float = 0.975
+    starts: Starts = "robustbase"
+    chunk_size: int = 2048
+
+    def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
+        """Return the fits."""
+        return fit_dets(patches, mask, **asdict(self))
 
 
 @dataclass(eq=False, repr=False)
@@ -142,7 +256,72 @@ class DetMM(_Function):
     quantile: float = 0.975
     starts: Starts = "robustbase"
     tuned_for: Target = "shape"
+    chunk_size: int = 2048
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
         """Return the fits."""
         return fit_detmm(patches, mask, **asdict(self))
+
+
+Method = Literal["pca", "jet", "irls", "detmcd", "fastmcd", "mve", "dets", "detmm"]
+
+_FITS: dict[str, Callable[..., NormalFit]] = {
+    "pca": fit_normals_pca,
+    "jet": fit_normals_jet,
+    "irls": fit_normals_irls,
+}
+_ROBUST: dict[str, Callable[..., RobustFit]] = {
+    "detmcd": fit_detmcd,
+    "fastmcd": fit_fastmcd,
+    "mve": fit_mve,
+    "dets": fit_dets,
+    "detmm": fit_detmm,
+}
+
+
+class PatchNormals(nn.Module):
+    """Unit normals of patches by an estimator of single neighbourhoods.
+
+    Args:
+        method: The estimator.
+        **settings: Its keywords, as in ``support_fraction=0.75``; ``irls`` needs ``noise``, one
+            number in the unit of the points.
+
+    Raises:
+        ConfigError: If there is no such estimator, or it has no such setting or value.
+
+    Example:
+        >>> corner = torch.eye(3)[[0, 1, 2, 0, 1, 2]]
+        >>> PatchNormals("detmcd", support_fraction=0.75)(corner).abs()
+        tensor([0.5774, 0.5774, 0.5774])
+    """
+
+    def __init__(self, method: Method = "pca", **settings: Any) -> None:  # noqa: ANN401
+        super().__init__()
+        check_choices("PatchNormals", method=(method, Method))
+        self.method, self.settings = method, settings
+        if method == "irls" and not settings.get("noise", 0) > 0:
+            raise ConfigError("PatchNormals: expected noise > 0 with method='irls', as a setting.")
+        try:
+            self.fit(torch.empty(0, 4, 3))
+        except TypeError as error:
+            reason = str(error).partition("() ")[2]
+            raise ConfigError(f"PatchNormals: {method} {reason}.") from None
+
+    def fit(self, patches: Tensor, mask: Tensor | None = None) -> NormalFit:
+        """Return normals with curvature and residuals of patches ``(*, K, 3)``."""
+        settings = dict(self.settings)
+        if self.method in _ROBUST:
+            return fit_normals_robust(patches, mask, estimator=_ROBUST[self.method], **settings)
+        if self.method == "irls":
+            settings["noise"] = torch.full_like(patches[..., 0, 0], settings["noise"])
+        return _FITS[self.method](patches, mask, **settings)
+
+    def forward(self, patches: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Return unit normals ``(*, 3)`` of arbitrary sign, zero where there is no plane."""
+        return self.fit(patches, mask).normals
+
+    def extra_repr(self) -> str:
+        """Return the settings as text."""
+        given = {"method": self.method, **self.settings}
+        return ", ".join(f"{name}={value!r}" for name, value in given.items())

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_points, check_shapes
+from torchrg._opaque import of_clouds
 from torchrg._parallel import sequential_operations
 from torchrg.config import (
     GrowingConfig,
@@ -163,6 +164,7 @@ Store = MemoryStore | TileStore
 """Where the arrays of a run are."""
 
 
+@of_clouds
 @sequential_operations()
 def segment_planes(
     points: Tensor | NDArray[np.floating] | Iterable[Cloud],
@@ -226,9 +228,8 @@ def segment_planes(
         [400]
     """
     if isinstance(points, Tensor | np.ndarray):
-        points = as_tensor("segment_planes", "points", points)
-        check_shapes("segment_planes", points=(points, "N 3"))
-        check_floating("segment_planes", points=points)
+        points = as_tensor("segment_planes", "points", points).detach()
+        check_points("segment_planes", points)
     config = load_config() if config is None else config
     store = MemoryStore() if store is None else store
     begin = on_stage or (lambda stage: None)
@@ -256,6 +257,7 @@ def segment_planes(
     return load_results(store, voxel)
 
 
+@of_clouds
 @sequential_operations()
 def make_superpoints(
     points: Tensor | NDArray[np.floating],
@@ -308,9 +310,8 @@ def make_superpoints(
         >>> found.labels.unique(return_counts=True)[1].tolist(), found.plane.tolist()
         ([200, 200], [0, 1])
     """
-    tensor = as_tensor("make_superpoints", "points", points)
-    check_shapes("make_superpoints", points=(tensor, "N 3"))
-    check_floating("make_superpoints", points=tensor)
+    tensor = as_tensor("make_superpoints", "points", points).detach()
+    check_points("make_superpoints", tensor)
     shades = None if colors is None else as_tensor("make_superpoints", "colors", colors)
     check_shapes("make_superpoints", points=(tensor, "N 3"), colors=(shades, "N 3"))
     seg = segment_planes(tensor, voxel=voxel) if seg is None else seg
@@ -371,7 +372,7 @@ def segment_mesh(
         >>> segment_mesh(fold, faces).unique(return_counts=True)[1].tolist()
         [200, 200]
     """
-    tensor = as_tensor("segment_mesh", "vertices", vertices)
+    tensor = as_tensor("segment_mesh", "vertices", vertices).detach()
     check_shapes("segment_mesh", vertices=(tensor, "V 3"))
     check_floating("segment_mesh", vertices=tensor)
     corners = None if faces is None else as_tensor("segment_mesh", "faces", faces)

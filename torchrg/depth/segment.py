@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._opaque import of_clouds
 from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
 from torchrg.depth.camera import has_depth, points_of_image
@@ -14,6 +15,7 @@ from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 
 
+@of_clouds
 @torch.no_grad()
 @sequential_operations()
 def segment_depth(

@@ -4,12 +4,13 @@ Every tolerance that follows from the precision of a dtype is a function here; o
 multiples of them.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
+from torchrg._opaque import has_values
 
 _JACOBI_SWEEPS = 5
 """Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding, in float64
@@ -79,7 +80,9 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Eigenvalues in ascending order ``(*, 3)`` and unit eigenvectors as columns ``(*, 3, 3)``.
-        Signs are arbitrary. Gradients do not flow well through repeated eigenvalues.
+        Signs are arbitrary. Gradients are those of :func:`torch.linalg.eigh`, and finite where
+        eigenvalues are equal: the turn between their vectors, which nothing determines, is left
+        out, so that projectors and vectors of other eigenvalues have the right ones.
 
     Raises:
         ShapeError: If the shape or dtype is not as above.
@@ -94,6 +97,47 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_shapes("eigh3", matrices=(matrices, "* 3 3"))
     check_floating("eigh3", matrices=matrices)
+    if not matrices.requires_grad and has_values(matrices):
+        return _jacobi(matrices)
+    values, vectors = _Eigh3.apply(matrices)  # type: ignore[no-untyped-call]
+    return values, vectors
+
+
+class _Eigh3(torch.autograd.Function):
+    """Jacobi rotations, with the gradient of eigenvalues and eigenvectors [1].
+
+    With ``W = V^T dV`` off the diagonal divided by ``l_j - l_i``, ``dA = V (diag(dl) + W) V^T``.
+
+    References:
+        [1] M. Giles. Collected matrix derivative results for forward and reverse mode algorithmic
+        differentiation. Advances in Automatic Differentiation, 2008, section 3.1.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(matrices: Tensor) -> tuple[Tensor, Tensor]:
+        return _jacobi(matrices)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ANN401
+        ctx.save_for_backward(*output)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:  # noqa: ANN401
+        (values, vectors), (of_values, of_vectors) = ctx.saved_tensors, gradients
+        gap = values[..., None, :] - values[..., :, None]
+        largest = values.detach().abs().amax(dim=-1)[..., None, None]
+        distinct = gap.detach().abs() > rank_tolerance(3, values.dtype) * largest
+        turn = (vectors.mT @ of_vectors) / torch.where(distinct, gap, 1.0)
+        inner = torch.where(distinct, turn, 0.0) + torch.diag_embed(of_values)
+        whole: Tensor = vectors @ inner @ vectors.mT
+        # Only the upper triangle is read, but both stand for one number, as in torch.linalg.eigh.
+        return (whole + whole.mT) / 2
+
+
+def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Do as :func:`eigh3`, without gradient."""
     scale = matrices.abs().amax(dim=(-2, -1))
     safe = torch.where(scale > 0, scale, 1.0)[..., None, None]
     scaled = matrices / safe
@@ -221,7 +265,7 @@ def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int
     active = apq != 0
     tau = (a[q][q] - a[p][p]) / (2 * torch.where(active, apq, 1.0))
     # tau may overflow to infinity for a negligible apq; then t = 0, as it should be.
-    t = torch.where(tau >= 0, 1.0, -1.0) / (tau.abs() + (1 + tau * tau).sqrt())
+    t = torch.where(tau >= 0, 1.0, -1.0).to(tau.dtype) / (tau.abs() + (1 + tau * tau).sqrt())
     t = torch.where(active, t, 0.0)
     c = 1 / (1 + t * t).sqrt()
     s = t * c
@@ -254,32 +298,10 @@ class PrincipalFrame(NamedTuple):
 
 
 def principal_frame(matrices: Tensor) -> PrincipalFrame:
-    r"""Decompose symmetric 3x3 matrices, with first-order gradients of normal and smallest value.
-
-    With the decomposition held constant, one step of perturbation theory changes nothing in value
-    and everything in gradient: ``dn = sum_j v_j (v_j . dA n) / (l0 - l_j)``. Where two eigenvalues
-    are equal, the turn between their vectors is left out.
-    """
-    with torch.no_grad():
-        values, vectors = eigh3(matrices)
-    normals, smallest = vectors[..., 0], values[..., 0].clamp(min=0)
-    if matrices.requires_grad:
-        normals, smallest = _perturbed(matrices, values, vectors)
-    return PrincipalFrame(normals, smallest, values, vectors)
-
-
-def _perturbed(matrices: Tensor, values: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first eigenvector and eigenvalue with their first-order gradients."""
-    smallest, normal = values[..., :1], vectors[..., :1]
-    gap = smallest - values[..., 1:]
-    distinct = gap.abs() > rank_tolerance(3, values.dtype) * values[..., 2:]
-    turn = (vectors[..., 1:].mT @ (matrices @ normal)).squeeze(-1)
-    turn = turn - turn.detach()
-    step = torch.where(distinct, turn / torch.where(distinct, gap, 1.0), 0.0)
-    moved = normal.squeeze(-1) + (vectors[..., 1:] @ step[..., None]).squeeze(-1)
-    value = (normal.mT @ matrices @ normal).squeeze(-1)
-    value = smallest + value - value.detach()
-    return moved, value.squeeze(-1).clamp(min=0)
+    """Decompose symmetric 3x3 matrices, with gradients of normal and smallest value."""
+    values, vectors = eigh3(matrices)
+    smallest = values[..., 0].clamp(min=0)
+    return PrincipalFrame(vectors[..., 0], smallest, values.detach(), vectors.detach())
 
 
 def root(squares: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._opaque import of_clouds
 from torchrg._parallel import ROWS_AT_ONCE, allowed_threads, chunks_of, sequential_operations
 from torchrg.errors import ShapeError
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
@@ -20,6 +21,7 @@ _SAMPLE_SIZE = 400
 """Points that tell how far the k-th neighbour is."""
 
 
+@of_clouds
 @sequential_operations()
 def search_knn(
     points: Tensor | NDArray[np.floating],
@@ -270,6 +272,9 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
         [[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]]
     """
     flat = indices.reshape(-1)
+    if points.requires_grad and torch.is_grad_enabled():
+        found = points.index_select(0, flat).view(*indices.shape, 3)
+        return found - found[:, :1]
     patches = points.new_empty((3, *indices.shape))
     for axis in range(3):
         column = points[:, axis].index_select(0, flat).view(indices.shape)

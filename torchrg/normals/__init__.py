@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_points
+from torchrg._opaque import of_clouds
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import NormalMethod, NormalsConfig
 from torchrg.errors import ConfigError
@@ -55,6 +56,9 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 """Estimators by name: points, their neighbours, settings, chunk size -> fit."""
 
+WITHOUT_GRADIENT = {"consensus"}
+"""Estimators that choose and smooth in so many steps that no fit is left to differentiate."""
+
 NOISE_STEPS = 3
 STEPS = dict.fromkeys(ESTIMATORS, 1) | {
     "irls": NOISE_STEPS,
@@ -69,6 +73,7 @@ noise of a region there are :data:`torchrg.normals.consensus.constants.REGIONAL_
 see :func:`torchrg.normals.consensus.wanted_neighbors`."""
 
 
+@of_clouds
 @sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],
@@ -81,6 +86,14 @@ def estimate_normals(
     chunk_size: int = CHUNK_SIZE,
 ) -> NormalFit:
     """Estimate normal and curvature of every point of a cloud.
+
+    Convention:
+        Gradients flow from normals, curvature and residual to the points: those of the fit, with
+        what is chosen held fixed, that is neighbours, inliers, sharp points, and the noise that
+        ``irls`` assumes. With the covariance ``C`` of the points of the fit, its eigenvalues ``l``
+        and eigenvectors ``v``, ``dn = sum_j v_j (v_j . dC n) / (l_0 - l_j)``. ``jet`` adds the
+        gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none
+        and refuses points that require one.
 
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
@@ -97,7 +110,8 @@ def estimate_normals(
         The fit in the order of the points.
 
     Raises:
-        ConfigError: If ``method`` is unknown or a setting is out of range.
+        ConfigError: If ``method`` is unknown or a setting is out of range, or the points require
+            gradients that the method has not.
         ShapeError: If a shape or dtype is not as above.
 
     Example:
@@ -107,8 +121,7 @@ def estimate_normals(
         tensor([0., 0., 1.])
     """
     tensor = as_tensor("estimate_normals", "points", points)
-    check_shapes("estimate_normals", points=(tensor, "N 3"))
-    check_floating("estimate_normals", points=tensor)
+    check_points("estimate_normals", tensor)
     settings = config or NormalsConfig()
     changes = {"method": method, "k": k}
     given = {name: value for name, value in changes.items() if value is not None}
@@ -119,6 +132,12 @@ def estimate_normals(
             f"estimate_normals: expected method to be one of {names}, got {settings.method!r}."
         )
     estimate = ESTIMATORS[settings.method]
+    if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():
+        names = ", ".join(sorted(ESTIMATORS.keys() - WITHOUT_GRADIENT))
+        raise ConfigError(
+            f"estimate_normals: expected a method with gradients ({names}) for points that require "
+            f"them, got {settings.method!r}; choose one, or pass points.detach()."
+        )
     if neighbors is not None:
         return estimate(tensor, neighbors, settings, chunk_size)
     rows = finite_rows(tensor)

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchrg._checks import check_floating, check_shapes
+from torchrg._opaque import opaque
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import second_moments
@@ -98,6 +99,18 @@ class _Solution(NamedTuple):
     heavy: Tensor
 
 
+def _no_fit(patches: Tensor) -> NormalFit:
+    """Return fits of patches ``(*, K, 3)`` that are not valid."""
+    first = patches[..., 0, 0]
+    return NormalFit(
+        patches.new_zeros((*first.shape, 3)),
+        first.new_zeros(first.shape),
+        first.new_zeros(first.shape, dtype=torch.bool),
+        first.new_zeros(first.shape),
+    )
+
+
+@opaque(_no_fit, differentiable=(0, 1, 3))
 def fit_normals_irls(
     patches: Tensor,
     mask: Tensor | None = None,

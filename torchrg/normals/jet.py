@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._opaque import in_own_precision
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root
 from torchrg.linalg.moments import Columns, along, sq_lengths
@@ -74,6 +75,7 @@ class JetFit(NamedTuple):
     residual_rms: Tensor
 
 
+@in_own_precision
 def fit_jet(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
 ) -> JetFit:

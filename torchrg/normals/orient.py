@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._opaque import of_clouds
 from torchrg._parallel import CHUNK_SIZE, map_chunks, sequential_operations
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, gather_patches, search_knn
@@ -53,6 +54,7 @@ _OPEN = 1 << 24
 """Added to the length of paths that leave the box: more cells than any grid has in a row."""
 
 
+@of_clouds
 @sequential_operations()
 def orient_normals(
     points: Tensor | NDArray[np.floating],

@@ -56,7 +56,7 @@ def find_sharp_points(
     """
     if rule not in ("qn", "percentile"):
         raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
-    columns = normals.T.contiguous()
+    columns = normals.detach().T.contiguous()
     if valid is not None and bool(valid.all()):
         valid = None
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)

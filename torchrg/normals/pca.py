@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes
+from torchrg._opaque import has_values
 from torchrg.linalg import coordinate_resolution, covariance, eigh3, rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
 from torchrg.structures import NormalFit
@@ -98,23 +99,12 @@ def _spans_plane(
     lengths, widths = (values[..., axis].clamp(min=0).sqrt() for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     narrow = widths < _NARROW * lengths
-    any_narrow = _any(narrow)
-    if any_narrow is None:
+    if not has_values(patches, mask, values):
         widths = torch.where(narrow, _width(patches, mask), widths)
-    elif any_narrow:
+    elif bool(narrow.any()):
         widths = widths.double()
         widths[narrow] = _width(patches[narrow], None if mask is None else mask[narrow])
     return widths > flat
-
-
-def _any(condition: Tensor) -> bool | None:
-    """Return whether a condition holds anywhere; None in a compiler and under vmap: no values."""
-    if torch.compiler.is_compiling():
-        return None
-    try:
-        return bool(condition.any())
-    except RuntimeError:  # vmap's answer; it has no public way to ask beforehand
-        return None
 
 
 def _width(patches: Tensor, mask: Tensor | None) -> Tensor:

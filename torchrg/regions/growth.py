@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._opaque import of_clouds
 from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_operations
 from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
@@ -36,6 +37,7 @@ _CLAIMING_SEEDS = 2**13
 """Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB."""
 
 
+@of_clouds
 @sequential_operations()
 def grow_regions(
     points: Tensor | NDArray[np.floating],

@@ -18,7 +18,7 @@ from torchrg.robust.lanes import (
     sq_distances,
     take_lanes,
 )
-from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise
+from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import sum_points
 from torchrg.robust.starts import (
     Starts,
@@ -30,6 +30,7 @@ from torchrg.robust.weights import (
     Estimate,
     Inliers,
     Scaling,
+    chi2_quantile,
     consistency_factor,
     distances_to_support,
     quantile_factor,
@@ -73,6 +74,7 @@ class _Concentrated(NamedTuple):
     determinants: Tensor
 
 
+@patchwise
 def fit_detmcd(
     patches: Tensor,
     mask: Tensor | None = None,
@@ -172,6 +174,7 @@ def fit_detmcd(
     return _fit_mcd("fit_detmcd", patches, mask, settings, chunk_size, search)
 
 
+@patchwise
 def fit_fastmcd(
     patches: Tensor,
     mask: Tensor | None = None,
@@ -265,6 +268,16 @@ def _fit_mcd(
             singular=ellipsoid.singular,
         )
 
+    def weigh(fit: RobustFit, points: Tensor) -> Tensor:
+        if settings.inliers == "raw":
+            return fit.support
+        # The second cut leaves location and covariance as they were: those of the first.
+        offsets = (points.nan_to_num(0.0, 0.0, 0.0) - fit.raw_location[..., None, :]).mT
+        solved = torch.linalg.lstsq(fit.raw_covariance.double(), offsets.double()).solution
+        bound = chi2_quantile(settings.quantile, points.shape[-1])
+        within: Tensor = (offsets * solved).sum(dim=-2) <= bound
+        return within & fit.sq_distances.isfinite()
+
     return fit_patchwise(
         caller,
         patches,
@@ -273,6 +286,7 @@ def _fit_mcd(
         settings.quantile,
         chunk_size,
         estimator,
+        weigh=weigh,
     )
 
 

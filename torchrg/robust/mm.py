@@ -1,7 +1,7 @@
 """S and MM estimates of location and scatter from deterministic starts."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import exp, lgamma, log
 from typing import Literal, NamedTuple
 
@@ -22,7 +22,7 @@ from torchrg.robust.lanes import (
     sq_distances,
     take_lanes,
 )
-from torchrg.robust.patches import RobustFit, fit_patchwise
+from torchrg.robust.patches import Estimator, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
@@ -57,6 +57,7 @@ class _Shape(NamedTuple):
     distances: Tensor
 
 
+@patchwise
 def fit_dets(
     patches: Tensor,
     mask: Tensor | None = None,
@@ -100,11 +101,12 @@ def fit_dets(
         shape, scale = _best_s_estimate(columns, floor, size, starts)
         return _estimate(columns, shape, shape, scale, quantile)
 
-    return fit_patchwise(
-        "fit_dets", patches, mask, 0.5, quantile, chunk_size, estimator, majority=half_size
+    return _fit_shapes(
+        "fit_dets", patches, mask, quantile, chunk_size, estimator, breakdown_constant
     )
 
 
+@patchwise
 def fit_detmm(
     patches: Tensor,
     mask: Tensor | None = None,
@@ -157,8 +159,34 @@ def fit_detmm(
         final = _shape_of(columns, torch.where(after <= before, weights, first.weights), floor)
         return _estimate(columns, first, final, scale, quantile)
 
+    cutoff_of = partial(efficiency_constant, target=tuned_for)
+    return _fit_shapes("fit_detmm", patches, mask, quantile, chunk_size, estimator, cutoff_of)
+
+
+def _fit_shapes(
+    caller: str,
+    patches: Tensor,
+    mask: Tensor | None,
+    quantile: float,
+    chunk_size: int,
+    estimator: Estimator,
+    cutoff_of: Callable[[int], float],
+) -> RobustFit:
+    """Fit patches by an estimator with bisquare weights that vanish at a cut-off for P."""
+
+    def weigh(fit: RobustFit, points: Tensor) -> Tensor:
+        return _bisquare_weights(fit.sq_distances / cutoff_of(points.shape[-1]) ** 2)
+
     return fit_patchwise(
-        "fit_detmm", patches, mask, 0.5, quantile, chunk_size, estimator, majority=half_size
+        caller,
+        patches,
+        mask,
+        0.5,
+        quantile,
+        chunk_size,
+        estimator,
+        majority=half_size,
+        weigh=weigh,
     )
 
 

@@ -14,7 +14,7 @@ from torchrg.robust.lanes import (
     sorted_points,
     sq_distances,
 )
-from torchrg.robust.patches import RobustFit, fit_patchwise
+from torchrg.robust.patches import RobustFit, fit_patchwise, patchwise
 from torchrg.robust.starts import draw_seed, elemental_sets
 from torchrg.robust.weights import (
     Estimate,
@@ -28,6 +28,7 @@ _LANES_AT_ONCE = 1024
 """Sets times patches that are worked on together, so that what they need fits the cache."""
 
 
+@patchwise
 def fit_mve(
     patches: Tensor,
     mask: Tensor | None = None,

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._opaque import Arguments, opaque
 from torchrg._parallel import map_chunks
 from torchrg.errors import ConfigError
-from torchrg.linalg import flatness_tolerance, smallest_normal
+from torchrg.linalg import flatness_tolerance, second_moments, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     columns_of_points,
@@ -41,6 +42,11 @@ class RobustFit(NamedTuple):
     ``chunk_size`` bounds the memory and never changes a result. Another shape, dtype or device is a
     :class:`torchrg.errors.ShapeError`, a setting out of range a
     :class:`torchrg.errors.ConfigError`.
+
+    ``location`` and ``covariance`` have gradients: those of the weighted mean
+    ``m = sum w_i x_i / sum w_i`` and of ``c sum w_i (x_i - m) (x_i - m)^T``, with the weights ``w``
+    (1 for the chosen points, those of the last step for DetS and DetMM) and the factor ``c`` held
+    fixed. The other fields have none.
 
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
@@ -97,6 +103,11 @@ class _Frame(NamedTuple):
         return lanes / length / length
 
 
+def patchwise(function: Callable[Arguments, RobustFit]) -> Callable[Arguments, RobustFit]:
+    """Make a robust fit of patches opaque to compilers, ``vmap`` and ``torch.func``."""
+    return opaque(_no_fit, differentiable=(0, 1))(function)
+
+
 def fit_patchwise(
     caller: str,
     patches: Tensor,
@@ -106,11 +117,13 @@ def fit_patchwise(
     chunk_size: int,
     estimator: Estimator,
     majority: Callable[[int], int] | None = None,
+    weigh: Callable[[RobustFit, Tensor], Tensor] = lambda fit, points: fit.support,
 ) -> RobustFit:
     """Apply an estimator to every patch, and answer the degenerate ones.
 
     Patches are grouped by their number of points that count, so that every group is dense. The
-    points on one plane are an exact fit where they are ``majority(n)`` of n, by default h.
+    points on one plane are an exact fit where they are ``majority(n)`` of n, by default h. Only
+    gradients ask ``weigh`` for the weights ``(*, K)`` of the points that a fit is the mean of.
     """
     patches = as_tensor(caller, "patches", patches)
     check_floating(caller, patches=patches)
@@ -132,8 +145,31 @@ def fit_patchwise(
     def fit_dense(chunk: Tensor) -> RobustFit:
         return _fit_chunk(chunk, support_fraction, estimator, majority)
 
-    fit = _fit_groups(dense, counted, chunk_size, fit_dense)
-    return RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in fit))
+    found = _fit_groups(dense, counted, chunk_size, fit_dense)
+    fit = RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in found))
+    if patches.requires_grad and torch.is_grad_enabled():
+        weights = torch.where(fit.exact_fit[..., None], fit.support, weigh(fit, patches.detach()))
+        return _with_gradients(fit, patches, weights.to(patches.dtype))
+    return fit
+
+
+def _with_gradients(fit: RobustFit, patches: Tensor, weights: Tensor) -> RobustFit:
+    """Return a fit whose location and covariance have the gradients of weighted points."""
+    total = weights.sum(dim=-1, keepdim=True)
+    shares = (weights / torch.where(total > 0, total, 1.0))[..., None]
+    points = torch.where(shares > 0, patches, 0.0)
+    mean = (shares * points).sum(dim=-2, keepdim=True)
+    offsets = (points - mean).unbind(dim=-1)
+    scatter = second_moments(offsets, shares.squeeze(-1))
+    size, own = (
+        m.detach().diagonal(dim1=-2, dim2=-1).sum(dim=-1) for m in (fit.covariance, scatter)
+    )
+    covariance = (size / torch.where(own > 0, own, 1.0))[..., None, None] * scatter
+    mean = mean.squeeze(-2)
+    return fit._replace(
+        location=fit.location + (mean - mean.detach()),
+        covariance=fit.covariance + (covariance - covariance.detach()),
+    )
 
 
 def _fit_groups(
@@ -285,17 +321,17 @@ def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustF
 
 
 def _no_fit(patches: Tensor) -> RobustFit:
-    """Fits of patches ``(B, K, P)`` that are not valid."""
-    num_patches, num_points, size = patches.shape
-    points = patches.new_zeros(num_patches, num_points, dtype=torch.bool)
-    flag = patches.new_zeros(num_patches, dtype=torch.bool)
+    """Fits of patches ``(*, K, P)`` that are not valid."""
+    *batch, num_points, size = patches.shape
+    points = patches.new_zeros((*batch, num_points), dtype=torch.bool)
+    flag = patches.new_zeros(batch, dtype=torch.bool)
     return RobustFit(
-        location=patches.new_zeros(num_patches, size),
-        covariance=patches.new_zeros(num_patches, size, size),
+        location=patches.new_zeros((*batch, size)),
+        covariance=patches.new_zeros((*batch, size, size)),
         support=points,
         sq_distances=patches.new_full(points.shape, torch.inf),
-        raw_location=patches.new_zeros(num_patches, size),
-        raw_covariance=patches.new_zeros(num_patches, size, size),
+        raw_location=patches.new_zeros((*batch, size)),
+        raw_covariance=patches.new_zeros((*batch, size, size)),
         raw_support=points.clone(),
         log_det=patches.new_full(flag.shape, torch.nan),
         exact_fit=flag,

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from functools import lru_cache
 from math import comb
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._opaque import opaque
 from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks
 from torchrg.errors import ShapeError
 
@@ -59,7 +60,7 @@ def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> median(torch.tensor([4.0, 1.0, 3.0, 2.0])).item()
         2.5
     """
-    return _per_count("median", x, dim, mask, _sorted_median)
+    return _along("median", x, dim, mask)
 
 
 def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -75,7 +76,7 @@ def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
         1.4825999736785889
     """
-    return _per_count("mad", x, dim, mask, lambda rows: MAD_FACTOR * _median_deviation(rows))
+    return _along("mad", x, dim, mask)
 
 
 def qn(
@@ -108,9 +109,7 @@ def qn(
         >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0]))
         tensor(6.6657)
     """
-    return _per_count(
-        "qn", x, dim, mask, lambda rows: qn_of_sorted(rows, finite_sample=finite_sample)
-    )
+    return _along("qn", x, dim, mask, finite_sample)
 
 
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -134,7 +133,8 @@ def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | Non
         count = _count_differences(rows, bound)
         return (count < comb(half_size(n), 2)) & ~rows[:, -1].isnan()
 
-    return _per_count("qn_exceeds", x, dim, mask, of_sorted)
+    rows, counted = _rows_along("qn_exceeds", x, dim, mask)
+    return _per_count(rows.detach(), counted, of_sorted)
 
 
 def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -157,28 +157,64 @@ def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
         tensor(1.7441)
     """
-    return _per_count("tau", x, dim, mask, tau_of_sorted)
+    return _along("tau", x, dim, mask)
 
 
-def _per_count(
-    caller: str, x: Tensor, dim: int, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]
+Scale = Literal["median", "mad", "qn", "tau"]
+
+
+def _along(
+    name: Scale, x: Tensor, dim: int, mask: Tensor | None, finite_sample: bool = False
 ) -> Tensor:
-    """Apply a function of sorted rows ``(B, n)`` along ``dim``, once for each number of values.
+    """Check the arguments of a scale, and reduce an axis by it."""
+    rows, counted = _rows_along(name, x, dim, mask)
+    return scale_of_rows(rows, counted, name=name, finite_sample=finite_sample)
 
-    Values that do not count become +inf, sort last, and are cut off; a NaN that counts sorts
-    behind them, so rows with one are set apart first.
-    """
+
+def _rows_along(
+    caller: str, x: Tensor, dim: int, mask: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """Check values and mask, and return them with an axis as the last."""
     x = as_tensor(caller, "x", x)
     check_floating(caller, x=x)
     check_shapes(caller, x=(x, "*"), mask=(mask, "*"))
     if not -x.dim() <= dim < x.dim():
         raise ShapeError(f"{caller}: expected x with an axis {dim}, got shape {tuple(x.shape)}.")
-    rows = x.detach().movedim(dim, -1)
+    return x.movedim(dim, -1), None if mask is None else mask.movedim(dim, -1)
+
+
+@opaque(lambda rows: rows.new_empty(rows.shape[:-1]))
+def scale_of_rows(
+    rows: Tensor, mask: Tensor | None = None, *, name: Scale, finite_sample: bool = False
+) -> Tensor:
+    """Return a scale of each row of ``(*, n)``.
+
+    Its gradient is that of the formula, with the values that it picks held fixed: Qn picks a pair.
+    """
+    if not torch.is_grad_enabled():
+        rows = rows.detach()
+    if name == "median":
+        return _per_count(rows, mask, _sorted_median)
+    if name == "mad":
+        return _per_count(rows, mask, lambda ascending: MAD_FACTOR * _median_deviation(ascending))
+    if name == "tau":
+        return _per_count(rows, mask, tau_of_sorted)
+    return _per_count(
+        rows, mask, lambda ascending: qn_of_sorted(ascending, finite_sample=finite_sample)
+    )
+
+
+def _per_count(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]) -> Tensor:
+    """Apply a function of sorted rows ``(B, n)`` to those of ``(*, n)``, once for each number.
+
+    Values that do not count become +inf, sort last, and are cut off; a NaN that counts sorts
+    behind them, so rows with one are set apart first.
+    """
     shape, n = rows.shape[:-1], rows.shape[-1]
     rows = rows.reshape(shape.numel(), n)
     if mask is None:
         return of_sorted(sort_rows(rows.contiguous())).reshape(shape)
-    counted = mask.movedim(dim, -1).reshape(shape.numel(), n)
+    counted = mask.reshape(shape.numel(), n)
     broken = (rows.isnan() & counted).any(dim=1)
     ascending = sort_rows(torch.where(counted, rows, torch.inf))
     counts = counted.sum(dim=1)
@@ -194,7 +230,7 @@ def _per_count(
 
 def sort_rows(rows: Tensor) -> Tensor:
     """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
-    if rows.device.type == "cpu":
+    if rows.device.type == "cpu" and not rows.requires_grad:
         return torch.from_numpy(np.sort(rows.numpy(), axis=1))
     return rows.sort(dim=1).values
 
@@ -230,7 +266,7 @@ def tau_of_sorted(rows: Tensor) -> Tensor:
     center = sum_points(weights * standard) / sum_points(weights)
     squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
     variance = sum_points(squares) / (len(lanes) * _tau_consistency())
-    return torch.where(spread > 0, unit * variance.sqrt(), spread)
+    return torch.where(spread > 0, unit * torch.where(spread > 0, variance, 1.0).sqrt(), spread)
 
 
 def sum_points(values: Tensor) -> Tensor:
@@ -239,6 +275,9 @@ def sum_points(values: Tensor) -> Tensor:
     So a sum is the same, to the last bit, wherever its lane stands. ``torch.sum`` does not promise
     that: it adds the last lanes of a tensor in another order than the first.
     """
+    if values.requires_grad:
+        total = values.sum(dim=0)
+        return sum_points(values.detach()) + (total - total.detach())
     if values.device.type == "cpu":
         # NumPy adds row by row only where rows are contiguous and longer than one.
         flat = values.reshape(len(values), -1).contiguous()
@@ -304,11 +343,28 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     Two values that are h or more places apart enclose at least C(h + 1, 2) pairs that are no
     further apart than they are, so only lags 1 to h - 1 of the sorted row can hold the answer.
     """
+    if sorted_rows.requires_grad:
+        return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
     rank = comb(half_size(sorted_rows.shape[1]), 2)
     out = sorted_rows.new_empty(len(sorted_rows))
     _with_lags(sorted_rows, out, lambda lagged, rows: lagged.select(rows, rank), sorts=True)
     out[sorted_rows[:, -1].isnan()] = torch.nan
     return out
+
+
+def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
+    """Return a difference that occurs in each row as that of the first pair that has it."""
+    rows = sorted_rows.detach()
+    # The sum may be off by a rounding; the value itself or one beside it is the partner.
+    place = torch.searchsorted(rows, rows + difference[:, None])
+    last = rows.shape[1] - 1
+    partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
+    own = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
+    found = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
+    is_pair = (found == difference[:, None, None]) & (partners > own)
+    pick = is_pair.flatten(1).to(torch.uint8).argmax(dim=1, keepdim=True)
+    low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (own, partners))
+    return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)
 
 
 def _count_differences(sorted_rows: Tensor, bound: float) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor
+from torchrg._opaque import of_clouds
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import restore_points, sample_voxels
@@ -80,6 +81,7 @@ class DepthToCloud(DepthTransform):
         ([[0.0, 0.0, 2.0], [0.0, 2.0, 2.0], [2.0, 2.0, 2.0]], [0, 2, 3])
     """
 
+    @of_clouds
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with the cloud."""
         depth, intrinsics, poses = self.read_images(sample)
@@ -152,6 +154,7 @@ class SegmentDepth(DepthTransform):
         self.config = config or DepthConfig()
         self.planes = planes
 
+    @of_clouds
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)

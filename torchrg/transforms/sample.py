@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrg._checks import as_tensor, check_shapes
+from torchrg._opaque import of_clouds
 from torchrg.errors import ConfigError
 from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
@@ -75,6 +76,7 @@ class SampleTransform(nn.Module):
         """Return the settings."""
         return "" if self.config is None else repr(self.config)
 
+    @of_clouds
     def forward(self, sample: Any) -> Any:  # noqa: ANN401
         """Return a new sample; the given one is not changed."""
         if is_separable(sample):

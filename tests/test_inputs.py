@@ -1,0 +1,135 @@
+"""Kinds of tensors: each gives the right result, or one line that says what to do."""
+
+import pytest
+import torch
+
+import torchrg
+from torchrg.config import NormalsConfig
+from torchrg.errors import ShapeError
+from torchrg.linalg import covariance, eigh3
+from torchrg.normals import ESTIMATORS, fit_jet, fit_normals_irls, fit_normals_pca
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, mad, qn, tau
+from torchrg.transforms import SegmentDepth
+
+PATCHES = {
+    "covariance": lambda x: covariance(x)[1],
+    "eigh3": lambda x: eigh3(covariance(x)[1])[1].abs(),
+    "pca": lambda x: fit_normals_pca(x).curvature,
+    "jet": lambda x: fit_jet(x).principal_curvatures,
+    "irls": lambda x: fit_normals_irls(x, noise=x.detach()[:, 0, 0] * 0, mu_decay=3.0).curvature,
+    "qn": qn,
+    "mad": mad,
+    "tau": tau,
+    "detmcd": lambda x: fit_detmcd(x, starts="more").covariance,
+    "fastmcd": lambda x: fit_fastmcd(x, num_starts=20).covariance,
+    "mve": lambda x: fit_mve(x, num_starts=20).covariance,
+    "dets": lambda x: fit_dets(x).covariance,
+    "detmm": lambda x: fit_detmm(x).covariance,
+}
+FEW_STEPS = NormalsConfig(irls_decay=3.0)
+CLOUDS = {
+    f"cloud, {method}": lambda x, method=method: (
+        torchrg.estimate_normals(x, method=method, k=10, config=FEW_STEPS).normals
+    )
+    for method in ESTIMATORS
+}
+CLOUDS |= {
+    "planes": lambda x: torchrg.segment_planes(x).normals,
+    "table": lambda x: torchrg.segment_planes(x).planes.offset,
+    "superpoints": lambda x: torchrg.make_superpoints(x).labels,
+    "neighbors": lambda x: torchrg.search_knn(x, 5).indices,
+}
+CALLS = PATCHES | CLOUDS
+calls = pytest.mark.parametrize("name", CALLS)
+
+
+def argument(name):
+    rng = torch.Generator().manual_seed(0)
+    if name in PATCHES:
+        return torch.randn(3, 15, 3, generator=rng) * torch.tensor([1.0, 0.7, 0.05])
+    cloud = torch.rand(120, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.02])
+    return torch.cat([cloud[:60], cloud[60:, [2, 0, 1]]])
+
+
+class OfSomebody(torch.Tensor):
+    """A subclass."""
+
+
+def under_autocast(call, x):
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        return call(x)
+
+
+def under_double(call, x):
+    torch.set_default_dtype(torch.float64)
+    try:
+        return call(x)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def under_inference(call, x):
+    with torch.inference_mode():
+        return call(x)
+
+
+SURROUNDINGS = {
+    "autocast": under_autocast,
+    "default dtype float64": under_double,
+    "inference": under_inference,
+    "not contiguous": lambda call, x: call(x.mT.contiguous().mT),
+    "every second": lambda call, x: call(x.repeat_interleave(2, dim=0)[::2]),
+    "subclass": lambda call, x: call(x.as_subclass(OfSomebody)),
+    "parameter": lambda call, x: call(torch.nn.Parameter(x, requires_grad=False)),
+}
+
+
+@calls
+def test_surroundings_change_nothing(name):
+    expected = CALLS[name](argument(name))
+    for kind, run in SURROUNDINGS.items():
+        found = run(CALLS[name], argument(name))
+        assert found.dtype == expected.dtype, kind
+        assert torch.equal(found.nan_to_num(), expected.nan_to_num()), kind
+
+
+@calls
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused_with_the_repair(name, half):
+    if name == "irls":
+        name = "pca"
+    with pytest.raises(ShapeError, match=r"of float32 or float64, got b?float16; pass \w+.float"):
+        CALLS[name](argument(name).to(half))
+
+
+@calls
+def test_sparse_tensors_are_refused_with_the_repair(name):
+    if name == "irls":
+        name = "pca"
+    with pytest.raises(ShapeError, match=r"to be dense, got a sparse tensor; pass \w+.to_dense"):
+        CALLS[name](argument(name).to_sparse())
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_clouds_on_meta_are_refused(name):
+    with pytest.raises(ShapeError, match="expected points with values, got those of vmap"):
+        CALLS[name](argument(name).to("meta"))
+
+
+@pytest.mark.parametrize(
+    "call", [torchrg.estimate_normals, torchrg.segment_planes, torchrg.make_superpoints]
+)
+def test_an_organised_cloud_points_to_depth(call):
+    with pytest.raises(ShapeError, match=r"got \(4, 5, 3\); pass the depth .*SegmentDepth, or"):
+        call(torch.rand(4, 5, 3))
+
+
+def test_depth_under_other_surroundings():
+    camera = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+
+    def segment(depth):
+        return SegmentDepth()({"depth": depth, "intrinsics": camera})["normal"]
+
+    depth = torch.full((1, 30, 40), 2.0)
+    for run in (under_autocast, under_double, under_inference):
+        assert torch.equal(run(segment, depth), segment(depth))

@@ -1,0 +1,260 @@
+"""Functions that read values, made opaque to what has none: compilers, ``vmap``, ``torch.func``.
+
+These run a function on tensors that stand for others. Functions of clouds stay outside of them. A
+function of patches that sorts with NumPy,
+or takes as many steps as its points need, is an operation of its own to them, with a rule for
+batches and one for gradients; called on ordinary tensors it is an ordinary function.
+"""
+
+import ast
+import inspect
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, TypeGuard, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchrg.errors import ConfigError, ShapeError
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def has_values(*tensors: Tensor | None) -> bool:
+    """Return whether tensors hold numbers that may be read: not in a compiler, nor under vmap.
+
+    Example:
+        >>> has_values(torch.zeros(2)), has_values(torch.zeros(2, device="meta"))
+        (True, False)
+        >>> torch.vmap(lambda row: torch.tensor(has_values(row)))(torch.zeros(2, 3)).tolist()
+        [False, False]
+    """
+    if torch.compiler.is_compiling():
+        return False
+    try:
+        given = [t for t in tensors if t is not None and t.layout is torch.strided]
+        return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in given)
+    except RuntimeError:  # the answer of what stands for another tensor
+        return False
+
+
+def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Keep compilers out of a function of clouds, and refuse tensors without values.
+
+    A compiler breaks its graph there and compiles the rest of the model.
+    """
+
+    @wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if torch.compiler.is_compiling():
+            uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
+            found: Result = uncompiled(*args, **kwargs)
+            return found
+        if not has_values(*(given for given in (*args, *kwargs.values()) if _is_tensor(given))):
+            raise ShapeError(
+                f"{function.__name__}: expected points with values, got those of vmap, torch.func "
+                "or the meta device; functions of clouds run outside of them."
+            )
+        return function(*args, **kwargs)
+
+    return call
+
+
+def in_own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Let a function that multiplies matrices keep its dtype under ``torch.autocast``."""
+
+    @wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+        if not kinds:
+            return function(*args, **kwargs)
+        with torch.autocast(kinds[0], enabled=False), torch.autocast(kinds[-1], enabled=False):
+            return function(*args, **kwargs)
+
+    return call
+
+
+class _Function(NamedTuple):
+    """A function of patches, what it returns without values, and which of that has gradients."""
+
+    run: Callable[..., Any]
+    outputs: Callable[[Tensor], Any]
+    differentiable: Collection[int]
+
+
+_FUNCTIONS: dict[str, _Function] = {}
+
+
+def opaque(
+    outputs: Callable[[Tensor], Any], *, differentiable: Collection[int] = (0,)
+) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Return a decorator for a function of patches, which all have the same leading axes.
+
+    The first argument is a tensor and the one that has a gradient; others are tensors or literals.
+    ``outputs`` makes tensors of the right shape and dtype from the first, in the kind of tuple that
+    the function returns, or one; ``differentiable`` are the places of those that have a gradient.
+    """
+
+    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        name = function.__name__
+        parameters = tuple(inspect.signature(function).parameters)
+        kind: Any = inspect.signature(function).return_annotation
+        make = kind if kind is not Tensor else (lambda found: found)
+        _FUNCTIONS[name] = _Function(function, outputs, differentiable)
+
+        @wraps(function)
+        def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            given: dict[str, Any] = {**dict(zip(parameters, args, strict=False)), **kwargs}
+            tensors = {key: given[key] for key in parameters if _is_tensor(given.get(key))}
+            if has_values(*tensors.values()):
+                return function(*args, **kwargs)
+            parts = [name, ",".join(tensors)]
+            for key, value in given.items():
+                if key not in tensors and value is not None:
+                    _check_literal(name, key, value)
+                    parts.append(f"{key}={value!r}")
+            found = _apply("|".join(parts), list(tensors.values()))
+            result: Result = make(*found)
+            return result
+
+        return call
+
+    return decorate
+
+
+def _is_tensor(value: object) -> TypeGuard[Tensor]:
+    return isinstance(value, Tensor)
+
+
+def _check_literal(name: str, key: str, value: object) -> None:
+    """Raise if a setting cannot be part of an operation."""
+    if not isinstance(value, bool | int | float | str):
+        raise ConfigError(
+            f"{name}: expected no {key} in a compiler or under vmap and torch.func, got "
+            f"{type(value).__name__}; call it outside, or leave {key} out."
+        )
+
+
+def _apply(call: str, tensors: list[Tensor]) -> list[Tensor]:
+    """Run an opaque function, with gradients if the first tensor wants them or may want them."""
+    if torch.compiler.is_compiling() and not tensors[0].requires_grad:
+        found: list[Tensor] = _forward(tensors, call)
+        return found
+    return list(_Differentiable.apply(call, *tensors))  # type: ignore[no-untyped-call]
+
+
+def _parse(call: str, tensors: list[Tensor]) -> tuple[_Function, dict[str, Any]]:
+    """Return the function of a call, and its arguments by name."""
+    name, keys, *settings = call.split("|")
+    pairs = (setting.split("=", 1) for setting in settings)
+    arguments = dict(zip(keys.split(","), tensors, strict=False))
+    return _FUNCTIONS[name], arguments | {key: ast.literal_eval(text) for key, text in pairs}
+
+
+def _as_list(found: Any) -> list[Tensor]:  # noqa: ANN401
+    tensors = [found] if isinstance(found, Tensor) else found
+    return [tensor for tensor in tensors if tensor is not None]
+
+
+@torch.library.custom_op("torchrg::patchwise", mutates_args=())
+def _forward(tensors: list[Tensor], call: str) -> list[Tensor]:
+    function, arguments = _parse(call, tensors)
+    return _as_list(function.run(**arguments))
+
+
+@torch.library.custom_op("torchrg::patchwise_gradient", mutates_args=())
+def _backward(tensors: list[Tensor], call: str) -> Tensor:
+    """Return the gradient of the first tensor; those of the outputs follow the inputs."""
+    function, arguments = _parse(call, tensors)
+    gradients = tensors[call.split("|")[1].count(",") + 1 :]
+    name = next(iter(arguments))
+
+    def differentiate() -> Tensor:
+        values = arguments[name].detach().clone().requires_grad_()
+        found = _as_list(function.run(**{**arguments, name: values}))
+        chosen = [found[place] for place in function.differentiable]
+        (gradient,) = torch.autograd.grad(chosen, values, gradients)
+        copied: Tensor = gradient.clone()
+        return copied
+
+    # Within an operation nothing is recorded for gradients; another thread is in none.
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(differentiate).result()
+
+
+@_forward.register_fake
+def _(tensors: list[Tensor], call: str) -> list[Tensor]:
+    return _as_list(_FUNCTIONS[call.split("|")[0]].outputs(tensors[0]))
+
+
+@_backward.register_fake
+def _(tensors: list[Tensor], call: str) -> Tensor:
+    return torch.empty_like(tensors[0])
+
+
+def _with_batch_first(size: int, places: list[int | None], tensors: list[Tensor]) -> list[Tensor]:
+    """Return tensors whose first axis is that of the batch."""
+    return [
+        tensor.expand(size, *tensor.shape) if place is None else tensor.movedim(place, 0)
+        for tensor, place in zip(tensors, places, strict=True)
+    ]
+
+
+if hasattr(_forward, "register_vmap"):  # torch 2.5
+
+    @_forward.register_vmap
+    def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+        found = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
+        return found, [0] * len(found)
+
+    @_backward.register_vmap
+    def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+        return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
+
+
+class _Differentiable(torch.autograd.Function):
+    """An opaque function with its gradient, which is another one."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(call: str, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(_forward(list(tensors), call))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ANN401
+        ctx.call, *tensors = inputs
+        ctx.save_for_backward(*tensors)
+        places = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
+        ctx.mark_non_differentiable(*(o for i, o in enumerate(output) if i not in places))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
+        places = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
+        tensors = [*ctx.saved_tensors, *(gradients[place].contiguous() for place in places)]
+        if torch.compiler.is_compiling():
+            first = _backward(tensors, ctx.call)
+        else:
+            first = _Once.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
+        return None, first, *[None] * (len(ctx.saved_tensors) - 1)
+
+
+class _Once(torch.autograd.Function):
+    """The gradient of an opaque function, which has none itself."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(call: str, *tensors: Tensor) -> Tensor:
+        gradient: Tensor = _backward(list(tensors), call)
+        return gradient
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ANN401
+        ctx.name = inputs[0].split("|")[0]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
+        raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")
