@@ -1,7 +1,6 @@
 """The methods that are compared."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from torchrg import load_config
@@ -9,24 +8,17 @@ from torchrg.config import PipelineConfig
 
 
 class Method(NamedTuple):
-    """A way to segment a cloud.
-
-    Attributes:
-        title: Its name in tables.
-        preset: The preset that it starts from.
-        growing: Settings of growth in which it differs.
-    """
+    """A way to segment a cloud: its name in tables, and its preset."""
 
     title: str
     preset: str
-    growing: Mapping[str, Any] = {}
 
 
 METHODS = {
     "pcl": Method("classic (PCL)", "classic"),
-    "classic": Method("classic (paper)", "classic", {"seed_rule": "increment"}),
-    "detmm": Method("DetMM", "detmm", {"seed_rule": "increment"}),
-    "printed": Method("paper as printed", "paper", {"connectivity_scope": "region"}),
+    "classic": Method("classic", "classic_increment"),
+    "detmm": Method("DetMM", "detmm"),
+    "printed": Method("Algorithm 2", "algorithm2"),
     "paper": Method("paper", "paper"),
     "consensus": Method("consensus", "consensus"),
 }
@@ -34,8 +26,8 @@ METHODS = {
 
 The paper compares all methods under its own description of region growing (II.B), in which a seed
 is chosen by the increment of the curvature; PCL's ``RegionGrowing`` tests the curvature itself.
-"As printed" is Algorithm 2, which drops unconnected neighbours; the text of the paper says three
-times that they join and only do not become seeds.
+Algorithm 2 drops unconnected neighbours; the text of the paper says three times that they join and
+only do not become seeds.
 """
 
 PAPERS = ("classic", "detmm", "paper")
@@ -46,10 +38,8 @@ DRAWN = (*PAPERS, "consensus")
 
 
 def settings_of(method: str) -> PipelineConfig:
-    """Return the settings of a method: its preset's, and where it differs its own."""
-    _, preset, growing = METHODS[method]
-    settings = load_config(preset)
-    return replace(settings, growing=replace(settings.growing, **growing))
+    """Return the settings of a method."""
+    return load_config(METHODS[method].preset)
 
 
 def titles(methods: Mapping[str, Any]) -> list[str]:
