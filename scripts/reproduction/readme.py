@@ -106,8 +106,8 @@ def to_section(results: Record) -> str:
             rows.append([f"{found['paper']['title']} ({found['paper']['faces']} faces)", *cells])
     made = "small clouds (`--quick`)" if results["quick"] else "full size"
     title = (
-        f"Adjusted Rand index / F1 of faces of {LARGE:,} points and more / mean best IoU; * made in "
-        f"place of the paper's cloud. `scripts/reproduce_paper.py`, {made}, commit "
+        f"Adjusted Rand index / F1 of faces of {LARGE:,} points and more / mean best IoU; * made "
+        f"in place of the paper's cloud. `scripts/reproduce_paper.py`, {made}, commit "
         f"{commit_of(results['made_with'])}:"
     )
     lines = [["cloud", *DRAWN], ["---", *["--:"] * len(DRAWN)], *rows]

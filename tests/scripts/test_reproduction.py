@@ -543,7 +543,7 @@ def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
     import reproduce_paper
 
     monkeypatch.setattr(reproduce_paper, "made_with", lambda: {"commit": "2f26e94-dirty"})
-    with pytest.raises(SystemExit, match="expected committed code .* got commit 2f26e94-dirty"):
+    with pytest.raises(SystemExit, match=r"expected committed code .* got commit 2f26e94-dirty"):
         call_script(monkeypatch, "--out", tmp_path, "times")
     assert not list(tmp_path.iterdir())
 
