@@ -5,9 +5,10 @@
     python scripts/reproduce_paper.py --out DIR normals times   # some parts
     python scripts/reproduce_paper.py --out DIR --again times   # Table 3 measured once more
 
-Open DIR/report.html. Each result is kept in a file of its own under DIR; what is there is not
-computed again, so a run that was interrupted goes on where it stopped. Quick results are apart, in
-DIR/quick. Clouds of the paper that are not given are replaced by made ones with known truth.
+Open DIR/report.html. Each result is kept in a file of its own under DIR; what the same commit made
+is not computed again, so a run that was interrupted goes on where it stopped. At full size the tree
+must be clean: a report is of one commit. Quick results are apart, in DIR/quick. Clouds of the paper
+that are not given are replaced by made ones with known truth.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
 
 from reproduction import method, normals, readme, segmentation, study, times
-from reproduction.cells import Folder, Record
+from reproduction.cells import Folder, Record, is_committed, made_with
 from reproduction.clouds import TITLES
 from reproduction.report import write_report
 from reproduction.runs import Run
@@ -44,6 +45,12 @@ def main() -> None:
     mpl.use("agg")
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
+    commit = made_with()["commit"]
+    if not arguments.quick and not is_committed(commit):
+        sys.exit(
+            "reproduce_paper.py: expected committed code for a report at full size, got commit "
+            f"{commit}; commit the changes, or take --quick."
+        )
     path = arguments.out / "quick" if arguments.quick else arguments.out
     folder = Folder(path, arguments.again)
     run = Run(folder, arguments.quick, {key: getattr(arguments, key) for key in TITLES})

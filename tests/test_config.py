@@ -26,7 +26,8 @@ def test_every_preset_loads_by_name_and_by_path(path):
 
 
 def test_presets_are_those_of_the_contract():
-    assert {"classic", "detmm", "paper", "consensus"} <= set(preset_names())
+    contract = {"classic", "classic_increment", "detmm", "paper", "algorithm2", "consensus"}
+    assert contract <= set(preset_names())
     assert load_config() == load_config("consensus")
     assert load_config("classic").growing.connectivity is None
     assert load_config("paper").growing == GrowingConfig()
@@ -39,6 +40,32 @@ def test_a_file_holds_differences_only(tmp_path):
     assert load_config(path) == PipelineConfig(growing=expected)
     path.write_text("")
     assert load_config(path) == PipelineConfig()
+
+
+def angles_of(config):
+    return config.normals.sharp_angle_deg, config.growing.max_angle_deg
+
+
+@pytest.mark.parametrize(
+    ("text", "angles"),
+    [
+        ("angle_deg: 8", (8, 8)),
+        ("angle_deg: 8\nbase: consensus", (8, 8)),
+        ("angle_deg: 8\ngrowing: {max_angle_deg: 3}", (8, 3)),
+        ("normals: {sharp_angle_deg: 2}\nangle_deg: 8", (2, 8)),
+        ("growing: {max_angle_deg: 3}", (5, 3)),
+    ],
+)
+def test_one_angle_moves_sharp_points_and_growth_unless_they_are_named(tmp_path, text, angles):
+    path = tmp_path / "my.yaml"
+    path.write_text(text)
+    assert angles_of(load_config(path)) == angles
+    assert angles_of(load_config(path).at_angle(4)) == (4, 4)
+
+
+def test_an_angle_beyond_a_right_one_is_refused():
+    with pytest.raises(ConfigError, match=r"expected angle_deg in \[0, 90\], got 90.5"):
+        PipelineConfig().at_angle(90.5)
 
 
 @pytest.mark.parametrize(
@@ -55,6 +82,9 @@ def test_a_file_holds_differences_only(tmp_path):
         ("growing: {connectivity: yes}", "expected float or null, got True"),
         ("planes: {up: w}", "up: expected one of x, y, z, -x, -y, -z or null, got 'w'"),
         ("growing: 5", "growing: expected a mapping of settings, got 5"),
+        ("angle_deg: [5]", r"angle_deg: expected float, got \[5\]"),
+        ("angle_deg: 91", r"expected angle_deg in \[0, 90\], got 91"),
+        ("angles: 5", "unknown key 'angles'; PipelineConfig has .*, angle_deg"),
         ("growing: [", "expected YAML"),
         ("- 1", "expected a mapping"),
     ],
@@ -68,7 +98,7 @@ def test_wrong_files_are_refused(tmp_path, text, message):
 
 
 def test_unknown_preset_lists_the_known_ones():
-    with pytest.raises(ConfigError, match=r"one of classic, .* got 'clasic'"):
+    with pytest.raises(ConfigError, match=r"one of algorithm2, .* got 'clasic'"):
         load_config("clasic")
 
 

@@ -47,9 +47,7 @@ def test_both_decompositions_agree(rng):
 
 
 def test_unknown_decomposition_is_refused():
-    with pytest.raises(
-        ConfigError, match="expected method to be one of jacobi, linalg, got 'svd'"
-    ):
+    with pytest.raises(ConfigError, match="expected method to be one of jacobi, linalg, got 'svd'"):
         modules.Eigh("svd")
 
 

@@ -34,7 +34,8 @@ class NormalsConfig:
     """How a point is tested for being sharp: by Qn of the angles between its normal and those of
     its neighbours (qn, eq. 9), or by their 25th percentile (percentile, Algorithm 1)."""
     sharp_angle_deg: float = 5.0
-    """A point is sharp when the rule for sharp points gives more than this angle."""
+    """A point is sharp when the rule for sharp points gives more than this angle, theta of the
+    paper. angle_deg of a configuration sets it together with max_angle_deg of growth."""
     support_fraction: float = 0.5
     """Share of the neighbours that the MCD fits, in [0.5, 1]. With 0.5 it resists most outliers;
     0.75 is the default of LIBRA, MATLAB's DetMCD."""
@@ -75,10 +76,14 @@ class GrowingConfig:
     """How regions grow; the defaults are the paper's."""
 
     max_angle_deg: float = 5.0
-    """A neighbour joins a region when the angle between the two normals is at most this. Larger
-    values join more."""
+    """A neighbour joins a region when the angle between the two normals is at most this, theta of
+    the paper. Larger values join more. angle_deg of a configuration sets it together with
+    sharp_angle_deg of normals."""
     curvature_quantile: float = 0.95
-    """Quantile of the curvatures of all valid points that is the curvature limit for seeds."""
+    """Quantile of the curvatures that is the curvature limit for seeds."""
+    curvature_scope: Literal["cloud", "neighborhood"] = "cloud"
+    """Points whose curvatures the quantile is of: all valid points of the cloud (cloud, Algorithm
+    2), or the neighbours of the seed (neighborhood, "of the k-NN" in section II.B)."""
     seed_rule: Literal["curvature", "increment"] = "increment"
     """When a point that joined becomes a seed, from which the region grows on: when its own
     curvature is at most the limit (curvature, as in PCL), or when the difference to the curvature
@@ -187,6 +192,32 @@ class PipelineConfig:
     def __post_init__(self) -> None:
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
+    def at_angle(self, angle_deg: float) -> "PipelineConfig":
+        """Return the settings with another angle: the one threshold that the paper tunes.
+
+        Below its eq. (9) the theta that tells sharp points is that of growth, so both move:
+        ``normals.sharp_angle_deg`` and ``growing.max_angle_deg``. A file says ``angle_deg: 8``,
+        the command line ``--angle-deg 8``; where these also name one of the two, that one stays.
+
+        Raises:
+            ConfigError: If the angle is not in [0, 90].
+
+        Example:
+            >>> config = load_config("paper").at_angle(8)
+            >>> config.normals.sharp_angle_deg, config.growing.max_angle_deg
+            (8, 8)
+        """
+        _check_angle("PipelineConfig", angle_deg)
+        parts = {
+            part: dataclasses.replace(getattr(self, part), **{name: angle_deg})
+            for part, name in _ANGLES.items()
+        }
+        return dataclasses.replace(self, **parts)
+
+
+_ANGLES = {"normals": "sharp_angle_deg", "growing": "max_angle_deg"}
+"""The settings that ``angle_deg`` moves, by their section."""
+
 
 @dataclass(frozen=True)
 class SuperpointsConfig:
@@ -282,7 +313,8 @@ def preset_names() -> list[str]:
 def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
     """Read settings from a preset or a YAML file; what it leaves out has its default.
 
-    A file that begins with ``base: NAME`` leaves out what that preset says instead.
+    A file that begins with ``base: NAME`` leaves out what that preset says instead. ``angle_deg``
+    at its top sets both angles: see :meth:`PipelineConfig.at_angle`.
 
     Args:
         name_or_file: A name from :func:`preset_names`, or the path of a ``.yaml`` file.
@@ -315,8 +347,15 @@ def _read_values(path: Path) -> object:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: expected YAML, got {reason}.") from error
-    if not isinstance(values, dict) or "base" not in values:
+    if not isinstance(values, dict):
         return {} if values is None else values
+    if "angle_deg" in values:
+        angle = _checked(values.pop("angle_deg"), float, f"{path}: angle_deg")
+        _check_angle(str(path), angle)
+        # What the file calls by its own name stays.
+        values = _merged({part: {name: angle} for part, name in _ANGLES.items()}, values)
+    if "base" not in values:
+        return values
     base = _preset_file(values.pop("base"), expected=f"{path}: expected base to be one of")
     return _merged(_read_values(base), values)
 
@@ -346,7 +385,7 @@ def _build_config(kind: type[Settings], values: object, *, where: str) -> Settin
     filled: dict[str, Any] = {}
     for key, value in values.items():
         if key not in hints:
-            names = ", ".join(hints)
+            names = ", ".join([*hints, *["angle_deg"] * (kind is PipelineConfig)])
             raise ConfigError(f"{where}: unknown key {key!r}; {kind.__name__} has {names}.")
         if dataclasses.is_dataclass(hints[key]):
             section = typing.cast(type, hints[key])
@@ -380,6 +419,12 @@ def _spelled(choice: Any) -> str:  # noqa: ANN401
     if typing.get_origin(choice) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(choice)))
     return "null" if choice is type(None) else str(choice.__name__)
+
+
+def _check_angle(where: str, angle_deg: float) -> None:
+    """Raise unless the angle of a configuration is in its range."""
+    if not 0 <= angle_deg <= 90:
+        raise ConfigError(f"{where}: expected angle_deg in [0, 90], got {angle_deg!r}.")
 
 
 def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401

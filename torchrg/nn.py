@@ -140,7 +140,7 @@ class Qn(_Function):
     finite_sample: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.dim, int) or isinstance(self.dim, bool):
+        if type(self.dim) is not int:
             raise ConfigError(f"Qn: expected dim to be a whole number, got {self.dim!r}.")
         nn.Module.__init__(self)
 

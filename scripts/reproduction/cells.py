@@ -1,4 +1,4 @@
-"""A folder of results, each computed once."""
+"""A folder of results, each computed once by one commit."""
 
 import functools
 import json
@@ -29,9 +29,10 @@ class Folder:
     _renewed: set[str] = field(default_factory=set)
 
     def cell(self, name: str, work: Callable[[], Record], *, needs: Path | None = None) -> Record:
-        """Return the record of that name, computed now if it is not there yet.
+        """Return the record of that name, computed now if this commit has not made it yet.
 
         A run that was interrupted goes on where it stopped, as records appear whole or not at all.
+        Those of other commits are made again: a report is of one.
 
         Args:
             name: Of the record.
@@ -42,7 +43,8 @@ class Folder:
         is_due = self.again and name not in self._renewed
         if path.exists() and (needs is None or needs.exists()) and not is_due:
             record: Record = json.loads(path.read_text())
-            return record
+            if record["made_with"]["commit"] == made_with()["commit"]:
+                return record
         record = {**work(), "made_with": made_with()}
         self._renewed.add(name)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,6 +67,16 @@ class Folder:
 def made_with() -> Record:
     """Return versions, commit, processor and threads: what a time depends on."""
     return surroundings.describe(torch.get_num_threads())
+
+
+def is_committed(commit: str) -> bool:
+    """Return whether the code is that of a commit, not of a tree with changes.
+
+    Example:
+        >>> is_committed("2f26e94"), is_committed("2f26e94-dirty")
+        (True, False)
+    """
+    return commit not in ("", "unknown") and "-dirty" not in commit
 
 
 def describe_surroundings(records: list[Record]) -> str:

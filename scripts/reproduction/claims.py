@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from reproduction.cells import Record
 from reproduction.clouds import HARD, title_of
 from reproduction.faces import LARGE
-from reproduction.methods import METHODS, PAPERS
+from reproduction.methods import PAPERS
 from reproduction.paper_numbers import INDEX_NAMES, INDICES
 from reproduction.sections import Block, claim, rising
 from torchrg.metrics import METRICS
@@ -54,7 +54,7 @@ def segmentation_claims(
         *([_curved(scores["curved"])] if "curved" in scores else []),
         _small(usual),
         *(_rise("beyond", name, form, take, hard) for name, form, take in _RISING[:2]),
-        *(_ahead("printed", "paper", *index, scores) for index in _RISING[:2]),
+        *(_ahead("algorithm2", "paper", *index, scores) for index in _RISING[:2]),
         *(_ahead("paper", "consensus", *index, scores) for index in _AHEAD),
     ]
 
@@ -107,7 +107,7 @@ def _sphere_claims(sphere: Scores, dvi_remark: str) -> list[Block]:
             theirs = _order({method: printed[method][place] for method in PAPERS}, name)
             values = {method: sphere[key][method][name] for method in PAPERS}
             ours = _order(values, name)
-            listed = ", ".join(f"{METHODS[method].title} {values[method]:.3g}" for method in ours)
+            listed = ", ".join(f"{method} {values[method]:.3g}" for method in ours)
             title = f"{name.upper()} of {sphere[key]['paper']['title']}"
             order[title] = (theirs == ours, listed)
             if theirs[0] == "paper":
@@ -236,6 +236,6 @@ def _ahead(
     """Return where a method is ahead of another one by an index."""
     return claim(
         "beyond",
-        f"{METHODS[low].title} < {METHODS[high].title} by {name}.",
+        f"{low} < {high} by {name}.",
         _each(scores, lambda found: rising([take(found[low]), take(found[high])], form)),
     )

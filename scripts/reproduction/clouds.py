@@ -18,6 +18,7 @@ from tests.made import (
     KINECT_LAYOUT,
     StoreyLayout,
     make_kinect_room,
+    make_mapped_room,
     make_storey,
     on_voxels,
     quantised_frame,
@@ -51,6 +52,7 @@ HARD = {
     "exact": "exact planes",
     "quantised": "depth in centimetres",
     "stepped": "depth in steps of a Kinect",
+    "frames": "raw frames of a Kinect",
     "thinned": "thinned to voxels",
     "curved": "curved surfaces",
 }
@@ -204,9 +206,12 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "kinect": (
         lambda quick: (
-            make_kinect_room(40_000, num_frames=4) if quick else make_kinect_room(POINTS["kinect"])
+            make_mapped_room(40_000, num_frames=16, voxel=0.04)
+            if quick
+            else make_mapped_room(POINTS["kinect"])
         ),
-        "an office from simulated depth frames with the noise of a Kinect",
+        "an office as mapped from frames of a Kinect v2: its noise, errors of registration, the "
+        "mean of each voxel",
     ),
     "room": (_room, "a furnished room, noise 3 mm"),
     "hall": (
@@ -227,6 +232,12 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
             quick, lambda depth: _DISPARITY_SCALE / (_DISPARITY_SCALE / depth).round()
         ),
         "one depth frame without noise, its disparity in eighths of a pixel",
+    ),
+    "frames": (
+        lambda quick: (
+            make_kinect_room(30_000, num_frames=4) if quick else make_kinect_room(250_000)
+        ),
+        "an office from 16 depth frames of a first Kinect, noise and steps, not averaged",
     ),
     "thinned": (
         lambda quick: on_voxels(_room(quick, num_points=5), _VOXEL),

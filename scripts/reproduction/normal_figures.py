@@ -19,6 +19,7 @@ STYLES = {
     "irls": ("weighted PCA", "#e39b3d", "^", "-"),
     "detmm": ("DetMM", "#7a4f9a", "D", "-"),
     "paper": ("PCA + DetMCD (paper)", "#c44e52", "X", "-"),
+    "libra": ("the same, DetMCD of LIBRA", "#c44e52", "x", "--"),
     "consensus": ("consensus", "#2a7f3f", "*", "-"),
     "adaptive": ("consensus, adaptive k", "#7cc08a", "*", "--"),
 }

@@ -19,8 +19,13 @@ COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
 }
 """Columns of a table of errors: field of the score, and how it is printed. Degrees."""
 
-PLAIN, ROBUST = ("pca", "jet"), ("irls", "detmm", "paper")
-"""What the paper compares: "fast but inaccurate", and the others."""
+PLAIN, ROBUST = ("pca", "jet"), ("irls", "detmm")
+"""What the paper compares with its own: "fast but inaccurate", and the others."""
+
+OURS = {"paper": "the two-stage method", "libra": "the two-stage method with LIBRA's DetMCD"}
+"""The paper's method: the preset, and with the DetMCD that its MATLAB very probably called."""
+
+WHY = ""
 
 TENTH = 0.1
 """An order of magnitude, of times."""
@@ -91,18 +96,27 @@ def normal_claims(records: list[Record], *, with_times: bool) -> list[Block]:
     """
     papers = [record for record in records if record["shape"] in ("cuboid", "dodecahedron")]
     others = [record for record in records if record not in papers]
-    every = "DetMM, weighted PCA and the two-stage method are below PCA and jets"
-    claims = [
-        claim("II.A, Figure 4", f"{every} by MSAE.", _robust_below(papers, "msae", ".1f")),
-        claim("beyond", f"{every} by the mean angle.", _robust_below(papers, "mean", ".2f")),
-        claim("II.A", f"{every} by MSAE: on other shapes.", _robust_below(others, "msae", ".1f")),
-        claim(
-            "II.A, Figure 4",
-            "The two-stage method has the second-lowest MSAE of the five.",
-            _second_lowest(papers),
-            "Means over seeds, lowest first.",
-        ),
-    ]
+    claims = []
+    for ours, name in OURS.items():
+        every = f"DetMM, weighted PCA and {name} are below PCA and jets by"
+        claims += [
+            claim(
+                "II.A, Figure 4", f"{every} MSAE.", _robust_below(papers, ours, "msae", ".1f"), WHY
+            ),
+            claim("beyond", f"{every} the mean angle.", _robust_below(papers, ours, "mean", ".2f")),
+            claim(
+                "II.A",
+                f"{every} MSAE: on other shapes.",
+                _robust_below(others, ours, "msae", ".1f"),
+                WHY,
+            ),
+            claim(
+                "II.A, Figure 4",
+                f"Second-lowest MSAE of the five has {name}.",
+                _second_lowest(papers, ours),
+                f"Means over seeds, lowest first. {WHY}",
+            ),
+        ]
     if with_times:
         claims.append(
             claim(
@@ -115,26 +129,28 @@ def normal_claims(records: list[Record], *, with_times: bool) -> list[Block]:
     return claims
 
 
-def _robust_below(records: list[Record], field: str, form: str) -> dict[str, tuple[bool, str]]:
+def _robust_below(
+    records: list[Record], ours: str, field: str, form: str
+) -> dict[str, tuple[bool, str]]:
     """Return where all robust estimators are below all plain ones, for every seed."""
     found = {}
     for place, some in _by_place(records).items():
         below = all(
-            max(_scores(one, field, ROBUST)) < min(_scores(one, field, PLAIN))
+            max(_scores(one, field, (*ROBUST, ours))) < min(_scores(one, field, PLAIN))
             for one in (where(some, seed=seed) for seed in values(some, "seed"))
         )
-        means = {name: mean_score(some, field, variant=name) for name in (*PLAIN, *ROBUST)}
+        means = {name: mean_score(some, field, variant=name) for name in (*PLAIN, *ROBUST, ours)}
         found[place] = (below, ", ".join(f"{name} {mean:{form}}" for name, mean in means.items()))
     return found
 
 
-def _second_lowest(records: list[Record]) -> dict[str, tuple[bool, str]]:
+def _second_lowest(records: list[Record], ours: str) -> dict[str, tuple[bool, str]]:
     """Return where the two-stage method is second of the paper's five, or first."""
     found = {}
     for place, some in _by_place(records).items():
-        means = {name: mean_score(some, "msae", variant=name) for name in (*PLAIN, *ROBUST)}
+        means = {name: mean_score(some, "msae", variant=name) for name in (*PLAIN, *ROBUST, ours)}
         order = sorted(means, key=means.__getitem__)
-        found[place] = (order.index("paper") <= 1, " < ".join(order))
+        found[place] = (order.index(ours) <= 1, " < ".join(order))
     return found
 
 

@@ -21,7 +21,7 @@ from reproduction.normal_tables import (
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, section, text
 from tests.made import SHAPES, make_shape
-from torchrg.config import NormalsConfig
+from torchrg.config import NormalsConfig, load_config
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_normals
 from torchrg.neighbors import search_knn
@@ -46,25 +46,23 @@ class Grid(NamedTuple):
     variants: tuple[str, ...]  # names of :data:`VARIANTS`
 
 
+_PAPER = load_config("paper").normals
+
 VARIANTS = {
     "pca": NormalsConfig(method="pca", k=K),
     "jet": NormalsConfig(method="jet", k=K),
     "irls": NormalsConfig(method="irls", k=K, irls_decay=1.01),  # The authors'.
     "detmm": NormalsConfig(method="detmm", k=K),
-    "paper": NormalsConfig(
-        method="paper",
-        k=K,
-        support_fraction=0.75,
-        mcd_scaling="quantile",
-        mcd_inliers="reweighted",
+    "paper": _PAPER,
+    "libra": dataclasses.replace(
+        _PAPER, support_fraction=0.75, mcd_scaling="quantile", mcd_inliers="reweighted"
     ),
-    "raw DetMCD": NormalsConfig(method="paper", k=K),
     "consensus": NormalsConfig(method="consensus", k=K),
     "adaptive": NormalsConfig(method="consensus", k=K, adaptive_k=300),
 }
-"""Estimators by the name they have in tables, the paper's five first. Its DetMCD is that of LIBRA,
-the library of its authors; beside it that of the preset, as published, with the smallest subsets
-and distances to the raw fit. ``adaptive`` is consensus with up to 300 neighbours."""
+"""Estimators by the name they have in tables, the paper's five first. ``paper`` is the preset, as
+everywhere in the report: DetMCD as published. ``libra`` is the same with the DetMCD of LIBRA, which
+the paper's MATLAB very probably called. ``adaptive`` is consensus with up to 300 neighbours."""
 
 PAPERS = ("cuboid", "dodecahedron")
 """Shapes of Figure 4."""

@@ -7,10 +7,10 @@
 import json
 from pathlib import Path
 
-from reproduction.cells import Record
+from reproduction.cells import Record, is_committed
 from reproduction.clouds import HARD
 from reproduction.faces import LARGE
-from reproduction.methods import DRAWN, titles
+from reproduction.methods import DRAWN
 from reproduction.sections import mark_best
 from torchrg.io import atomic_path
 
@@ -30,16 +30,28 @@ def update(report: Record) -> None:
         report: All parts, as :func:`reproduction.report.write_report` returns it.
 
     Raises:
-        ValueError: If some of it was made by code that is not committed.
+        ValueError: If it was made by code that is not committed, or by several commits.
     """
-    if "-dirty" in report["made_with"] or "commit unknown" in report["made_with"]:
+    commit = commit_of(report["made_with"])
+    if not is_committed(commit) or "," in commit:
         raise ValueError(
-            f"update: expected a report made by committed code, got {report['made_with']}; commit, "
-            "then make the report again with --again."
+            f"update: expected a report of one commit, got {commit or 'none'}; commit, then make "
+            "the report again."
         )
     results = take_results(report)
     _write(RESULTS, json.dumps(results, indent=1) + "\n")
     _write(README, insert(README.read_text(encoding="utf-8"), results))
+
+
+def commit_of(made_with: str) -> str:
+    """Return the commit, or several, in a line that says how something was made.
+
+    Example:
+        >>> commit_of("torchrg 0.1.0; commit 2f26e94; python 3.11.7")
+        '2f26e94'
+    """
+    fields = dict(field.partition(" ")[::2] for field in made_with.split("; "))
+    return fields.get("commit", "")
 
 
 def insert(readme: str, results: Record) -> str:
@@ -92,13 +104,13 @@ def to_section(results: Record) -> str:
             ]
             cells = map(" / ".join, zip(*columns, strict=True))
             rows.append([f"{found['paper']['title']} ({found['paper']['faces']} faces)", *cells])
-    made = "small clouds: `--quick`" if results["quick"] else "full size"
+    made = "small clouds (`--quick`)" if results["quick"] else "full size"
     title = (
-        f"Adjusted Rand index / F1 of faces of {LARGE:,} points and more / mean best IoU, of "
-        "clouds with truth (*: made in place of the paper's), from `scripts/reproduce_paper.py` "
-        f"({made}; {results['made_with']}):"
+        f"Adjusted Rand index / F1 of faces of {LARGE:,} points and more / mean best IoU; * made "
+        f"in place of the paper's cloud. `scripts/reproduce_paper.py`, {made}, commit "
+        f"{commit_of(results['made_with'])}:"
     )
-    lines = [["cloud", *titles(DRAWN)], ["---", *["--:"] * len(DRAWN)], *rows]
+    lines = [["cloud", *DRAWN], ["---", *["--:"] * len(DRAWN)], *rows]
     return "\n".join([title, "", *("| " + " | ".join(line) + " |" for line in lines)])
 
 

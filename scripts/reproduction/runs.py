@@ -10,8 +10,8 @@ from torch import Tensor
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud, load_cloud
 from reproduction.faces import find_edges
-from reproduction.methods import settings_of
 from torchrg import estimate_normals, load_config, search_knn, segment_planes
+from torchrg.config import NormalsConfig
 from torchrg.scenes import make_room
 from torchrg.structures import Neighbors, NormalFit
 
@@ -47,7 +47,7 @@ class Run:
     def warm_up(self, method: str) -> None:
         """Segment a small cloud first, so that no time includes the loading of code."""
         if method not in self._warm:
-            segment_planes(make_room(_WARM_UP).points, settings_of(method))
+            segment_planes(make_room(_WARM_UP).points, load_config(method))
             self._warm.add(method)
 
 
@@ -56,7 +56,7 @@ class LoadedCloud:
     """A cloud, and its neighbours and normals once they are asked for."""
 
     cloud: EvalCloud
-    _fits: dict[str, NormalFit] = field(default_factory=dict)
+    _fits: dict[NormalsConfig, NormalFit] = field(default_factory=dict)
 
     @cached_property
     def neighbors(self) -> Neighbors:
@@ -68,14 +68,14 @@ class LoadedCloud:
         """The points with true faces of two kinds among their neighbours, shape ``(N,)``."""
         return find_edges(self.cloud.labels, self.neighbors)
 
-    def fit(self, method: str) -> NormalFit:
-        """Return the normals of a method; those of the last one asked for are kept."""
-        if method not in self._fits:
+    def fit(self, settings: NormalsConfig) -> NormalFit:
+        """Return normals by some settings; those of the last ones asked for are kept."""
+        if settings not in self._fits:
             self._fits.clear()
-            self._fits[method] = estimate_normals(
-                self.cloud.points, config=settings_of(method).normals, neighbors=self.neighbors
+            self._fits[settings] = estimate_normals(
+                self.cloud.points, config=settings, neighbors=self.neighbors
             )
-        return self._fits[method]
+        return self._fits[settings]
 
     def forget(self) -> None:
         """Let go what is large and can be computed again."""

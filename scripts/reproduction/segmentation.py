@@ -7,7 +7,7 @@ from reproduction.cells import Record
 from reproduction.claims import segmentation_claims
 from reproduction.clouds import HARD, OTHERS, TITLES
 from reproduction.faces import LARGE
-from reproduction.methods import DRAWN, METHODS, PAPERS, titles
+from reproduction.methods import DRAWN, METHODS, PAPERS
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
 from reproduction.pictures import draw_outcomes, draw_side_by_side, write_pair
 from reproduction.runs import Run
@@ -66,13 +66,14 @@ def reproduce(run: Run) -> Record:
     angles = {key: _angles(run, key) for key in ("cory", "kinect")}
     blocks = [
         text(
-            "Classic (PCL) chooses seeds by curvature as PCL does; classic (paper) and DetMM by "
-            "its increment, as the paper describes region growing (II.B). In paper, neighbours "
-            "that share less than 75 % of their neighbours with a seed join and become seeds once "
-            "a connected seed reaches them (text of the paper); paper as printed drops them "
-            "(Algorithm 2). F1 is the paper's: of mean precision and recall over the pairs of a "
-            "region and a face that are each other's largest overlap. Regions and faces without "
-            "a partner do not enter it, and a face of 50 points weighs as much as a wall: hence "
+            "Methods are presets. classic chooses seeds by curvature as PCL does; "
+            "classic_increment and detmm by its increment, as the paper describes region growing "
+            "(II.B). In paper, neighbours that share less than 75 % of their neighbours with a "
+            "seed join and become seeds once a connected seed reaches them (text of the paper); "
+            "algorithm2 drops them, as Algorithm 2 is printed. F1 is the paper's: of mean "
+            "precision and recall over the pairs of a region and a face that are each other's "
+            "largest overlap. Regions and faces without a partner do not enter it, and a face of "
+            "50 points weighs as much as a wall: hence "
             "F1 of faces of 1,000 points and more, and F1 of objects, where a table or a door is "
             "one, as in S3DIS. ARI and mean best IoU count everything. Faces found: at IoU 0.5. "
             "Right at edges: points with another face among their 50 neighbours that lie in the "
@@ -116,7 +117,7 @@ def index_table(run: Run, key: str, found: dict[str, Record]) -> Block:
     ]
     faces = next(iter(found.values()))["labels"]["faces"]
     title = f"**{run.cloud(key).cloud.title}** ({faces} faces; {run.cloud(key).cloud.origin})"
-    return table(title, ["method", *COLUMNS], zip(titles(found), *columns, strict=True))
+    return table(title, ["method", *COLUMNS], zip(found, *columns, strict=True))
 
 
 def sphere_table(run: Run, key: str, sphere: dict[str, Record], scores: dict[str, Record]) -> Block:
@@ -139,15 +140,13 @@ def sphere_table(run: Run, key: str, sphere: dict[str, Record], scores: dict[str
                 *mark_best(ours, form, higher=higher),
             ]
         )
-    head = [key, *(f"printed: {title}" for title in titles(dict.fromkeys(PAPERS)))]
+    head = [key, *(f"printed: {title}" for title in PAPERS)]
     note = (
         f"Left, the paper's printed numbers; right, ours on {run.cloud(key).cloud.origin}. "
         f"Clusters of more than {SAMPLE_SIZE:,} points enter DBI by a subsample of that size. "
         f"{DVI_REMARK}"
     )
-    return table(
-        f"**Table 2**, {run.cloud(key).cloud.title}", [*head, *titles(METHODS)], rows, note
-    )
+    return table(f"**Table 2**, {run.cloud(key).cloud.title}", [*head, *METHODS], rows, note)
 
 
 def _external(record: Record, name: str) -> float | None:
@@ -159,7 +158,7 @@ def _external(record: Record, name: str) -> float | None:
 def draw_figures(run: Run, key: str, number: str) -> list[Block]:
     """Return the figures of a cloud: methods side by side, and with truth what is wrong."""
     cloud = run.cloud(key).cloud
-    labelings = {METHODS[method].title: read_segmented(run, key, method).labels for method in DRAWN}
+    labelings = {method: read_segmented(run, key, method).labels for method in DRAWN}
     name = f"{number.lower().replace(' ', '')}_{key}"
     file = draw_side_by_side(run.folder, name, cloud, labelings)
     page = write_pair(run.folder, name, cloud, labelings)
@@ -180,7 +179,7 @@ def draw_figures(run: Run, key: str, number: str) -> list[Block]:
 
 
 def _angles(run: Run, key: str) -> Record:
-    """Draw what the paper's method makes of a cloud at several angles of growth, and score it."""
+    """Draw what the paper's method makes of a cloud at several angles, and score it."""
     cloud = run.cloud(key).cloud
 
     def work() -> Record:
@@ -215,8 +214,8 @@ def angle_blocks(run: Run, key: str, record: Record) -> list[Block]:
         for angle, one in record["angles"].items()
     ]
     caption = (
-        f"**Figure 9**, {run.cloud(key).cloud.origin}: the paper's method at several angles of "
-        "growth. Normals and sharp points are those of the preset, at 5 degrees."
+        f"**Figure 9**, {run.cloud(key).cloud.origin}: the paper's method at several angles, "
+        "which are those of sharp points and of growth."
     )
     return [
         figure(f"figures/{_angles_name(key)}.png", caption),

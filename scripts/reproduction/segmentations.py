@@ -10,9 +10,8 @@ from torch import Tensor
 
 from reproduction.cells import Record
 from reproduction.faces import score_faces
-from reproduction.methods import settings_of
 from reproduction.runs import Run
-from torchrg import Cloud, read_cloud, segment_planes, write_cloud
+from torchrg import Cloud, load_config, read_cloud, segment_planes, write_cloud
 from torchrg.metrics import score_clusters, score_labels
 from torchrg.regions import grow_regions
 
@@ -42,7 +41,7 @@ def segment(run: Run, key: str, method: str) -> Record:
             begins.append((stage, time.perf_counter()))
             print(f" {stage}", end="", flush=True)
 
-        seg = segment_planes(cloud.points, settings_of(method), on_stage=note)
+        seg = segment_planes(cloud.points, load_config(method), on_stage=note)
         total = begins[-1][1] - begins[0][1]
         print(f", {total:.1f} s", flush=True)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -100,22 +99,26 @@ def score_sphere(run: Run, key: str, method: str) -> Record:
     return run.folder.cell(f"sphere-{cloud.name}-{method}", work)
 
 
-def regrow(
-    run: Run, key: str, method: str, max_angle_deg: float, curvature_quantile: float
-) -> Tensor:
-    """Return the labels ``(N,)`` that a method gives with other limits of growth."""
-    growing = settings_of(method).growing
-    if (max_angle_deg, curvature_quantile) == (growing.max_angle_deg, growing.curvature_quantile):
+def regrow(run: Run, key: str, method: str, angle_deg: float, curvature_quantile: float) -> Tensor:
+    """Return the labels ``(N,)`` that a method gives at another angle and limit of curvature.
+
+    The angle is the one of the paper, that of sharp points and of growth.
+    """
+    usual = load_config(method)
+    settings = usual.at_angle(angle_deg)
+    growing = replace(settings.growing, curvature_quantile=curvature_quantile)
+    if growing == usual.growing:
         return read_segmented(run, key, method).labels
-    settings = replace(growing, max_angle_deg=max_angle_deg, curvature_quantile=curvature_quantile)
+    # Only the paper's normals depend on an angle; others are estimated once.
+    normals = settings.normals if usual.normals.method == "paper" else usual.normals
     loaded = run.cloud(key)
-    fit = loaded.fit(method)
+    fit = loaded.fit(normals)
     return grow_regions(
         loaded.cloud.points,
         fit.normals,
         fit.curvature,
         loaded.neighbors,
-        settings,
+        growing,
         valid=fit.valid,
         residual_rms=fit.residual_rms,
     )

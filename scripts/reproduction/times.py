@@ -2,7 +2,7 @@
 
 from reproduction.cells import Record, describe_surroundings
 from reproduction.clouds import TITLES
-from reproduction.methods import METHODS, PAPERS, titles
+from reproduction.methods import METHODS, PAPERS
 from reproduction.paper_numbers import MINUTES, POINTS
 from reproduction.runs import Run
 from reproduction.sections import Block, claim, section, table, text
@@ -52,7 +52,7 @@ def ratio_table(run: Run, records: list[Record]) -> Block:
             cells.append(f"{record['total']:.1f} s{theirs}")
         rows.append([cloud.title, f"{len(cloud.points):,}", *cells])
     note = "Seconds, then the paper's minutes and how many times faster. * made cloud, or a piece."
-    return table("**Table 3**", ["cloud", "points", *titles(METHODS)], rows, note)
+    return table("**Table 3**", ["cloud", "points", *METHODS], rows, note)
 
 
 def stage_table(records: list[Record]) -> Block:
@@ -60,7 +60,7 @@ def stage_table(records: list[Record]) -> Block:
     rows = [
         [
             record["title"],
-            METHODS[record["method"]].title,
+            record["method"],
             *(f"{record['seconds'][stage]:.1f}" for stage in STAGES),
             f"{100 * record['sharp_fraction']:.1f} %",
             f"{1e6 * record['total'] / record['points']:.1f}",

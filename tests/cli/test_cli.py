@@ -76,6 +76,22 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(room, tmp_path):
     assert (used["growing"]["min_size"], used["growing"]["max_angle_deg"]) == (10, 7.0)
 
 
+@pytest.mark.parametrize(
+    ("flags", "angles"),
+    [
+        (["--angle-deg", "8"], (8.0, 8.0)),
+        (["--angle_deg=8", "--growing.max-angle-deg", "3"], (8.0, 3.0)),
+        (["--normals.sharp-angle-deg", "2"], (2.0, 5.0)),
+    ],
+)
+def test_one_flag_moves_both_angles(room, tmp_path, flags, angles):
+    out = tmp_path / "seg.npz"
+    assert main(["segment", str(room), "--out", str(out), "--preset", "paper", *flags]) == 0
+    with np.load(out) as result:
+        used = json.loads(str(result["provenance"]))["config"]
+    assert (used["normals"]["sharp_angle_deg"], used["growing"]["max_angle_deg"]) == angles
+
+
 def test_several_inputs_go_to_a_directory_and_a_bad_one_stops_no_other(room, tmp_path, capsys):
     bad = tmp_path / "bad.pcd"
     bad.write_bytes(b"not a cloud")
@@ -143,7 +159,9 @@ def mistakes(tmp_path, room):
         ("empty.pcd", [], "expected at least one point"),
         ("pickled.npz", [], "pickle"),
         ("nan.npy", [], "finite"),
-        ("ROOM", ["--preset", "clasic"], "classic, consensus"),
+        ("ROOM", ["--preset", "clasic"], "classic, classic_increment"),
+        ("ROOM", ["--angle-deg", "91"], "expected angle_deg in [0, 90], got 91.0"),
+        ("ROOM", ["--angle-deg", "five"], "--angle-deg"),
         ("ROOM", ["--config", "wrong.yaml"], "unknown key 'max_angle'"),
         ("ROOM", ["--config", "none.yaml"], "No such file"),
         ("ROOM", ["--normals.k", "2"], "expected k >= 3, got 2"),

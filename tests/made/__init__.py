@@ -15,6 +15,7 @@ from tests.made.cameras import (
     cameras_around,
     fuse_frames,
     make_kinect_room,
+    make_mapped_room,
     render_depth,
 )
 from tests.made.patches import OUTLIERS, contaminated
@@ -50,6 +51,7 @@ __all__ = [
     "fuse_frames",
     "in_pieces",
     "make_kinect_room",
+    "make_mapped_room",
     "make_shape",
     "make_storey",
     "objects_of",

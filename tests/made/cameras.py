@@ -1,7 +1,7 @@
 """Depth cameras: pinhole geometry, the noise of a Kinect, and frames fused to a cloud."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -23,7 +23,7 @@ from torchrg.scenes import (
 )
 from torchrg.structures import UNLABELED
 
-Sensor = Literal["exact", "kinect"]
+Sensor = Literal["exact", "kinect", "kinect2"]
 
 _SENSOR_NOISE, _CAMERAS, _FUSION = 200, 300, 400
 """What random numbers are drawn for."""
@@ -40,6 +40,15 @@ _DISPARITY_STEP = 1 / 8
 """Pixels."""
 _NOISE_FLOOR, _NOISE_GROWTH = 0.0012, 0.0019
 """Standard deviation at the nearest depth, metres, and its growth with the square beyond it."""
+
+_KINECT2_RANGE = (0.5, 4.5)
+"""Metres, of a Kinect v2."""
+_KINECT2_NOISE = (0.0015, -0.0005, 0.0003)
+"""Standard deviation of its depth in metres: a polynomial of the depth in metres."""
+_KINECT2_SIZE, _KINECT2_FOCAL = (512, 424), 365.0
+"""Pixels."""
+_DRIFT_METRES, _DRIFT_DEG = 0.004, 0.2
+"""Standard deviation of where a registration places a frame, and of how it turns it, by axis."""
 
 KINECT_LAYOUT = RoomLayout(
     size=(5.4, 4.4, 2.6),
@@ -194,12 +203,13 @@ def render_depth(
     The Kinect's noise is the axial one of [1]: a standard deviation of
     ``0.0012 + 0.0019 (z - 0.4)^2`` metres along the optical axis; then the disparity, for a
     baseline of 7.5 cm, is rounded to an eighth of a pixel, and depth outside of 0.4 to 8 m is
-    dropped.
+    dropped. A Kinect v2 measures the time of flight, without such steps: its noise is the axial one
+    of [2] for surfaces that face it, ``0.0015 - 0.0005 z + 0.0003 z^2``, from 0.5 to 4.5 m.
 
     Args:
         model: The scene.
         camera: Default: the first of :func:`cameras_around`.
-        sensor: ``"exact"`` or ``"kinect"``.
+        sensor: ``"exact"``, ``"kinect"`` or ``"kinect2"``.
         seed: Of the noise, and of the default camera.
 
     Raises:
@@ -208,6 +218,8 @@ def render_depth(
     References:
         [1] C. V. Nguyen, S. Izadi, D. Lovell. Modeling Kinect sensor noise for improved 3D
         reconstruction and tracking. 3DIMPVT, 2012.
+        [2] P. Fankhauser et al. Kinect v2 for mobile robot navigation: evaluation and modeling.
+        ICAR, 2015.
 
     Example:
         >>> from torchrg.scenes import build_room
@@ -230,6 +242,8 @@ def render_depth(
     depth = np.where(faces == UNLABELED, 0, exact)
     if sensor == "kinect":
         depth = _as_kinect(depth, camera.fx, np.random.default_rng([seed, _SENSOR_NOISE]))
+    if sensor == "kinect2":
+        depth = _as_kinect2(depth, np.random.default_rng([seed, _SENSOR_NOISE]))
     seen = depth > 0
     return DepthFrame(
         depth=torch.from_numpy(depth.astype(np.float32)),
@@ -253,6 +267,15 @@ def _as_kinect(depth: Array, focal: float, rng: np.random.Generator) -> Array:
     valid = (depth > 0) & (noisy >= nearest) & (noisy <= furthest)
     steps = np.rint(scale / np.where(valid, noisy, 1))
     return np.where(valid, scale / steps, 0)
+
+
+def _as_kinect2(depth: Array, rng: np.random.Generator) -> Array:
+    """Return depth with the noise of a Kinect v2; 0 where out of its range."""
+    nearest, furthest = _KINECT2_RANGE
+    constant, slope, bend = _KINECT2_NOISE
+    deviation = constant + slope * depth + bend * depth * depth
+    noisy = depth + deviation * rng.standard_normal(depth.shape)
+    return np.where((depth > 0) & (noisy >= nearest) & (noisy <= furthest), noisy, 0)
 
 
 def make_kinect_room(
@@ -280,6 +303,66 @@ def make_kinect_room(
         for number, camera in enumerate(cameras_around(model, num_frames, seed=seed))
     ]
     return fuse_frames(model, frames, num_points, seed=seed)
+
+
+def make_mapped_room(
+    num_points: int = 968_520, seed: int = 0, *, num_frames: int = 48, voxel: float = 0.012
+) -> Scene:
+    """Make the map of a room that a Kinect v2 was carried through: the mean of what each voxel saw.
+
+    Frames are placed with the errors of a registration, some millimetres and tenths of a degree,
+    and a voxel has the mean of the points of all frames in it, as RTAB-Map exports its maps. The
+    points are a random subset of these, in random order; face and normal are of a point in each.
+
+    Args:
+        num_points: Points of the map.
+        seed: Of the room, the cameras, the noise and the errors.
+        num_frames: Frames that were taken.
+        voxel: Side of a voxel in metres.
+
+    Raises:
+        ConfigError: If the map has fewer points.
+
+    Example:
+        >>> make_mapped_room(1000, num_frames=1, voxel=0.04).points.shape
+        torch.Size([1000, 3])
+    """
+    model, rng = build_room(seed, layout=KINECT_LAYOUT), np.random.default_rng([seed, _FUSION + 2])
+    width, height = _KINECT2_SIZE
+    parts = []
+    for number, camera in enumerate(
+        cameras_around(model, num_frames, seed=seed, width=width, height=height)
+    ):
+        camera = replace(camera, fx=_KINECT2_FOCAL, fy=_KINECT2_FOCAL)
+        frame = render_depth(model, camera, sensor="kinect2", seed=seed * num_frames + number)
+        pixels = np.flatnonzero(frame.depth.numpy().ravel() > 0)
+        points, normals, faces = _to_world(frame, pixels)
+        shift, turn = rng.standard_normal((2, 3)) * [[_DRIFT_METRES], [np.radians(_DRIFT_DEG)]]
+        points = points + shift + np.cross(turn, points - camera.frame.origin)
+        parts.append((points, normals, faces))
+    points, normals, faces = map(np.concatenate, zip(*parts, strict=True))
+    cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
+    sides = cells.max(axis=0) + 1
+    _, firsts, rows, counts = np.unique(
+        np.ravel_multi_index(cells.T, sides),
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    if num_points > len(firsts):
+        raise ConfigError(
+            f"make_mapped_room: expected num_points <= {len(firsts)}, the voxels that were seen, "
+            f"got {num_points}; take more frames or smaller voxels."
+        )
+    means = np.stack([np.bincount(rows, column) for column in points.T], axis=1) / counts[:, None]
+    kept = rng.permutation(len(firsts))[:num_points]
+    chosen = firsts[kept]
+    return label_points(
+        model,
+        means[kept].astype(np.float32),
+        faces[chosen],
+        normals[chosen].astype(np.float32),
+    )
 
 
 def fuse_frames(

@@ -20,6 +20,7 @@ def segment(
     k=None,
     max_angle_deg=5.0,
     curvature_quantile=0.95,
+    curvature_scope="cloud",
     seed_rule="increment",
     connectivity=0.75,
     connectivity_scope="region",
@@ -37,8 +38,7 @@ def segment(
     num_points, k = len(points), k or len(knn[0])
     valid = [True] * num_points if valid is None else valid
     promotes_late = connectivity is not None and connectivity_scope == "seed"
-    ascending = sorted(c for c, v in zip(curvature, valid, strict=True) if v)
-    sigma_th = ascending[int(curvature_quantile * (len(ascending) - 1))] if ascending else 0.0
+    sigma_th = curvature_percentile(range(num_points), curvature, valid, curvature_quantile)
     available = {i for i in range(num_points) if valid[i]}
     regions = []
 
@@ -53,6 +53,8 @@ def segment(
         available.remove(p_min)
         for seed in seeds:
             neighbors = list(knn[seed])
+            if curvature_scope == "neighborhood":
+                sigma_th = curvature_percentile(neighbors, curvature, valid, curvature_quantile)
             connected = [
                 connectivity is None or num_shared(knn, seed, j) >= connectivity * k
                 for j in neighbors
@@ -93,6 +95,11 @@ def segment(
         for i in region:
             labels[i] = label
     return labels
+
+
+def curvature_percentile(rows, curvature, valid, quantile):
+    ascending = sorted(curvature[i] for i in rows if valid[i])
+    return ascending[int(quantile * (len(ascending) - 1))] if ascending else 0.0
 
 
 def num_shared(knn, i, j):

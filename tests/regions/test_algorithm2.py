@@ -16,16 +16,19 @@ from torchrg.regions import grow_regions
 RULES = [
     {
         "seed_rule": seed_rule,
+        "curvature_scope": curvature_scope,
         "connectivity": connectivity,
         "connectivity_scope": scope,
         "coplanarity": coplanarity_scope is not None,
         "coplanarity_scope": coplanarity_scope or "all",
     }
-    for seed_rule, (connectivity, scope), coplanarity_scope in itertools.product(
+    for seed_rule, curvature_scope, (connectivity, scope), coplanarity_scope in itertools.product(
         ["curvature", "increment"],
+        ["cloud", "neighborhood"],
         [(None, "region"), (0.5, "region"), (0.5, "seed")],
         [None, "all", "connected"],
     )
+    if curvature_scope == "cloud" or coplanarity_scope is None
 ]
 VARIANTS = [
     {"k": 8, "max_angle_deg": 10.0, "curvature_quantile": 0.8, "min_size": 1},

@@ -98,6 +98,51 @@ def test_a_ramp_of_few_points_does_not_join_two_sheets(rng):
     assert torch.equal(again, found[order])
 
 
+def bridged_strips(rng, turn_deg=40):
+    """Two strips 5 cm wide on both sides of an edge, noise of a quarter of that, and a few points
+    whose normals turn from one to the other."""
+    turn, ramp = np.radians(turn_deg), np.linspace(0, 1, 10)
+    along = np.r_[rng.uniform(0, 1, 1200), 0.5 + 0.005 * ramp]
+    across = np.r_[rng.uniform(-0.05, 0, 600), rng.uniform(0, 0.05, 600), 0.004 * ramp - 0.002]
+    tilt = np.r_[np.zeros(600), np.full(600, turn), turn * ramp]
+    normals = np.stack([-np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=1)
+    points = np.stack([across * np.cos(tilt), along, across * np.sin(tilt)], axis=1)
+    points += 0.012 * rng.normal(size=(1210, 1)) * normals
+    return torch.tensor(points), torch.tensor(normals), torch.arange(1200) // 600
+
+
+def test_narrow_strips_at_an_edge_are_not_parts_of_one_noisy_face():
+    points, normals, truth = bridged_strips(np.random.default_rng(4))
+    curvature, neighbors = torch.zeros(len(points), dtype=torch.float64), search_knn(points, 12)
+    joined = grow_regions(points, normals, curvature, neighbors, PLAIN)
+    assert int(joined.max()) == 0
+    found = grow_regions(points, normals, curvature, neighbors, CUTTING)[:1200]
+    assert score_labels(found, truth).ari > 0.99
+
+
+def panel_beside_a_cove(rng):
+    """A quarter of a cylinder, at its end a flat panel turned by 40 degrees, and a few points whose
+    normals turn from one to the other."""
+    ramp = np.linspace(0, 1, 10)
+    bend = np.r_[-rng.uniform(0, np.pi / 2, 1200), np.zeros(250)]
+    flat = np.r_[np.zeros(1200), rng.uniform(0, 0.3, 240), 0.06 * (ramp - 0.5)]
+    tilt = bend + np.radians(40) * np.r_[np.zeros(1200), np.ones(240), ramp]
+    along = np.r_[rng.uniform(0, 1, 1440), 0.5 + 0.06 * ramp]
+    x, z = np.sin(bend) + flat * np.cos(tilt), 1 - np.cos(bend) + flat * np.sin(tilt)
+    normals = np.stack([-np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=1)
+    return torch.tensor(np.stack([x, along, z], axis=1)), torch.tensor(normals)
+
+
+def test_a_flat_panel_is_cut_off_a_curved_surface_that_stays_whole():
+    points, normals = panel_beside_a_cove(np.random.default_rng(5))
+    curvature, neighbors = torch.zeros(len(points), dtype=torch.float64), search_knn(points, 12)
+    joined = grow_regions(points, normals, curvature, neighbors, PLAIN)
+    assert int(joined.max()) == 0
+    found = grow_regions(points, normals, curvature, neighbors, CUTTING)
+    assert found[:1200].eq(0).all()
+    assert found[1200:1440].eq(1).all()
+
+
 def test_a_room_without_bridges_is_left_alone():
     points = growing_clouds.room(np.random.default_rng(3), 900, 0.005)
     cloud = growing_clouds.prepare(points, 14)

@@ -12,6 +12,7 @@ from tests.made import (
     cameras_around,
     cast_rays,
     make_kinect_room,
+    make_mapped_room,
     render_depth,
     scan_scene,
 )
@@ -315,6 +316,21 @@ def test_kinect_noise_grows_with_the_square_of_depth_and_has_steps_of_an_eighth_
         assert abs(error[there].mean()) < 0.1 * expected
 
 
+def test_kinect_2_has_little_noise_and_no_steps():
+    model = build_room(0)
+    camera = cameras_around(model, 1)[0]
+    exact, noisy = render_depth(model, camera), render_depth(model, camera, sensor="kinect2")
+    valid = noisy.depth > 0
+    assert 0.5 <= noisy.depth[valid].min() <= noisy.depth.max() <= 4.5
+    depth = exact.depth[valid].double()
+    error = noisy.depth[valid].double() - depth
+    for low, high in ((1.0, 2.0), (3.0, 4.0)):
+        there = (depth > low) & (depth < high)
+        expected = (0.0015 - 0.0005 * depth[there] + 0.0003 * depth[there] ** 2).square().mean()
+        assert error[there].std().item() == pytest.approx(expected.sqrt().item(), rel=0.05)
+    assert len(noisy.depth[valid].unique()) > 0.9 * int(valid.sum())
+
+
 def test_kinect_drops_what_is_out_of_its_range():
     model = build_room(0, layout=RoomLayout(size=(16.0, 7.0, 2.8)))
     camera = Camera.looking((0.5, 3.5, 1.6), (15, 3.5, 1.5), width=160, height=120)
@@ -330,7 +346,7 @@ def test_kinect_drops_what_is_out_of_its_range():
 
 def test_unknown_sensor_is_refused():
     with pytest.raises(
-        ConfigError, match="expected sensor to be one of exact, kinect, got 'lidar'"
+        ConfigError, match="expected sensor to be one of exact, kinect, kinect2, got 'lidar'"
     ):
         render_depth(build_room(), sensor="lidar")
 
@@ -355,6 +371,19 @@ def test_fused_frames_come_in_random_order_without_doubles():
     assert len(scene.points.unique(dim=0)) == 5000
     places = scene.points[:, 0].double().numpy()
     assert kstest(places[:2500], places[2500:]).pvalue > 1e-3
+
+
+def test_a_map_lies_on_its_faces_within_noise_and_drift():
+    scene = make_mapped_room(3000, seed=1, num_frames=2, voxel=0.05)
+    residuals = (scene.points.double() * scene.face_normals[scene.labels]).sum(dim=1)
+    residuals = (residuals - scene.face_offsets[scene.labels]).abs()
+    # Voxels of 5 cm at edges hold the mean of two faces.
+    assert 0.001 < residuals.median() < 0.01
+    assert residuals.max() < 0.1
+    cells = torch.floor((scene.points - scene.points.min(dim=0).values) / 0.05)
+    assert len(cells.unique(dim=0)) > 2500
+    with pytest.raises(ConfigError, match=r"expected num_points <= .*, the voxels that were seen"):
+        make_mapped_room(10**6, seed=1, num_frames=1, voxel=0.5)
 
 
 def test_too_few_pixels_are_refused():

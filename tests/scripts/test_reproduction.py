@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg import load_config, segment_planes
 from torchrg.scenes import make_room
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-VARIANTS = ("pca", "irls", "jet", "detmm", "paper", "consensus")
-METHODS = ("pcl", "classic", "detmm", "printed", "paper", "consensus")
+VARIANTS = ("pca", "irls", "jet", "detmm", "paper", "libra", "consensus")
+METHODS = ("classic", "classic_increment", "detmm", "algorithm2", "paper", "consensus")
 
 pytest.importorskip("matplotlib").use("agg")
 
@@ -90,7 +91,7 @@ def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch, capsys):
     assert len(files) >= 14
     for file in files:
         assert (folder / file).read_bytes().startswith(b"\x89PNG"), file
-    assert "printed: classic (paper)" in page
+    assert "printed: classic_increment" in page
     for claim in report["claims"]:
         assert f"<td>{html.escape(claim['text'], quote=False)}</td>" in page.replace("&#39;", "'")
         assert claim["numbers"] or "1,000" in claim["text"], claim["text"]
@@ -184,6 +185,21 @@ def test_results_are_computed_again_once_a_call(run):
     assert run.folder.cell("a", work)["value"] == 2
 
 
+def test_results_of_another_commit_are_computed_again(run, monkeypatch):
+    from reproduction import cells
+
+    made = []
+
+    def work():
+        made.append(1)
+        return {}
+
+    for commit in ("a", "a", "b"):
+        monkeypatch.setattr(cells, "made_with", lambda commit=commit: {"commit": commit})
+        run.folder.cell("a", work)
+    assert len(made) == 2
+
+
 def test_points_at_edges_are_those_whose_neighbors_lie_on_another_face(normals):
     scene = normals.make_shape("cuboid", 4000)
     at_edges = normals._near_edges(scene)
@@ -192,14 +208,16 @@ def test_points_at_edges_are_those_whose_neighbors_lie_on_another_face(normals):
     assert torch.equal(at_edges, other)
 
 
-@pytest.mark.parametrize("method", ["classic", "paper", "consensus"])
+@pytest.mark.parametrize("method", ["classic_increment", "paper", "consensus"])
 def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run, method):
-    from reproduction.methods import settings_of
     from reproduction.segmentations import read_segmented, regrow
 
-    limits = settings_of(method).growing
+    limits = load_config(method).growing
     angle, quantile = limits.max_angle_deg, limits.curvature_quantile
     kept = read_segmented(run, "hallway", method).labels
+    points = run.cloud("hallway").cloud.points
+    turned = segment_planes(points, load_config(method).at_angle(8.0)).labels
+    assert torch.equal(regrow(run, "hallway", method, 8.0, quantile), turned)
     # Another angle by less than rounding: grown again instead of read.
     assert torch.equal(regrow(run, "hallway", method, angle + 1e-12, quantile), kept)
     assert not torch.equal(regrow(run, "hallway", method, 0.01, quantile), kept)
@@ -332,8 +350,8 @@ def test_claims_hold_only_where_the_numbers_say_so():
 
     low, high = (0.9, 0.1, 0.2, 0.8, 0.3, 0.4), (0, 0.5, 0.4, 0, 0.3, 0.2)
     printed = {
-        "tutorial": {"classic": (0.2, 0.6, 2, 10), "detmm": (0.15, 0.4, 1.4, 4)},
-        "hallway": {"classic": (0.1, 0.4, 2, 7), "detmm": (0.2, 0.3, 1.5, 4)},
+        "tutorial": {"classic_increment": (0.2, 0.6, 2, 10), "detmm": (0.15, 0.4, 1.4, 4)},
+        "hallway": {"classic_increment": (0.1, 0.4, 2, 7), "detmm": (0.2, 0.3, 1.5, 4)},
     }
     printed["tutorial"]["paper"], printed["hallway"]["paper"] = (0.1, 0.7, 1.7, 5), (0.3, 0.2, 1, 5)
     names = ("cp", "sp", "dbi", "dvi")
@@ -384,7 +402,14 @@ def test_normals_hold_only_if_they_do_for_every_seed():
     from reproduction.normal_tables import normal_claims
 
     def measured(seed, paper):
-        msae = {"pca": 100.0, "jet": 110.0, "irls": 80.0, "detmm": 70.0, "paper": paper}
+        msae = {
+            "pca": 100.0,
+            "jet": 110.0,
+            "irls": 80.0,
+            "detmm": 70.0,
+            "paper": paper,
+            "libra": 90.0,
+        }
         return [
             {
                 "shape": "cuboid",
@@ -399,11 +424,13 @@ def test_normals_hold_only_if_they_do_for_every_seed():
         ]
 
     good = normal_claims([*measured(0, 90.0), *measured(1, 75.0)], with_times=True)
-    assert [bool(claim["holds"]) for claim in good] == [True, True, False, False, True]
+    libra = [True, True, False, False]
+    assert [bool(claim["holds"]) for claim in good] == [True, True, False, False, *libra, True]
     assert "paper 82.5" in good[0]["numbers"]["cuboid 0.25 %"]
     assert good[3]["numbers"]["cuboid 0.25 %"] == "detmm < irls < paper < pca < jet"
+    assert good[7]["numbers"]["cuboid 0.25 %"] == "detmm < irls < libra < pca < jet"
     bad = normal_claims([*measured(0, 101.0), *measured(1, 60.0)], with_times=False)
-    assert [bool(claim["fails"]) for claim in bad] == [True, True, False, True]
+    assert [bool(claim["fails"]) for claim in bad[:4]] == [True, True, False, True]
 
 
 def test_ratio_is_the_papers_time_over_ours_per_point():
@@ -434,8 +461,8 @@ def test_times_hold_only_where_the_numbers_say_so():
 
     records = []
     for key in ("tutorial", "hallway", "kinect"):
-        records += timed(key, classic=2, detmm=4, paper=3)
-    records += timed("cory", classic=2, detmm=14, paper=14.8)
+        records += timed(key, classic_increment=2, detmm=4, paper=3)
+    records += timed("cory", classic_increment=2, detmm=14, paper=14.8)
     order, minute, goal = time_claims(records)
     assert (order["holds"], order["fails"]) == (["tutorial", "hallway", "kinect"], ["cory"])
     assert minute["numbers"] == {"cory": "7.4 s"}
@@ -506,9 +533,19 @@ def test_results_of_code_that_is_not_committed_are_refused(monkeypatch):
     from reproduction import readme
 
     monkeypatch.setattr(readme, "_write", lambda path, text: pytest.fail("written"))
-    report = {"quick": False, "made_with": "torchrg 0.1.0; commit 2f26e94-dirty, ad1e777"}
-    with pytest.raises(ValueError, match="expected a report made by committed code"):
-        readme.update(report)
+    for commit in ("2f26e94-dirty", "unknown", "2f26e94, ad1e777"):
+        report = {"quick": False, "made_with": f"torchrg 0.1.0; commit {commit}; python 3"}
+        with pytest.raises(ValueError, match=f"expected a report of one commit, got {commit}"):
+            readme.update(report)
+
+
+def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
+    import reproduce_paper
+
+    monkeypatch.setattr(reproduce_paper, "made_with", lambda: {"commit": "2f26e94-dirty"})
+    with pytest.raises(SystemExit, match=r"expected committed code .* got commit 2f26e94-dirty"):
+        call_script(monkeypatch, "--out", tmp_path, "times")
+    assert not list(tmp_path.iterdir())
 
 
 def test_readme_is_updated_between_the_markers_only(tmp_path, monkeypatch):

@@ -93,10 +93,14 @@ class PlaneSettings:
     """How planes are found: what the preset or the file says, where no flag says otherwise."""
 
     preset: str = DEFAULT_PRESET
-    """Settings to start from: those of a method (classic, detmm, paper, consensus), or those for a
-    kind of data (s3dis, scannet, laser, rgbd). Flags change them one by one."""
+    """Settings to start from: those of a method (classic, classic_increment, detmm, paper,
+    algorithm2, consensus), or those for a kind of data (s3dis, scannet, laser, rgbd). Flags change
+    them one by one."""
     config: Path | None = None
     """YAML file with settings, in place of a preset; what it does not name has its default."""
+    angle_deg: float | None = None
+    """The one threshold of the paper, in degrees: that of sharp points and of growth. The flags
+    --normals.sharp-angle-deg and --growing.max-angle-deg win where they are given."""
     resolved: Annotated[PipelineConfig, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=PipelineConfig
     )
@@ -111,12 +115,18 @@ class PlaneSettings:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
             'pca'
         """
-        values = {"--preset": preset, "--config": ""}
+        values = {"--preset": preset, "--config": "", "--angle-deg": ""}
         for argument, following in zip_longest(argv, argv[1:], fillvalue=""):
             name, equals, value = argument.partition("=")
+            name = name.replace("_", "-")
             if name in values:
                 values[name] = value if equals else following
-        return cls(preset, resolved=load_config(values["--config"] or values["--preset"]))
+        resolved = load_config(values["--config"] or values["--preset"])
+        try:
+            angle = float(values["--angle-deg"])
+        except ValueError:  # It is not given, or a word that the parser refuses.
+            return cls(preset, resolved=resolved)
+        return cls(preset, resolved=resolved.at_angle(angle))
 
 
 CloudsFlag = Annotated[

@@ -1,11 +1,12 @@
 """External indices: predicted plane labels against true ones."""
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import ContingencyTable, count_overlaps
 from torchrg.metrics.protocols import count_segcomp, score_evops, share
 
@@ -77,6 +78,7 @@ def score_labels(
     *,
     min_size: int = 1,
     ignore: int | None = None,
+    matching: Literal["largest", "second"] = "largest",
 ) -> LabelScore:
     """Score predicted plane labels against true ones.
 
@@ -102,6 +104,7 @@ def score_labels(
         min_size: Regions of fewer points count as unlabelled (the paper draws those of 50 and
             more). Faces of any size count.
         ignore: Points with this true label are left out of everything. Default: none is.
+        matching: Which pairs precision, recall and F1 are of; see :func:`match_regions`.
 
     Returns:
         The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
@@ -127,7 +130,7 @@ def score_labels(
     """
     table = count_overlaps("score_labels", labels, truth, min_size, ignore)
     num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
-    precision, recall, num_pairs = _pair_precision_recall(table)
+    precision, recall, num_pairs = _pair_precision_recall(table, matching)
     matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))
     best = _best_iou(table)
     segcomp, evops = count_segcomp(table), score_evops(table)
@@ -153,13 +156,15 @@ def score_labels(
     )
 
 
-def _pair_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
+def _pair_precision_recall(
+    table: ContingencyTable, matching: Literal["largest", "second"]
+) -> tuple[float, float, int]:
     """Return mean precision and recall of the pairs, in percent, and how many there are.
 
     Section III.B of the paper: ``P = 100 TP / (TP + FP)``, ``R = 100 TP / (TP + FN)`` with TP the
     points that region and face share. 0 where there is no pair.
     """
-    pairs = match_regions(table)
+    pairs = match_regions(table, matching)
     shared = 100 * table.overlaps[pairs].double()
     precision = shared / table.region_sizes[table.regions[pairs]]
     recall = shared / table.face_sizes[table.faces[pairs]]
@@ -167,10 +172,15 @@ def _pair_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
     return share(float(precision.sum()), count), share(float(recall.sum()), count), count
 
 
-def match_regions(table: ContingencyTable) -> Tensor:
+def match_regions(
+    table: ContingencyTable, matching: Literal["largest", "second"] = "largest"
+) -> Tensor:
     """Pair each region with the face that it overlaps most and that it is overlapped most by.
 
-    A region and a face correspond when each is the other's largest overlap, in points [1].
+    A region and a face correspond when each is the other's largest overlap, in points [1]. The
+    paper also says "the maximum or second maximum overlap", and not how the second enters. With
+    ``matching="second"`` those that are left without a partner correspond when each is the other's
+    largest overlap among what is left, and one of its two largest among all.
 
     Convention:
         Equal overlaps are decided by the larger intersection over union, that is the smaller
@@ -178,10 +188,14 @@ def match_regions(table: ContingencyTable) -> Tensor:
 
     Args:
         table: Overlaps of regions and faces.
+        matching: Whether the second largest overlap may make a pair too.
 
     Returns:
         The rows of the table's overlaps that are pairs, shape ``(P,)``, int64; no region and no
         face occurs twice. Empty if nothing overlaps.
+
+    Raises:
+        ConfigError: If there is no such matching.
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
@@ -196,21 +210,38 @@ def match_regions(table: ContingencyTable) -> Tensor:
         >>> table.face_labels[table.faces[pairs]].tolist()
         [0, 1]
     """
-    face_sizes, region_sizes = table.face_sizes[table.faces], table.region_sizes[table.regions]
-    of_region = _first_of_each(table.regions, (-table.overlaps, face_sizes, table.faces))
-    of_face = _first_of_each(table.faces, (-table.overlaps, region_sizes, table.regions))
-    return (of_region & of_face).nonzero().squeeze(1)
+    if matching not in ("largest", "second"):
+        raise ConfigError(
+            f"match_regions: expected matching to be largest or second, got {matching!r}."
+        )
+    most = 1 if matching == "largest" else 2
+    left = (torch.stack(_ranks(table, slice(None))) < most).all(dim=0).nonzero().squeeze(1)
+    pairs = left[:0]
+    while len(left):
+        found = left[(torch.stack(_ranks(table, left)) == 0).all(dim=0)]
+        pairs = torch.cat([pairs, found])
+        taken = torch.isin(table.regions[left], table.regions[found])
+        left = left[~(taken | torch.isin(table.faces[left], table.faces[found]))]
+    return pairs.sort().values
 
 
-def _first_of_each(groups: Tensor, keys: tuple[Tensor, ...]) -> Tensor:
-    """Mark the entry of each group that comes first by the keys, shape ``(E,)``, bool."""
-    order = torch.arange(len(groups), device=groups.device)
+def _ranks(table: ContingencyTable, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
+    """Return how many of some overlaps are larger, of the same region and of the same face."""
+    regions, faces, overlaps = table.regions[rows], table.faces[rows], table.overlaps[rows]
+    of_region = _ranks_of_each(regions, (-overlaps, table.face_sizes[faces], faces))
+    return of_region, _ranks_of_each(faces, (-overlaps, table.region_sizes[regions], regions))
+
+
+def _ranks_of_each(groups: Tensor, keys: tuple[Tensor, ...]) -> Tensor:
+    """Return the place of each entry in its group, ordered by the keys, shape ``(E,)``."""
+    places = torch.arange(len(groups), device=groups.device)
+    order = places
     for key in (*reversed(keys), groups):
         order = order[key[order].argsort(stable=True)]
     ordered = groups[order]
-    first = torch.ones_like(ordered, dtype=torch.bool)
-    first[1:] = ordered[1:] != ordered[:-1]
-    return torch.zeros_like(first).index_put((order,), first)
+    begins = places.clone()
+    begins[1:] *= ordered[1:] != ordered[:-1]
+    return torch.empty_like(order).index_put((order,), places - begins.cummax(dim=0).values)
 
 
 def adjusted_rand_index(table: ContingencyTable) -> float:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg import deg_to_sq_chord, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments
 from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
 from torchrg.regions.fit import MOST_FITTED, RegionPlanes, fit_planes
@@ -40,6 +40,10 @@ _LEAST_FLAT = 0.5
 """Share of a region's points in flat cores from which it is faces: a noisy column breaks into cores
 that are few, and curved."""
 
+_LEAST_FACE = 0.05
+"""Share of the points of another region from which a flat core is a face beside what is curved: the
+panel that a moulding runs around. Smaller ones are parts of a surface that bends."""
+
 _OPEN_SHARE = 0.1
 """Least share of the edges between two cores that pass the criteria where a surface goes on; where
 a bridge joins them it is a few in a hundred."""
@@ -47,6 +51,10 @@ a bridge joins them it is a few in a hundred."""
 _LEAST_MISFIT = 2.0
 """Times the thickness. Two cores lie on one plane when they are nearer to it: parts of a face that
 noise has bent are."""
+
+_MOST_TURNED_DEG = 30.0
+"""And when their own planes are not turned by more: of narrow strips on both sides of an edge one
+plane is also within twice the thickness."""
 
 
 class MixedRegions(NamedTuple):
@@ -139,9 +147,9 @@ def cut_bridges(
     ``grown`` ``(n,)`` are the cores in the ``part`` of the mixed regions, 0 to C-1 or
     :data:`torchrg.UNLABELED`. They, and the plane if nearly all points are on one, belong together
     where the surface goes on from one to the next, a tenth of the edges between them passing the
-    whole limits, and where one plane explains both. Regions with cores that do not, and with most
-    of their points in flat cores, are split: the other points join the core of the nearest
-    neighbour that they have an edge to, and no core grows through them.
+    whole limits, and where one plane explains both. Regions with cores that do not are split: the
+    other points join the core of the nearest neighbour that they have an edge to, and no core grows
+    through them. Where most points are in curved cores, all that is no large flat one is one core.
 
     ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
     perhaps with gaps in their numbers.
@@ -154,7 +162,8 @@ def cut_bridges(
     around = cloud.neighbors.of(cores.to(torch.int32), rows)
     rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
-    split = _are_several_faces(cloud, labels, cores, mixed.on_plane)
+    cores = _join_curved(cloud, labels, cores, mixed.on_plane)
+    split = torch.bincount(_owners(labels, cores), minlength=len(mixed.on_plane)) > 1
     free = (labels >= 0) & split[labels.clamp(min=0)]
     # Of points on the plane only those with its direction tell which cores it meets.
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
@@ -179,17 +188,28 @@ def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Ten
     return torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores], on_plane
 
 
-def _are_several_faces(
-    cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor
-) -> Tensor:
-    """Tell which regions ``(M,)`` have several cores, and are flat where these are."""
-    num_regions = len(on_plane)
-    owner = torch.full((int(cores.max()) + 1,), UNLABELED, device=labels.device)
-    owner[cores[cores >= 0]] = labels[cores >= 0]
-    flat = ~_planes_of(cloud, cores).curved
-    covered = torch.bincount(labels[(cores >= 0) & flat[cores.clamp(min=0)]], minlength=num_regions)
-    is_flat = covered >= _LEAST_FLAT * torch.bincount(labels[labels >= 0])
-    return (torch.bincount(owner, minlength=num_regions) > 1) & (on_plane | is_flat)
+def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
+    """Return cores ``(N,)`` where those of a curved region that are no faces are one."""
+    flat, owner = ~_planes_of(cloud, cores).curved, _owners(labels, cores)
+    num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
+    of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
+    covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
+    curved = ~(on_plane | (covered >= _LEAST_FLAT * of_region))
+    is_face = flat & (num_points >= _LEAST_FACE * of_region[owner])
+    joined = curved[owner] & ~is_face
+    numbers = torch.arange(len(owner) + 1, device=cores.device)
+    numbers[-1] = UNLABELED
+    first = torch.full_like(of_region, len(owner))
+    first.scatter_reduce_(0, owner[joined], numbers[:-1][joined], "amin")
+    numbers[:-1][joined] = first[owner[joined]]
+    return numbers[cores]
+
+
+def _owners(labels: Tensor, cores: Tensor) -> Tensor:
+    """Return the region of each core, in ascending order of the cores that have points."""
+    points = (cores >= 0).nonzero().squeeze(1)
+    numbers, rows = torch.unique(cores[points], return_inverse=True)
+    return labels.new_zeros(len(numbers)).index_copy_(0, rows, labels[points])
 
 
 def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
@@ -258,7 +278,10 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(numbers, minlength=len(pairs))
     num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
-    joined = misfit_of_pairs(_planes_of(cloud, cores), pairs) < _LEAST_MISFIT
+    planes = _planes_of(cloud, cores)
+    one, other = planes.normal[pairs].unbind(dim=1)
+    turn = unsigned_angle_deg(one, other)
+    joined = (misfit_of_pairs(planes, pairs) < _LEAST_MISFIT) & (turn <= _MOST_TURNED_DEG)
     joined |= num_open >= _OPEN_SHARE * num_edges
     ends = pairs[joined].T.cpu().numpy()
     ones = np.ones(ends.shape[1], dtype=np.int8)

@@ -66,7 +66,8 @@ class GrowingCloud(NamedTuple):
 
 def is_order_free(config: GrowingConfig) -> bool:
     """Tell whether what a claimed point does next depends on itself, not on who claimed it."""
-    return config.seed_rule == "curvature" and not promotes_late(config)
+    of_cloud = config.curvature_scope == "cloud"
+    return config.seed_rule == "curvature" and of_cloud and not promotes_late(config)
 
 
 def promotes_late(config: GrowingConfig) -> bool:
@@ -151,6 +152,9 @@ def _become_seeds(
 ) -> Tensor:
     """Tell which neighbours of some points become seeds by the edge from the point, ``(n, K)``."""
     target = cloud.neighbors.of(cloud.curvature, rows)
+    if config.curvature_scope == "neighborhood":
+        counted = cloud.neighbors.counted(rows) & cloud.neighbors.of(cloud.valid, rows)
+        limit = _curvature_limits(target, counted, config.curvature_quantile)
     if config.seed_rule == "increment":
         becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
     else:
@@ -158,6 +162,13 @@ def _become_seeds(
     if connected is not None and config.connectivity_scope == "seed":
         becomes_seed &= connected
     return becomes_seed
+
+
+def _curvature_limits(curvature: Tensor, counted: Tensor, quantile: float) -> Tensor:
+    """Return the lower quantile of each row ``(n, K)`` of those that count, ``(n, 1)``."""
+    ascending = curvature.where(counted, torch.inf).sort(dim=1).values
+    places = (quantile * (counted.sum(dim=1, keepdim=True) - 1).double()).long()
+    return ascending.gather(1, places.clamp_min(0))
 
 
 def accept_edges(
