@@ -25,6 +25,7 @@ def changes(settings, base):
             "s3dis",
             {
                 ("growing", "facet_tolerance"): 0.009,
+                ("growing", "max_plane_residual"): 2.5,
                 ("growing", "min_size"): 200,
                 ("planes", "up"): "z",
             },

@@ -265,11 +265,33 @@ def test_a_thin_side_is_no_facet_of_the_face_beside_it():
     points = np.concatenate([front, side])
     cloud, order = flat_cloud(points)
     labels = (order >= 3000).long()
-    contacts, planes = (
-        NearestPoints(cloud.neighbors).contacts(labels),
-        fit_regions(cloud, labels, OFF),
-    )
+    contacts = NearestPoints(cloud.neighbors).contacts(labels)
+    planes = fit_regions(cloud, labels, OFF)
     assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == 2
+
+
+@pytest.mark.parametrize(("step", "faces"), [(0.012, 1), (0.035, 2)])
+def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, faces):
+    rng = np.random.default_rng(19)
+    upper, lower = (rng.uniform(0, 1, (3000, 3)) * (1.74, 0.29, 0) for _ in range(2))
+    points = np.concatenate([upper + np.array([0, 0.295, step]), lower])
+    cloud, order = flat_cloud(points)
+    labels = (order >= 3000).long()
+    contacts = NearestPoints(cloud.neighbors).contacts(labels)
+    planes = fit_regions(cloud, labels, OFF)
+    both = points - points.mean(axis=0)
+    across = both @ np.linalg.svd(both, full_matrices=False)[2][2]
+    assert np.sqrt(np.mean(across**2)) < 0.009
+    assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == faces
+
+
+def test_faces_of_facets_are_at_least_as_thick_as_these_may_lie_apart():
+    rng = np.random.default_rng(20)
+    cloud, _ = flat_cloud(sheet(rng, 3000, 0.0))
+    labels = torch.zeros(3000, dtype=torch.long)
+    assert fit_regions(cloud, labels, with_settings()).thickness < 1e-3
+    found = fit_regions(cloud, labels, with_settings(facet_tolerance=0.009))
+    torch.testing.assert_close(found.thickness, torch.tensor([0.006], dtype=torch.float64))
 
 
 def scattered(rng, count, angle_deg):

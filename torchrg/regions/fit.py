@@ -45,6 +45,10 @@ _BENT = 0.5
 """Reaches. A region thicker than this share of the reach that its points have is bent: twice as
 thick as the neighbourhoods in it. From 0.3 to 0.5 made rooms come out the same."""
 
+_FACET_THICKNESS = 2 / 3
+"""Facet tolerances. Least thickness of the faces of a mesh: points beside a face are on facets of
+it that are no closer to its plane than those in it."""
+
 _LEAST_HEIGHT = 0.2
 """Of the product of angle and width, both as standard deviations: an arc is 0.45 of it thick, a cap
 of a sphere 0.41. Scattered normals in a thin region are noise."""
@@ -182,8 +186,9 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
         for rows in torch.split(segments.rows, ROWS_AT_ONCE)
     ]
     floor = config.coplanarity_floor * segments.median(torch.cat(radii)).double()
+    facets = _FACET_THICKNESS * (config.facet_tolerance or 0.0)
     planes = planes._replace(
-        thickness=torch.maximum(planes.thickness, floor),
+        thickness=torch.maximum(planes.thickness, floor).clamp(min=facets),
         num_points=torch.bincount(labels + 1, minlength=1)[1:],
         floor=floor,
     )

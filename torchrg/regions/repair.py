@@ -35,6 +35,9 @@ _FACET_TURN_DEG = 25.0
 """The plane through two facets of a flat face is not turned by more against either of them. Those
 of ten points are turned most; the sides of a thin board are turned by 90."""
 
+_FACET_TILT = 2 / 3
+"""Tolerances. Root mean square distance that this turn alone gives the points of a facet. Without
+a limit a plane across the step between two shelves, 5 cm, explains both."""
 
 class Beside(Protocol):
     """Who is beside whom: nearest points (:mod:`torchrg.regions.adjacency`), or pixels."""
@@ -204,8 +207,9 @@ def merge_facets(
     thickness does not say how far from the face it may be. Two regions are merged when the root
     mean square distance of either to the plane through both is at most ``tolerance``, in the unit
     of the cloud, and that plane is turned against neither by more than 25 degrees: a strip narrower
-    than the tolerance lies near any plane that it touches. What is merged is one region from then
-    on, so that the facets of a bend join only as far as one plane goes.
+    than the tolerance lies near any plane that it touches. Nor may the turn alone lift the points
+    of either by more than two thirds of the tolerance. What is merged is one region from then on,
+    so that the facets of a bend join only as far as one plane goes.
 
     ``contacts`` and labels are those of :func:`merge_coplanar`.
     """
@@ -215,7 +219,7 @@ def merge_facets(
     scale, noise = torch.full_like(moments.scale, tolerance), torch.zeros_like(moments.noise)
     moments = moments._replace(scale=scale, noise=noise)
     moments = _Moments(*(part.cpu() for part in moments))
-    owner = _merge_pairs(moments, pairs.cpu(), 1.0, max_turn_deg=_FACET_TURN_DEG)
+    owner = _merge_pairs(moments, pairs.cpu(), 1.0, max_tilt=_FACET_TILT * tolerance)
     return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
 
 
@@ -261,11 +265,11 @@ def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
 
 
 def _merge_pairs(
-    moments: _Moments, pairs: Tensor, tolerance: float, *, max_turn_deg: float = 90.0
+    moments: _Moments, pairs: Tensor, tolerance: float, *, max_tilt: float | None = None
 ) -> list[int]:
     """Return for each region the smallest of those that it is merged with.
 
-    Regions are not merged whose own planes are turned by more than an angle against the joint one.
+    With a largest tilt those are not whose own planes the joint one is turned against too far.
     """
     groups = _Moments(*(values.clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
@@ -276,8 +280,8 @@ def _merge_pairs(
         first, second = pairs.unbind(dim=1)
         sides = groups.at(first), groups.at(second)
         misfits = _misfit(*sides)
-        if max_turn_deg < 90:
-            misfits = torch.where(_turn_deg(*sides) <= max_turn_deg, misfits, torch.inf)
+        if max_tilt is not None:
+            misfits = torch.where(_are_turned(*sides, max_tilt), torch.inf, misfits)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
@@ -339,12 +343,16 @@ def _misfit(a: _Moments, b: _Moments) -> Tensor:
     return torch.maximum(*misfits)
 
 
-def _turn_deg(a: _Moments, b: _Moments) -> Tensor:
-    """Return the larger of the angles of the planes of both to the joint one, in degrees."""
-    joint, first, second = (
-        eigh3_of_few(part.covariance)[1][:, :, 0] for part in (_joined(a, b), a, b)
-    )
-    return torch.maximum(*(unsigned_angle_deg(own, joint) for own in (first, second)))
+def _are_turned(a: _Moments, b: _Moments, max_tilt: float) -> Tensor:
+    """Return whether the joint plane is turned too far against that of either."""
+    joint = eigh3_of_few(_joined(a, b).covariance)[1][:, :, 0]
+    turned = torch.zeros(len(joint), dtype=torch.bool)
+    for part in (a, b):
+        values, vectors = eigh3_of_few(part.covariance)
+        own = (joint[:, None] @ part.covariance @ joint[:, :, None])[:, 0, 0]
+        turned |= unsigned_angle_deg(vectors[:, :, 0], joint) > _FACET_TURN_DEG
+        turned |= own - values[:, 0] > max_tilt**2
+    return turned
 
 
 def refine_borders(
