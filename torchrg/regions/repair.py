@@ -39,6 +39,7 @@ _FACET_TILT = 2 / 3
 """Tolerances. Root mean square distance that this turn alone gives the points of a facet. Without
 a limit a plane across the step between two shelves, 5 cm, explains both."""
 
+
 class Beside(Protocol):
     """Who is beside whom: nearest points (:mod:`torchrg.regions.adjacency`), or pixels."""
 
