@@ -30,7 +30,11 @@ def test_presets_are_those_of_the_contract():
     assert contract <= set(preset_names())
     assert load_config() == load_config("consensus")
     assert load_config("classic").growing.connectivity is None
-    assert load_config("paper").growing == GrowingConfig()
+    assert load_config() == PipelineConfig()
+    paper = load_config("paper").growing
+    beyond = ("absorb", "cut_bridges", "merge_coplanar", "refine_borders")
+    assert not any(getattr(paper, name) for name in beyond)
+    assert (paper.max_angle_deg, paper.connectivity, paper.plane_reach) == (5.0, 0.75, None)
 
 
 def test_a_file_holds_differences_only(tmp_path):

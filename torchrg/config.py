@@ -22,9 +22,9 @@ DEFAULT_PRESET = "consensus"
 
 @dataclass(frozen=True)
 class NormalsConfig:
-    """How normals and curvature are estimated."""
+    """How normals and curvature are estimated; the defaults are those of the preset consensus."""
 
-    method: NormalMethod = "paper"
+    method: NormalMethod = "consensus"
     """Estimator of the normals: one fit at every point (pca, jet, irls, fastmcd, mve, detmcd,
     detmm), or PCA and a second fit at sharp points (paper, consensus)."""
     k: int = 50
@@ -62,6 +62,7 @@ class NormalsConfig:
     the points on it."""
 
     def __post_init__(self) -> None:
+        _check_choices(self)
         _require(self, "k", ">= 3", self.k >= 3)
         most = self.adaptive_k
         _require(self, "adaptive_k", ">= k or none", most is None or most >= self.k)
@@ -73,9 +74,12 @@ class NormalsConfig:
 
 @dataclass(frozen=True)
 class GrowingConfig:
-    """How regions grow; the defaults are the paper's."""
+    """How regions grow; the defaults are those of the preset consensus.
 
-    max_angle_deg: float = 5.0
+    ``load_config("paper").growing`` are the paper's, and ``dataclasses.replace`` changes some.
+    """
+
+    max_angle_deg: float = 6.5
     """A neighbour joins a region when the angle between the two normals is at most this, theta of
     the paper. Larger values join more. angle_deg of a configuration sets it together with
     sharp_angle_deg of normals."""
@@ -84,11 +88,11 @@ class GrowingConfig:
     curvature_scope: Literal["cloud", "neighborhood"] = "cloud"
     """Points whose curvatures the quantile is of: all valid points of the cloud (cloud, Algorithm
     2), or the neighbours of the seed (neighborhood, "of the k-NN" in section II.B)."""
-    seed_rule: Literal["curvature", "increment"] = "increment"
+    seed_rule: Literal["curvature", "increment"] = "curvature"
     """When a point that joined becomes a seed, from which the region grows on: when its own
     curvature is at most the limit (curvature, as in PCL), or when the difference to the curvature
     of the point it joined is (increment, as in the paper)."""
-    connectivity: float | None = 0.75
+    connectivity: float | None = None
     """Two points are connected when they share at least this fraction of their k neighbours. None:
     not tested."""
     connectivity_scope: Literal["region", "seed"] = "seed"
@@ -104,7 +108,7 @@ class GrowingConfig:
     coplanarity_floor: float = 0.005
     """Least value of Qn in the coplanarity test, as a fraction of the distance to the farthest
     neighbour. On exact and quantised surfaces most residuals are equal, and Qn alone is 0."""
-    plane_reach: float | None = None
+    plane_reach: float | None = 4.0
     """Two points join only if each is within this many times the other's residual of the other's
     plane, so that faces never join across a thin plate. The test takes the place of eq. 11 but
     where a fit is exact (a residual below coplanarity_floor), and needs normals with residuals.
@@ -115,7 +119,7 @@ class GrowingConfig:
     min_size: int = 50
     """Regions of fewer points are not labelled. With absorb, points at the borders of a region
     count as well."""
-    cut_bridges: bool = False
+    cut_bridges: bool = True
     """Whether a region of several faces that only a few points join is split, as faces 12 degrees
     apart and floors with furniture on them are. It takes consensus about a twentieth more time."""
     facet_tolerance: float | None = None
@@ -125,7 +129,7 @@ class GrowingConfig:
     max_plane_residual: float | None = None
     """After growth, a point loses its label when it is farther from the plane of its region than
     this many times the thickness of the region. None: it keeps the label."""
-    absorb: bool = False
+    absorb: bool = True
     """Whether points without a region, and those of regions that are too small, join a flat region
     that they touch and whose plane they are on."""
     absorb_reach: float = 3.0
@@ -134,11 +138,11 @@ class GrowingConfig:
     absorb_angle_deg: float = 45.0
     """With absorb, a point joins only if its normal is within this angle of the normal of the
     plane."""
-    refine_borders: bool = False
+    refine_borders: bool = True
     """Whether points where regions touch go to the region that explains them best. Between two
     planes within reach, the line in which they meet decides. It needs absorb, and matters most for
     faces a few centimetres wide."""
-    merge_coplanar: bool = False
+    merge_coplanar: bool = True
     """Whether regions that touch and lie on one plane become one. A region within the noise of a
     larger one, as the residuals of the normals tell it, is included."""
     merge_tolerance: float = 1.2
@@ -146,6 +150,7 @@ class GrowingConfig:
     many times its thickness about its own plane."""
 
     def __post_init__(self) -> None:
+        _check_choices(self)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
         _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
         within = self.connectivity is None or 0 <= self.connectivity <= 1
@@ -177,7 +182,10 @@ class PlanesConfig:
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """Everything that decides the result of :func:`torchrg.segment_planes`, and its memory."""
+    """Everything that decides the result of :func:`torchrg.segment_planes`, and its memory.
+
+    The defaults are those of :func:`load_config`.
+    """
 
     normals: NormalsConfig = field(default_factory=NormalsConfig)
     """How normals and curvature are estimated."""
@@ -311,7 +319,7 @@ def preset_names() -> list[str]:
 
 
 def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
-    """Read settings from a preset or a YAML file; what it leaves out has its default.
+    """Read settings from a preset or a YAML file; what it leaves out is as in ``consensus``.
 
     A file that begins with ``base: NAME`` leaves out what that preset says instead. ``angle_deg``
     at its top sets both angles: see :meth:`PipelineConfig.at_angle`.
@@ -334,6 +342,49 @@ def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
         expected = "load_config: expected a .yaml file, or a preset, one of"
         path = _preset_file(str(name_or_file), expected=expected)
     return _build_config(PipelineConfig, _read_values(path), where=str(path))
+
+
+def settings_of(
+    caller: str,
+    kind: type[Settings],
+    config: object = None,
+    changes: Mapping[str, Any] | None = None,
+) -> Settings:
+    """Return settings of one kind, from whatever stands for a configuration, with some changed.
+
+    Args:
+        caller: Name of the public function or class, the first word of messages.
+        kind: :class:`PipelineConfig`, or the kind of one of its sections.
+        config: Such settings, a whole configuration, or the name of a preset or a file. Default:
+            that of :func:`load_config`.
+        changes: Single settings.
+
+    Raises:
+        ConfigError: If there is no such preset or setting, or a value is wrong.
+
+    Example:
+        >>> settings_of("f", NormalsConfig, "classic", {"k": 30}).method
+        'pca'
+    """
+    if config is None or isinstance(config, str | Path):
+        config = load_config(config or DEFAULT_PRESET)
+    if isinstance(config, PipelineConfig):
+        parts = (config, config.normals, config.growing, config.planes)
+        config = next(part for part in parts if isinstance(part, kind))
+    if not isinstance(config, kind):
+        raise ConfigError(
+            f"{caller}: expected config to be a {kind.__name__}, a PipelineConfig or a preset, one "
+            f"of {', '.join(preset_names())}, got {type(config).__name__}."
+        )
+    hints = typing.get_type_hints(kind)
+    given = {}
+    for key, value in (changes or {}).items():
+        if key not in hints:
+            raise ConfigError(
+                f"{caller}: unknown setting {key!r}; {kind.__name__} has {', '.join(hints)}."
+            )
+        given[key] = _checked(value, hints[key], f"{caller}: {key}")
+    return dataclasses.replace(config, **given)  # type: ignore[type-var]
 
 
 def _read_values(path: Path) -> object:
@@ -425,6 +476,15 @@ def _check_angle(where: str, angle_deg: float) -> None:
     """Raise unless the angle of a configuration is in its range."""
     if not 0 <= angle_deg <= 90:
         raise ConfigError(f"{where}: expected angle_deg in [0, 90], got {angle_deg!r}.")
+
+
+def _check_choices(config: Any) -> None:  # noqa: ANN401
+    """Raise unless settings that are one of some words are one of them."""
+    for name, hint in typing.get_type_hints(type(config)).items():
+        if typing.get_origin(hint) is Literal:
+            names = ", ".join(typing.get_args(hint))
+            is_one = getattr(config, name) in typing.get_args(hint)
+            _require(config, name, f"to be one of {names}", is_one)
 
 
 def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401

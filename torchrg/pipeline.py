@@ -23,7 +23,7 @@ from torchrg.config import (
     NormalsConfig,
     PipelineConfig,
     SuperpointsConfig,
-    load_config,
+    settings_of,
 )
 from torchrg.errors import ShapeError
 from torchrg.neighbors import (
@@ -168,7 +168,7 @@ Store = MemoryStore | TileStore
 @sequential_operations()
 def segment_planes(
     points: Tensor | NDArray[np.floating] | Iterable[Cloud],
-    config: PipelineConfig | None = None,
+    config: PipelineConfig | str | None = None,
     *,
     voxel: float | None = None,
     store: Store | None = None,
@@ -192,7 +192,7 @@ def segment_planes(
             float64, or moved to it first, as :func:`torchrg.read_cloud` does. Or a cloud in chunks,
             which stands for the ``Cloud.points`` of the whole, and is read only if the store does
             not have them.
-        config: Settings. Default: the preset ``consensus``.
+        config: Settings, or the name of a preset. Default: that of :func:`torchrg.load_config`.
         voxel: Side of voxels, in the unit of the cloud: one point of each is segmented, and every
             point has the result of its voxel. Sizes of regions are counted in voxels then; planes
             are described from all points and numbered by their number, and which of them meet is
@@ -214,23 +214,23 @@ def segment_planes(
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
-        >>> seg = segment_planes(grid, load_config("classic"))
+        >>> seg = segment_planes(grid, "classic")
         >>> seg.planes.count.tolist(), seg.planes.normal.abs().tolist()
         ([400], [[0.0, 0.0, 1.0]])
-        >>> segment_planes(grid, load_config("classic"), voxel=2.0).planes.count.tolist()
+        >>> segment_planes(grid, "classic", voxel=2.0).planes.count.tolist()
         [400]
         >>> import tempfile
         >>> from torchrg.tiles import TileStore
         >>> chunks = (Cloud(some.numpy()) for some in grid.split(150))
         >>> with tempfile.TemporaryDirectory() as work:
         ...     store = TileStore(work, tile_size=100)
-        ...     segment_planes(chunks, load_config("classic"), store=store).planes.count.tolist()
+        ...     segment_planes(chunks, "classic", store=store).planes.count.tolist()
         [400]
     """
     if isinstance(points, Tensor | np.ndarray):
         points = as_tensor("segment_planes", "points", points).detach()
         check_points("segment_planes", points)
-    config = load_config() if config is None else config
+    config = settings_of("segment_planes", PipelineConfig, config)
     store = MemoryStore() if store is None else store
     begin = on_stage or (lambda stage: None)
     store.begin(config={**dataclasses.asdict(config), "chunk_size": None}, voxel=voxel)
@@ -386,7 +386,7 @@ def segment_mesh(
             )
     shades = None if colors is None else as_tensor("segment_mesh", "colors", colors)
     check_shapes("segment_mesh", vertices=(tensor, "V 3"), colors=(shades, "V 3"))
-    seg = segment_planes(tensor, load_config(config) if isinstance(config, str) else config)
+    seg = segment_planes(tensor, config)
     parts = SuperpointsConfig(strengths=(_STRENGTH_OF_K * k_thresh,), min_size=seg_min_verts)
     return partition_points(tensor, seg.normals, seg.labels, parts, shades, corners).labels
 

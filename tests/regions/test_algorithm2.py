@@ -8,8 +8,8 @@ import pytest
 import torch
 from pypcd4 import PointCloud
 
+from tests.made.settings import papers_growing
 from tests.regions import algorithm2, growing_clouds
-from torchrg.config import GrowingConfig
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 
@@ -62,7 +62,7 @@ def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
     dtype = torch.float32 if f32 else torch.float64
     cloud = growing_clouds.prepare(coordinates, k, dtype=dtype, ties=ties)
     for rules in RULES:
-        config = GrowingConfig(**rules, **settings)
+        config = papers_growing(**rules, **settings)
         labels = grow_regions(*cloud, config, canonical=True, chunk_size=64)
         assert labels.tolist() == expected_labels(*cloud, config), config
 
@@ -91,7 +91,7 @@ def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, m
         rules = dict(RULES[rng.integers(len(RULES))])
         if rules["connectivity"] is not None:
             rules["connectivity"] = float(rng.choice([0.3, 0.5, 0.75]))
-        config = GrowingConfig(
+        config = papers_growing(
             **rules,
             max_angle_deg=float(rng.choice([3.0, 8.0, 20.0, 40.0])),
             curvature_quantile=float(rng.choice([0.0, 0.3, 0.6, 0.95, 1.0])),
@@ -118,7 +118,7 @@ def test_invalid_points_neither_join_nor_conduct(rules):
     rng = np.random.default_rng(5)
     cloud = growing_clouds.prepare(growing_clouds.room(rng, 250, 0.005), 8)
     valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.7)
-    config = GrowingConfig(**rules, min_size=2, max_angle_deg=15.0)
+    config = papers_growing(**rules, min_size=2, max_angle_deg=15.0)
     labels = grow_regions(*cloud, config, valid=valid, canonical=True)
     assert labels.tolist() == expected_labels(*cloud, config, valid)
     assert (labels[~valid] == -1).all()
@@ -132,7 +132,7 @@ def test_neighbors_beyond_the_search_radius_do_not_count(rules):
     )
     limited = search_knn(points, 10, max_distance=0.11, canonical=True)
     assert not limited.valid.all()
-    config = GrowingConfig(**{**rules, "connectivity": 0.3}, min_size=1, max_angle_deg=15.0)
+    config = papers_growing(**{**rules, "connectivity": 0.3}, min_size=1, max_angle_deg=15.0)
     cloud = (points, normals, curvature, limited)
     labels = grow_regions(*cloud, config, canonical=True)
     assert labels.tolist() == expected_labels(*cloud, config)
@@ -149,7 +149,7 @@ def test_planes_that_each_point_must_be_on(kind, coplanarity):
     rms = torch.from_numpy(0.03 * rng.random(len(coordinates)))
     rms[::3] = 0
     for connectivity, scope in ((None, "seed"), (0.5, "region"), (0.5, "seed")):
-        config = GrowingConfig(
+        config = papers_growing(
             max_angle_deg=25.0,
             seed_rule="curvature",
             connectivity=connectivity,

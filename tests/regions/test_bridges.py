@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
 from torchrg import load_config, segment_planes
-from torchrg.config import GrowingConfig
 from torchrg.metrics import score_labels
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 
-PLAIN = GrowingConfig(
+PLAIN = papers_growing(
     seed_rule="curvature", connectivity=None, coplanarity=False, min_size=20, max_angle_deg=15.0
 )
 CUTTING = dataclasses.replace(PLAIN, cut_bridges=True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
-from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
@@ -21,7 +21,7 @@ from torchrg.regions.growth import (
 )
 from torchrg.structures import Neighbors
 
-CLASSIC = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
+CLASSIC = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
 
 
 def strip(num_points, angle_step_deg):
@@ -37,21 +37,21 @@ def test_angle_limit_is_between_neighbours_and_inclusive():
     at_limit = strip(10, 4.999999)
     assert grow_regions(*at_limit, CLASSIC).tolist() == [0] * 10
     assert grow_regions(*strip(10, 5.000001), CLASSIC).tolist() == list(range(10))
-    same = GrowingConfig(**{**vars(CLASSIC), "max_angle_deg": 0.0})
+    same = papers_growing(**{**vars(CLASSIC), "max_angle_deg": 0.0})
     assert grow_regions(*strip(10, 0.0), same).tolist() == [0] * 10
 
 
 def test_right_angles_join_at_a_limit_of_ninety_degrees():
     points, _, curvature, neighbors = strip(4, 0.0)
     normals = torch.eye(3, dtype=torch.float64)[[0, 1, 2, 0]]
-    config = GrowingConfig(**{**vars(CLASSIC), "max_angle_deg": 90.0})
+    config = papers_growing(**{**vars(CLASSIC), "max_angle_deg": 90.0})
     assert grow_regions(points, normals, curvature, neighbors, config).tolist() == [0] * 4
 
 
 def test_points_above_thecurvature_limit_join_but_do_not_spread():
     points, normals, curvature, neighbors = strip(9, 0.0)
     curvature[4] = 0.2
-    config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.5})
+    config = papers_growing(**{**vars(CLASSIC), "curvature_quantile": 0.5})
     labels = grow_regions(points, normals, curvature, neighbors, config)
     assert labels.tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1]
 
@@ -60,10 +60,10 @@ def test_the_increment_rule_compares_with_the_point_that_was_joined():
     points, normals, curvature, neighbors = strip(9, 0.0)
     curvature = (torch.arange(9, dtype=torch.float64) - 1).clamp(min=0) / 32
     # The limit is 1/32: each step of curvature is within it, most values are above.
-    config = GrowingConfig(**{**vars(CLASSIC), "curvature_quantile": 0.25})
+    config = papers_growing(**{**vars(CLASSIC), "curvature_quantile": 0.25})
     by_value = grow_regions(points, normals, curvature, neighbors, config)
     assert by_value.max() > 1
-    config = GrowingConfig(**{**vars(config), "seed_rule": "increment"})
+    config = papers_growing(**{**vars(config), "seed_rule": "increment"})
     assert grow_regions(points, normals, curvature, neighbors, config).max() == 0
 
 
@@ -73,8 +73,8 @@ def test_a_point_that_joined_unconnected_is_a_seed_once_a_connected_seed_reaches
     points, normals, _, _ = strip(6, 0.0)
     cloud = (points, normals, torch.arange(6).double(), Neighbors(torch.tensor(rows)))
     settings = {"coplanarity": False, "curvature_quantile": 1.0, "min_size": 1}
-    assert grow_regions(*cloud, GrowingConfig(**settings)).tolist() == [0] * 6
-    printed = GrowingConfig(**settings, connectivity_scope="region")
+    assert grow_regions(*cloud, papers_growing(**settings)).tolist() == [0] * 6
+    printed = papers_growing(**settings, connectivity_scope="region")
     assert grow_regions(*cloud, printed).tolist() == [0, 0, 0, 1, 1, 1]
 
 
@@ -89,7 +89,7 @@ def testcurvature_limit_is_the_lower_quantile():
 def test_regions_smaller_than_min_size_are_not_labelled():
     points, normals, curvature, neighbors = strip(10, 0.0)
     normals[:3] = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    config = GrowingConfig(**{**vars(CLASSIC), "min_size": 4})
+    config = papers_growing(**{**vars(CLASSIC), "min_size": 4})
     labels = grow_regions(points, normals, curvature, neighbors, config)
     assert labels.tolist() == [-1] * 3 + [0] * 7
 
@@ -109,7 +109,7 @@ def test_points_without_finite_normal_or_curvature_do_not_join():
     assert len(labels.unique()) == 4
 
 
-@pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
+@pytest.mark.parametrize("config", [CLASSIC, papers_growing(min_size=1)])
 @pytest.mark.parametrize("num_points", [0, 1, 2, 3])
 def test_tiny_clouds_work(config, num_points):
     points = torch.eye(3)[:num_points] * torch.tensor([1.0, 1, 0])
@@ -122,14 +122,14 @@ def test_tiny_clouds_work(config, num_points):
     assert labels.tolist() == [0] * num_points
 
 
-@pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
+@pytest.mark.parametrize("config", [CLASSIC, papers_growing(min_size=1)])
 def test_a_cloud_without_a_valid_point_has_no_region(config):
     cloud = strip(6, 0.0)
     nobody = torch.zeros(6, dtype=torch.bool)
     assert grow_regions(*cloud, config, valid=nobody).tolist() == [-1] * 6
 
 
-@pytest.mark.parametrize("config", [CLASSIC, GrowingConfig(min_size=1)])
+@pytest.mark.parametrize("config", [CLASSIC, papers_growing(min_size=1)])
 def test_equal_points_are_one_region(config):
     points = torch.full((20, 3), 0.3)
     neighbors = search_knn(points, 5)
@@ -145,7 +145,7 @@ def test_exact_and_quantized_walls_do_not_shatter():
     rough[:, 2] = (rough[:, 2] / (20 * step) > 0.9) * step
     for points in (grid, rough):
         cloud = growing_clouds.prepare(points.numpy(), 50, dtype=torch.float32)
-        config = GrowingConfig(connectivity=0.5, min_size=1)
+        config = papers_growing(connectivity=0.5, min_size=1)
         labels = grow_regions(*cloud, config)
         assert (labels == 0).float().mean() > 0.97
 
@@ -178,7 +178,7 @@ def test_neighbours_across_a_gap_join_only_within_the_distance():
     points[5:, 0] += 1
     neighbors = search_knn(points, 4)
     assert grow_regions(points, normals, curvature, neighbors, CLASSIC).max() == 0
-    config = GrowingConfig(**{**vars(CLASSIC), "max_distance": 1.5})
+    config = papers_growing(**{**vars(CLASSIC), "max_distance": 1.5})
     labels = grow_regions(points, normals, curvature, neighbors, config)
     assert labels.tolist() == [0] * 5 + [1] * 5
 
@@ -205,7 +205,7 @@ def test_faces_of_a_plate_join_only_without_planes_to_be_on():
     cloud = (*cloud, search_knn(points, 30))
     rms = torch.full((600,), 0.002, dtype=torch.float64)
     assert grow_regions(*cloud, CLASSIC).max() == 0
-    config = GrowingConfig(**{**vars(CLASSIC), "plane_reach": 4.0})
+    config = papers_growing(**{**vars(CLASSIC), "plane_reach": 4.0})
     labels = grow_regions(*cloud, config, residual_rms=rms)
     assert labels.max() == 1
     assert torch.equal(labels == labels[0], face == face[0])
@@ -265,4 +265,4 @@ def test_wrong_shapes_are_refused():
 )
 def test_values_out_of_range_are_refused(name, value):
     with pytest.raises(ConfigError, match=f"GrowingConfig: expected {name} "):
-        GrowingConfig(**{name: value})
+        papers_growing(**{name: value})

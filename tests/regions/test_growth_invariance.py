@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
-from torchrg.config import GrowingConfig, load_config
+from torchrg.config import load_config
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 from torchrg.structures import Neighbors
@@ -16,9 +17,9 @@ from torchrg.structures import Neighbors
 PRESETS = {name: load_config(name).growing for name in ("classic", "paper", "consensus")}
 PRESETS["consensus"] = dataclasses.replace(PRESETS["consensus"], plane_reach=None)
 SMALL = {"min_size": 3, "max_angle_deg": 12.0}
-CONFIGS = {name: GrowingConfig(**{**vars(config), **SMALL}) for name, config in PRESETS.items()} | {
-    "seeds by value": GrowingConfig(seed_rule="curvature", **SMALL),
-    "as printed": GrowingConfig(connectivity_scope="region", **SMALL),
+CONFIGS = {name: dataclasses.replace(config, **SMALL) for name, config in PRESETS.items()} | {
+    "seeds by value": papers_growing(seed_rule="curvature", **SMALL),
+    "as printed": papers_growing(connectivity_scope="region", **SMALL),
 }
 
 

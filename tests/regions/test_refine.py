@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
-from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
@@ -17,11 +17,11 @@ from torchrg.regions.growth import label_regions
 from torchrg.regions.repair import absorb_points, merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
-OFF = GrowingConfig(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)
+OFF = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)
 
 
 def with_settings(**settings):
-    return GrowingConfig(**{**vars(OFF), **settings})
+    return papers_growing(**{**vars(OFF), **settings})
 
 
 def flat_cloud(coordinates, k=16, normals=None):
@@ -408,4 +408,4 @@ def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
 )
 def test_settings_out_of_range_are_refused(name, value):
     with pytest.raises(ConfigError, match=f"GrowingConfig: expected {name} "):
-        GrowingConfig(**{name: value})
+        papers_growing(**{name: value})

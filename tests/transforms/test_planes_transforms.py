@@ -6,9 +6,19 @@ import pytest
 import torch
 from torch import nn
 
-from torchrg.config import SuperpointsConfig, load_config
+from torchrg.config import (
+    GrowingConfig,
+    NormalsConfig,
+    PipelineConfig,
+    SuperpointsConfig,
+    load_config,
+    preset_names,
+)
 from torchrg.errors import ConfigError
+from torchrg.neighbors import search_knn
+from torchrg.normals import estimate_normals
 from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.regions import grow_regions
 from torchrg.scenes import make_room
 from torchrg.transforms import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
 
@@ -63,7 +73,7 @@ def test_points_that_are_not_finite_are_left_out(coord):
     assert expected[7] == -1
 
 
-@pytest.mark.parametrize("transform", [EstimateNormals(), GrowRegions(), SegmentPlanes("classic")])
+@pytest.mark.parametrize("transform", [EstimateNormals(), GrowRegions("paper"), SegmentPlanes()])
 def test_empty_clouds_pass(transform):
     empty = torch.empty(0, 3)
     sample = {"coord": empty, "normal": empty, "curvature": torch.empty(0)}
@@ -89,14 +99,81 @@ def test_settings_are_shown():
 def test_normals_then_regions_with_the_residual_are_the_whole_method():
     config = load_config("consensus")
     sample = {"coord": make_room(4000, 0.003, 5).points}
-    steps = nn.Sequential(
-        EstimateNormals(config.normals, residual=True), GrowRegions(config.growing)
-    )
+    steps = nn.Sequential(EstimateNormals(config.normals), GrowRegions(config.growing))
     whole = SegmentPlanes(config)(sample)["plane"]
     assert whole.max() >= 3
     assert torch.equal(steps(sample)["plane"], whole)
     with pytest.raises(ConfigError, match="residual"):
-        GrowRegions(config.growing)(EstimateNormals(config.normals)(sample))
+        GrowRegions(config.growing)(EstimateNormals(config.normals, residual=False)(sample))
+
+
+def test_who_says_nothing_gets_the_same_everywhere():
+    points = make_room(4000, 0.003, 5).points
+    seg = segment_planes(points)
+    fit = estimate_normals(points)
+    neighbors = search_knn(points, load_config().normals.k)
+    labels = grow_regions(*(points, fit.normals, fit.curvature, neighbors), residual_rms=fit[3])
+    assert torch.equal(seg.labels, labels)
+    assert torch.equal(seg.normals, fit.normals)
+    for transform in (SegmentPlanes(), nn.Sequential(EstimateNormals(), GrowRegions())):
+        assert torch.equal(transform({"coord": points})["plane"], seg.labels)
+    assert load_config() == PipelineConfig() == PipelineConfig(NormalsConfig(), GrowingConfig())
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
+    points, config = make_room(1500, 0.003, 5).points, load_config(preset)
+    seg = segment_planes(points, config)
+    assert torch.equal(segment_planes(points, preset).labels, seg.labels)
+    assert torch.equal(SegmentPlanes(preset)({"coord": points})["plane"], seg.labels)
+    fit = estimate_normals(points, preset)
+    assert torch.equal(fit.normals, seg.normals)
+    assert torch.equal(EstimateNormals(config)({"coord": points})["normal"], seg.normals)
+    steps = nn.Sequential(EstimateNormals(preset), GrowRegions(preset, k=config.normals.k))
+    assert torch.equal(steps({"coord": points})["plane"], seg.labels)
+    neighbors = search_knn(points, config.normals.k)
+    grown = grow_regions(points, *fit[:2], neighbors, preset, residual_rms=fit.residual_rms)
+    assert torch.equal(grown, seg.labels)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: EstimateNormals(method="svd"),
+            "EstimateNormals: method: expected one of pca",
+        ),
+        (lambda: EstimateNormals(methd="pca"), "unknown setting 'methd'; NormalsConfig has method"),
+        (lambda: EstimateNormals(k=2.5), "EstimateNormals: k: expected int, got 2.5"),
+        (lambda: EstimateNormals("clasic"), "a preset, one of classic, .* got 'clasic'"),
+        (
+            lambda: EstimateNormals(GrowingConfig()),
+            "EstimateNormals: expected config to be",
+        ),
+        (lambda: GrowRegions(max_angle=5), "GrowRegions: unknown setting 'max_angle'; Growing"),
+        (lambda: GrowRegions(min_size=0), "GrowingConfig: expected min_size >= 1, got 0"),
+        (lambda: SegmentPlanes(7), "expected config to be a PipelineConfig, .* got int"),
+        (
+            lambda: segment_planes(torch.rand(9, 3), {}),
+            "expected config .* got dict",
+        ),
+        (lambda: NormalsConfig(method="svd"), "expected method to be one of pca, .* got 'svd'"),
+        (lambda: GrowingConfig(seed_rule="x"), "expected seed_rule to be one of curvature, incre"),
+    ],
+)
+def test_wrong_settings_are_refused_at_once_and_in_one_line(make, message):
+    with pytest.raises(ConfigError, match=message) as info:
+        make()
+    assert "\n" not in str(info.value)
+
+
+def test_settings_are_shown_on_lines_that_can_be_read():
+    for module in (SegmentPlanes(), EstimateNormals(), GrowRegions(k=9), MakeSuperpoints()):
+        lines = repr(module).splitlines()
+        assert all(len(line) <= 100 for line in lines)
+        assert len(lines) > 1
+    assert "method='consensus', k=50" in repr(SegmentPlanes())
+    assert repr(GrowRegions(k=9)).splitlines()[1].strip() == "k=9,"
 
 
 def test_superpoints_are_those_of_the_function(coord):

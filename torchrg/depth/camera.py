@@ -1,9 +1,11 @@
 """Pinhole cameras: depth images to points, through kornia, and back from organised clouds."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_floating, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
 
 
@@ -17,7 +19,8 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Args:
         depth: Shape ``(B, H, W)``, floating point, in any unit.
-        intrinsics: Camera matrices, shape ``(B, 3, 3)``, without skew.
+        intrinsics: Camera matrices, shape ``(B, 3, 3)``, without skew, or what
+            :func:`read_intrinsics` makes them of.
         poses: Matrices from camera to world coordinates, shape ``(B, 4, 4)``. Default: the points
             are in camera coordinates.
 
@@ -34,6 +37,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         tensor([[-1., nan],
                 [-1.,  1.]])
     """
+    intrinsics = read_intrinsics("depth_to_points", intrinsics)
     check_shapes(
         "depth_to_points",
         depth=(depth, "B H W"),
@@ -50,6 +54,25 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         return points
     poses = poses.to(depth.device)
     return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
+
+
+def read_intrinsics(caller: str, given: Any) -> Tensor:  # noqa: ANN401
+    """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)``, of whatever holds them.
+
+    Args:
+        caller: Name of the public function, the first word of messages.
+        given: Such matrices, those of 4 x 4 as kornia has them, or its ``PinholeCamera``, of which
+            the intrinsics are taken and nothing else; tensors or arrays.
+
+    Raises:
+        ShapeError: If it is no tensor, array or camera.
+
+    Example:
+        >>> read_intrinsics("f", torch.eye(4)[None]).shape
+        torch.Size([1, 3, 3])
+    """
+    tensor = as_tensor(caller, "intrinsics", getattr(given, "camera_matrix", given))
+    return tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
 
 
 def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:

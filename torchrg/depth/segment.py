@@ -7,7 +7,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._opaque import of_clouds
 from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
-from torchrg.depth.camera import has_depth, points_of_image
+from torchrg.depth.camera import has_depth, points_of_image, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import PixelPlanes, fit_pixels
 from torchrg.depth.windows import WindowPlanes
@@ -38,7 +38,7 @@ def segment_depth(
 
     Args:
         depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
-        intrinsics: Camera matrix, shape ``(3, 3)``; see
+        intrinsics: Camera matrix, shape ``(3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; see
             :func:`torchrg.depth.camera.depth_to_points`.
         config: Settings. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
@@ -61,7 +61,8 @@ def segment_depth(
         ([0, 0, 1, 1], [2.0, 3.0])
     """
     depth = as_tensor("segment_depth", "depth", depth)
-    intrinsics = as_tensor("segment_depth", "intrinsics", intrinsics)
+    intrinsics = read_intrinsics("segment_depth", intrinsics)
+    intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(
         "segment_depth",
         depth=(depth, "H W"),

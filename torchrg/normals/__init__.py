@@ -1,6 +1,5 @@
 """Normals and curvature of clouds: one call for every estimator."""
 
-import dataclasses
 from functools import partial
 
 import numpy as np
@@ -11,7 +10,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_points
 from torchrg._opaque import of_clouds
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
-from torchrg.config import NormalMethod, NormalsConfig
+from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals.consensus import constants, estimate_consensus
@@ -77,12 +76,12 @@ see :func:`torchrg.normals.consensus.wanted_neighbors`."""
 @sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],
+    config: NormalsConfig | PipelineConfig | str | None = None,
     *,
     method: NormalMethod | None = None,
     k: int | None = None,
     neighbors: Neighbors | None = None,
     max_distance: float | None = None,
-    config: NormalsConfig | None = None,
     chunk_size: int = CHUNK_SIZE,
 ) -> NormalFit:
     """Estimate normal and curvature of every point of a cloud.
@@ -97,13 +96,14 @@ def estimate_normals(
 
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
+        config: Settings, a whole configuration, or the name of a preset. Default: that of
+            :func:`torchrg.load_config`.
         method: A name from :data:`ESTIMATORS`. Default: that of ``config``.
         k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud
             with fewer points uses those it has.
         neighbors: Neighbours found before, for finite points. Default: searched.
         max_distance: Neighbours farther than this do not count: a hybrid search. In the unit of the
             cloud. Default: no limit.
-        config: Further settings. Default: :class:`torchrg.config.NormalsConfig`.
         chunk_size: Points handled at a time; bounds memory, changes no result.
 
     Returns:
@@ -122,15 +122,9 @@ def estimate_normals(
     """
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
-    settings = config or NormalsConfig()
     changes = {"method": method, "k": k}
     given = {name: value for name, value in changes.items() if value is not None}
-    settings = dataclasses.replace(settings, **given)  # type: ignore[arg-type]
-    if settings.method not in ESTIMATORS:
-        names = ", ".join(sorted(ESTIMATORS))
-        raise ConfigError(
-            f"estimate_normals: expected method to be one of {names}, got {settings.method!r}."
-        )
+    settings = settings_of("estimate_normals", NormalsConfig, config, given)
     estimate = ESTIMATORS[settings.method]
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():
         names = ", ".join(sorted(ESTIMATORS.keys() - WITHOUT_GRADIENT))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._opaque import of_clouds
 from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_operations
-from torchrg.config import GrowingConfig
+from torchrg.config import GrowingConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order
 from torchrg.regions.adjacency import NearestPoints
@@ -44,7 +44,7 @@ def grow_regions(
     normals: Tensor | NDArray[np.floating],
     curvature: Tensor | NDArray[np.floating],
     neighbors: Neighbors,
-    config: GrowingConfig | None = None,
+    config: GrowingConfig | PipelineConfig | str | None = None,
     *,
     valid: Tensor | None = None,
     residual_rms: Tensor | NDArray[np.floating] | None = None,
@@ -74,7 +74,8 @@ def grow_regions(
         normals: Unit normals, shape ``(N, 3)``; their sign only matters with ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
-        config: Settings. Default: the paper's.
+        config: Settings, a whole configuration, or the name of a preset. Default: that of
+            :func:`torchrg.load_config`, which needs ``residual_rms``.
         valid: Points that have a normal, shape ``(N,)``, bool; the others join no region, and no
             region passes through them. Default: all. Points whose normal or curvature is not
             finite never join.
@@ -104,10 +105,14 @@ def grow_regions(
         >>> points = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
         >>> normals, curvature = torch.eye(3)[[2] * 16], torch.zeros(16)
         >>> neighbors = Neighbors(torch.arange(16).expand(16, 16))
-        >>> grow_regions(points, normals, curvature, neighbors, GrowingConfig(min_size=9)).unique()
+        >>> found = grow_regions(
+        ...     points, normals, curvature, neighbors, GrowingConfig(min_size=9),
+        ...     residual_rms=torch.zeros(16),
+        ... )
+        >>> found.unique()
         tensor([0])
     """
-    config = GrowingConfig() if config is None else config
+    config = settings_of("grow_regions", GrowingConfig, config)
     cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg._opaque import of_clouds
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
+from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.structures import UNLABELED
@@ -28,6 +29,9 @@ class DepthTransform(SampleTransform):
 
     def read_images(self, sample: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
+        key = self.key(sample, "intrinsics")
+        if key in sample:
+            sample = {**sample, key: read_intrinsics(type(self).__name__, sample[key])}
         depth, intrinsics = self.read(sample, "depth"), self.read(sample, "intrinsics")
         if depth.ndim not in (2, 3, 4) or (depth.ndim > 2 and depth.shape[-3] != 1):
             raise ShapeError(
@@ -119,9 +123,9 @@ class SegmentDepth(DepthTransform):
     """Add plane labels, normals and curvature to depth images; see :func:`segment_depth`.
 
     Reads ``depth``, of shape ``(H, W)``, ``(1, H, W)`` or ``(B, 1, H, W)``, ``intrinsics``
-    ``(3, 3)`` or ``(B, 3, 3)``, and ``pose`` ``(4, 4)`` or ``(B, 4, 4)`` if there: normals and
-    planes are then in world coordinates, else in camera coordinates. Adds images, with ``B`` in
-    front for a batch:
+    ``(3, 3)`` or ``(B, 3, 3)``, 4 x 4 or a kornia ``PinholeCamera``, and ``pose`` ``(4, 4)`` or
+    ``(B, 4, 4)`` if there: normals and planes are then in world coordinates, else in camera
+    coordinates. Adds images, with ``B`` in front for a batch:
 
     * ``plane`` ``(H, W)``, int64: 0 to M-1 by descending size in each image, -1 for none;
     * ``normal`` ``(H, W, 3)``: unit normals towards the camera, 0 where there is no depth;

@@ -7,13 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import (
     DEFAULT_PRESET,
     GrowingConfig,
     NormalsConfig,
     PipelineConfig,
     SuperpointsConfig,
-    load_config,
+    settings_of,
 )
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
@@ -27,12 +28,14 @@ from torchrg.transforms.sample import CloudTransform
 class EstimateNormals(CloudTransform):
     """Add unit normals and curvature; see :func:`torchrg.estimate_normals`.
 
-    Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
+    Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)``, ``curvature`` and ``residual`` ``(N,)``.
 
     Args:
-        config: Settings of the estimator. Default: :class:`torchrg.config.NormalsConfig`.
-        residual: Whether to add ``residual`` ``(N,)`` too, the root mean square distance of the
+        config: Settings of the estimator, a whole configuration, or the name of a preset. Default:
+            that of :func:`torchrg.load_config`.
+        residual: Whether to add ``residual`` ``(N,)``, the root mean square distance of the
             neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
+        chunk_size: Points handled at a time; bounds memory, changes no result.
         keys: Other names for the keys.
         **changes: Single settings, as in ``method="pca", k=30``.
 
@@ -44,19 +47,20 @@ class EstimateNormals(CloudTransform):
 
     def __init__(
         self,
-        config: NormalsConfig | None = None,
+        config: NormalsConfig | PipelineConfig | str | None = None,
         *,
-        residual: bool = False,
+        residual: bool = True,
+        chunk_size: int = CHUNK_SIZE,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keys=keys)
-        self.config = dataclasses.replace(config or NormalsConfig(), **changes)
-        self.residual = residual
+        self.config = settings_of("EstimateNormals", NormalsConfig, config, changes)
+        self.residual, self.chunk_size = residual, chunk_size
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return normals and curvature of a cloud."""
-        fit = estimate_normals(cloud["coord"], config=self.config)
+        fit = estimate_normals(cloud["coord"], self.config, chunk_size=self.chunk_size)
         found = {"normal": fit.normals, "curvature": fit.curvature}
         return {**found, "residual": fit.residual_rms} if self.residual else found
 
@@ -69,7 +73,8 @@ class GrowRegions(CloudTransform):
     none. A point with a zero normal joins no region.
 
     Args:
-        config: Settings of the growth. Default: :class:`torchrg.config.GrowingConfig`.
+        config: Settings of the growth, a whole configuration, or the name of a preset. Default:
+            that of :func:`torchrg.load_config`.
         k: Number of neighbours, the point itself included.
         keys: Other names for the keys.
         **changes: Single settings, as in ``max_angle_deg=7``.
@@ -77,20 +82,20 @@ class GrowRegions(CloudTransform):
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
         >>> sample = EstimateNormals(method="pca", k=9)({"coord": floor})
-        >>> GrowRegions(k=9, connectivity=None)(sample)["plane"].unique()
+        >>> GrowRegions(k=9)(sample)["plane"].unique()
         tensor([0])
     """
 
     def __init__(
         self,
-        config: GrowingConfig | None = None,
+        config: GrowingConfig | PipelineConfig | str | None = None,
         *,
         k: int = NormalsConfig.k,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keys=keys)
-        self.config = dataclasses.replace(config or GrowingConfig(), **changes)
+        self.config = settings_of("GrowRegions", GrowingConfig, config, changes)
         self.k = k
         with_residual = self.config.plane_reach is not None
         self.reads = ("coord", "normal", "curvature", *["residual"] * with_residual)
@@ -117,7 +122,7 @@ class GrowRegions(CloudTransform):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        return f"k={self.k}, {self.config!r}"
+        return f"k={self.k},\n{super().extra_repr()}"
 
 
 class SegmentPlanes(CloudTransform):
@@ -143,7 +148,7 @@ class SegmentPlanes(CloudTransform):
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keys=keys)
-        self.config = load_config(config) if isinstance(config, str) else config
+        self.config = settings_of("SegmentPlanes", PipelineConfig, config)
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return plane labels, normals and curvature of a cloud."""

@@ -6,7 +6,9 @@ treat each cloud by itself.
 """
 
 import copy
+import dataclasses
 import importlib
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -38,6 +40,8 @@ KEYS = (
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
 """Names that a PyG ``Data`` has instead of ours, unless others are given. PyG makes entries with
 ``index`` in their name refer to the rows of the batch."""
+_LINE = 90
+"""Characters of a line of settings."""
 _MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
 """Entries that PyG makes when it joins clouds."""
 _NEVER_A_ROW = torch.iinfo(torch.int64).min
@@ -74,7 +78,7 @@ class SampleTransform(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        return "" if self.config is None else repr(self.config)
+        return "" if self.config is None else "\n".join(_lines_of(self.config))
 
     @of_clouds
     def forward(self, sample: Any) -> Any:  # noqa: ANN401
@@ -284,6 +288,21 @@ class SampleVoxels(SampleTransform):
     def extra_repr(self) -> str:
         """Return the settings."""
         return f"size={self.size}"
+
+
+def _lines_of(config: Any) -> list[str]:  # noqa: ANN401
+    """Return settings as lines of text, those of a section behind its name."""
+    parts = [(field.name, getattr(config, field.name)) for field in dataclasses.fields(config)]
+    own = ", ".join(f"{name}={part!r}" for name, part in parts if not _is_section(part))
+    lines = textwrap.wrap(own, _LINE, break_long_words=False) if own else []
+    for name, part in parts:
+        if _is_section(part):
+            lines += [f"{name}:", *(f"  {line}" for line in _lines_of(part))]
+    return lines
+
+
+def _is_section(part: object) -> bool:
+    return dataclasses.is_dataclass(part)
 
 
 def is_separable(sample: Any) -> bool:  # noqa: ANN401
