@@ -154,7 +154,7 @@ class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Axis that points up: planes then have roles, as floor, ceiling, wall. None: not told apart."""
+    """Axis that points up: planes then have roles: floor, ceiling, wall and others. None: no."""
     outline: bool = False
     """Whether to trace the outline of each plane; needs shapely."""
 
