@@ -28,6 +28,8 @@ have to come after. With ``from torchrg.transforms import SegmentPlanes`` at the
       params:
         config: s3dis
 
+:func:`make_nag` nests superpoints as its ``NAG``.
+
 OpenPCSeg reads scans of cars only (SemanticKITTI, Waymo), of which there is nothing to convert; in
 ``__getitem__`` of a subclass, columns of ours go beside those of ``xyzret``::
 
@@ -41,6 +43,7 @@ here, and a test; a new folder of depth frames is a row of :data:`~torchrg.datas
 
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.folder import FolderOfClouds, SceneFiles, read_pointcept_area
+from torchrg.datasets.nag import make_nag
 from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
@@ -60,6 +63,7 @@ __all__ = [
     "SceneFiles",
     "Skipped",
     "collate_offset",
+    "make_nag",
     "read_pointcept_area",
     "read_pointcept_scene",
     "read_room",
