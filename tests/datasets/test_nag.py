@@ -25,12 +25,14 @@ def nested():
 
 def test_levels_agree_in_both_directions(nested):
     """What ``NAG.debug`` and ``Cluster.to_super_index`` of the transformer ask for."""
-    room, _, levels = nested
+    room, parts, levels = nested
     assert len(levels) == 4
     assert all(isinstance(level, Data) for level in levels)
     assert torch.equal(levels[0].pos, room.points)
     assert torch.equal(levels[0].y, room.labels)
-    assert [level.num_nodes for level in levels] == [4000, 150, 80, 20]
+    counts = [int(labels.max()) + 1 for labels in (parts.labels, *parts.levels)]
+    assert counts[1:] == [80, 20]
+    assert [level.num_nodes for level in levels] == [4000, *counts]
     assert "super_index" not in levels[-1]
     assert "sub" not in levels[0]
     for low, high in pairwise(levels):
