@@ -6,10 +6,17 @@
 
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
-from torchrg.transforms.planes import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
+from torchrg.transforms.planes import (
+    AlignAxes,
+    EstimateNormals,
+    GrowRegions,
+    MakeSuperpoints,
+    SegmentPlanes,
+)
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleVoxels
 
 __all__ = [
+    "AlignAxes",
     "CenterCloud",
     "DepthToCloud",
     "EstimateNormals",
