@@ -174,8 +174,8 @@ class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Axis that points up. With it the table calls each plane a floor, ceiling, wall or other.
-    None: planes are not told apart."""
+    """Axis that points up. With it the table gives each plane a role: floor, ceiling, wall or
+    another. None: planes are not told apart."""
     outline: bool = False
     """Whether the outline of each plane is traced; this needs shapely."""
 

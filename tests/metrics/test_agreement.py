@@ -1,14 +1,23 @@
 """Agreement of labellings against scikit-learn and against loops."""
 
+import numpy as np
 import pytest
 import torch
-from sklearn.metrics import adjusted_rand_score, normalized_mutual_info_score
+from scipy.stats import entropy
+from sklearn.metrics import (
+    adjusted_rand_score,
+    mutual_info_score,
+    normalized_mutual_info_score,
+    rand_score,
+)
 
 from torchrg.metrics import (
     adjusted_rand_index,
     contingency_table,
     normalized_mutual_information,
+    rand_index,
     segmentation_covering,
+    variation_of_information,
 )
 from torchrg.metrics.contingency import ContingencyTable
 
@@ -30,6 +39,12 @@ def test_rand_index_and_information_are_those_of_scikit_learn(labels, truth):
     nmi = normalized_mutual_info_score(truth.numpy(), labels.numpy())
     assert adjusted_rand_index(table) == pytest.approx(ari, abs=1e-12)
     assert normalized_mutual_information(table) == pytest.approx(nmi, abs=1e-12)
+    rand = rand_score(truth.numpy(), labels.numpy())
+    assert rand_index(table) == pytest.approx(rand, abs=1e-12)
+    (_, counts), shared = np.unique(truth, return_counts=True), mutual_info_score(truth, labels)
+    entropies = entropy(counts), entropy(np.unique(labels, return_counts=True)[1])
+    bits = (sum(entropies) - 2 * shared) / np.log(2)
+    assert variation_of_information(table) == pytest.approx(bits, abs=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore:The number of unique classes:UserWarning")
@@ -54,6 +69,9 @@ def test_degenerate_labellings_have_the_values_of_scikit_learn(labels, truth):
     ari, nmi = adjusted_rand_score(truth, labels), normalized_mutual_info_score(truth, labels)
     assert adjusted_rand_index(table) == pytest.approx(ari, abs=1e-12)
     assert normalized_mutual_information(table) == pytest.approx(nmi, abs=1e-12)
+    expected = rand_score(truth, labels) if len(labels) else 1
+    assert rand_index(table) == pytest.approx(expected, abs=1e-12)
+    assert variation_of_information(table) >= 0
 
 
 def test_rand_index_of_billions_of_points_does_not_overflow():

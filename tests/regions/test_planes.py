@@ -9,6 +9,7 @@ import torch
 from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import summarize_planes
+from torchrg.scenes import make_room
 from torchrg.structures import PLANE_KINDS
 
 
@@ -255,7 +256,38 @@ def test_table_tops_and_cabinets_are_neither_floor_nor_wall():
     normals = torch.cat([normals, torch.eye(3).double()[[2] * 500 + [1] * 500]])
     labels = torch.cat([labels, torch.tensor([6] * 500 + [7] * 500)])
     table = summarize_planes(points, normals, labels, up=(0, 0, 1))
-    assert [PLANE_KINDS[kind] for kind in table.kind[6:]] == ["other", "other"]
+    assert [PLANE_KINDS[kind] for kind in table.kind[6:]] == ["horizontal", "vertical"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_floors_ceilings_and_walls_of_made_rooms_are_told_from_the_rest(seed):
+    room = make_room(num_points=6000, noise=0.003, seed=seed)
+    faces, labels = torch.unique(room.labels, return_inverse=True)
+    labels = torch.where(room.labels < 0, -1, labels - int((faces < 0).sum()))
+    table = summarize_planes(room.points, room.normals, labels, up="z")
+    found = [PLANE_KINDS[kind] for kind in table.kind]
+    true = [room.kinds[face] for face in faces[faces >= 0]]
+    shell = {"floor", "ceiling", "wall"}
+    assert [kind for kind in found if kind in shell] == [kind for kind in true if kind in shell]
+    assert {a for a, b in zip(found, true, strict=True) if b in ("table top", "shelf")} == {
+        "horizontal"
+    }
+    assert "vertical" in {a for a, b in zip(found, true, strict=True) if b == "cabinet"}
+
+
+def test_what_leans_is_oblique_and_what_is_bent_has_no_role():
+    rng = np.random.default_rng(13)
+    points, normals, labels = box_of_points(rng, n=800)
+    flat = torch.from_numpy(rng.uniform([1, 1, 1], [2, 2, 1], (500, 3)))
+    roof = flat + (flat[:, :1] - 1) * torch.tensor([0, 0, 0.7]).double()
+    angle = torch.from_numpy(rng.uniform(0, np.pi, 500))
+    column = torch.stack([1 + angle.cos() / 3, 1 + angle.sin() / 3, flat[:, 0]], dim=1)
+    lean = torch.tensor([-0.573, 0, 0.819]).double().expand(500, 3)
+    around = torch.stack([angle.cos(), angle.sin(), 0 * angle], dim=1)
+    points, normals = torch.cat([points, roof, column]), torch.cat([normals, lean, around])
+    labels = torch.cat([labels, torch.tensor([6] * 500 + [7] * 500)])
+    table = summarize_planes(points, normals, labels, up="z")
+    assert [PLANE_KINDS[kind] for kind in table.kind[6:]] == ["oblique", "other"]
 
 
 def test_outline_of_a_frame_has_a_hole_and_its_area():

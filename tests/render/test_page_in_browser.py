@@ -207,6 +207,26 @@ def test_hiding_a_plane_and_cutting_change_the_picture(tab, room):
     tab.page.locator("#near").fill("0")
 
 
+def test_kinds_of_planes_are_a_filter(tab):
+    before, cloud = tab.picture(), "torchrg.page.clouds[0]"
+    kinds = tab.run(f"{cloud}.planes.map((plane) => torchrg.page.kinds[plane.kind])")
+    boxes, names = tab.page.locator("#kinds input"), tab.page.locator("#kinds label")
+    assert {"floor", "ceiling", "wall"} <= set(kinds)
+    shown = {text.strip() for text in names.all_inner_texts()}
+    assert shown == {f"{name} ({kinds.count(name)})" for name in set(kinds)}
+    tab.page.get_by_label("show wall planes").uncheck()
+    hidden = tab.run(f"[...{cloud}.hidden]")
+    assert [kinds[own] for own in hidden] == ["wall"] * kinds.count("wall")
+    assert (tab.picture() != before).any()
+    assert tab.run("document.activeElement.getAttribute('aria-label')") == "show wall planes"
+    tab.run(f"torchrg.setHidden(0, [{hidden[0]}], false)")
+    half = "(boxes) => boxes.filter((box) => box.indeterminate).length"
+    assert boxes.evaluate_all(half) == 1
+    tab.run("showall.click()")
+    assert boxes.evaluate_all("(boxes) => boxes.every((box) => box.checked)")
+    assert (tab.picture() == before).all()
+
+
 def test_both_halves_are_turned_together(tab):
     def cameras():
         return np.array(tab.run("torchrg.deck().getViewports().map((v) => v.cameraPosition)"))

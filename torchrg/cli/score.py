@@ -5,7 +5,7 @@ import io
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -29,6 +29,7 @@ from torchrg.io.files import check_place
 from torchrg.metrics import (
     differing_rows,
     match_points,
+    planes_of_colors,
     score_labels,
     score_normals,
     score_partition,
@@ -76,6 +77,9 @@ class Arguments:
     same point but for the rounding of the files, in any order."""
     superpoints: bool = False
     """Score superpoints against the true labels, as torchrg segment --superpoints writes them."""
+    plane_colors: bool = False
+    """True labels are in the colours, as in planes.ply of PlaneRCNN and AirPlanes, of which a
+    folder has one in the folder of each scan, or in annotation below."""
     ignore: int | None = None
     """True label of points that are not of any part, for superpoints. -1 always is one."""
     boundary_distance: float | None = None
@@ -104,7 +108,7 @@ def run(argv: list[str]) -> int:
         check_apart([arguments.csv], [predicted, truth])
     if of_folders:
         with warnings_as_lines():
-            pairs = _pair_scans(predicted, truth).items()
+            pairs = _pair_scans(predicted, truth, coded=arguments.plane_colors).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
         scores = _mean(scans)
@@ -132,12 +136,18 @@ def _holds_scans(path: Path) -> bool:
     return path.is_dir() and not is_scene(path)
 
 
-def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
-    """Return both places of each scan of two folders by name, in natural order."""
+def _pair_scans(predicted: Path, truth: Path, *, coded: bool) -> dict[str, tuple[Path, Path]]:
+    """Return both places of each scan of two folders by name, in natural order.
+
+    With ``coded`` a true scan is called as the folder that its planes are in.
+    """
     ours, theirs = (
         {scene.name: scene.path for scene in FolderOfClouds(folder).scenes}
         for folder in (predicted, truth)
     )
+    if coded:
+        parts = ("/planes", "/annotation")
+        theirs = {n.removesuffix(parts[0]).removesuffix(parts[1]): p for n, p in theirs.items()}
     for folder, missing in (
         (truth, ours.keys() - theirs.keys()),
         (predicted, theirs.keys() - ours.keys()),
@@ -163,6 +173,11 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     for cloud in (ours, theirs):
         for note in cloud.notes:
             warn(f"{cloud.source}: {note}.")
+    if arguments.plane_colors:
+        if "color" not in theirs.fields:
+            raise FormatError(f"{truth}: expected colours for --plane-colors, got none.")
+        labels = planes_of_colors(theirs.fields["color"].astype(np.uint8))
+        theirs = replace(theirs, fields={**theirs.fields, "labels": labels})
     scores: Scores = {}
     if arguments.match == "rows":
         _check_rows(predicted, truth, ours, theirs)

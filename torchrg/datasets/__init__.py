@@ -28,6 +28,21 @@ have to come after. With ``from torchrg.transforms import SegmentPlanes`` at the
       params:
         config: s3dis
 
+:func:`make_nag` nests superpoints as its ``NAG``.
+
+Sonata, Concerto and other pretrained encoders want ``coord``, ``color`` and ``normal`` of scenes in
+metres, z up, and know normals of meshes, which look into the room; zeros in their place cost
+accuracy. Of a scan without normals these lines make the dict that their transforms begin with.
+In made rooms 99.5 % of the normals of floors, ceilings and walls look into the room then, and 96 %
+of all: those of plates thinner than two point spacings may not. ``torchrg align`` sets a scan
+upright before, and ``torchrg normals --orient interior`` writes the normals into a file::
+
+    cloud = torchrg.read_cloud("scan.ply")
+    normals = torchrg.estimate_normals(cloud.points).normals
+    normals = torchrg.normals.orient_normals(cloud.points, normals, towards="interior")
+    point = {"coord": cloud.points.numpy(), "color": cloud.fields["color"].astype(np.float32)}
+    point = sonata.transform.default()(point | {"normal": normals.numpy()})
+
 OpenPCSeg reads scans of cars only (SemanticKITTI, Waymo), of which there is nothing to convert; in
 ``__getitem__`` of a subclass, columns of ours go beside those of ``xyzret``::
 
@@ -41,6 +56,7 @@ here, and a test; a new folder of depth frames is a row of :data:`~torchrg.datas
 
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.folder import FolderOfClouds, SceneFiles, read_pointcept_area
+from torchrg.datasets.nag import make_nag
 from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rooms import CLASS_ORDERS, Repair, Room, RoomReport, Skipped, read_room
@@ -60,6 +76,7 @@ __all__ = [
     "SceneFiles",
     "Skipped",
     "collate_offset",
+    "make_nag",
     "read_pointcept_area",
     "read_pointcept_scene",
     "read_room",

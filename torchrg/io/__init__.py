@@ -34,6 +34,7 @@ from torchrg.io.stream import (
     stream_table,
 )
 from torchrg.io.text import count_text, open_text, write_text
+from torchrg.io.vg import open_bvg, open_vg, write_bvg, write_vg
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
@@ -86,7 +87,12 @@ FORMATS: dict[str, Format] = {
     ".xyz": Format(open_text, write_text, count_text, takes_columns=True),
     ".txt": Format(open_text, write_text, count_text, takes_columns=True),
 }
-"""What is known of each format, by suffix."""
+"""What is known of each format that holds any field, by suffix."""
+GROUP_FORMATS: dict[str, Format] = {
+    ".vg": Format(open_vg, write_vg),
+    ".bvg": Format(open_bvg, write_bvg),
+}
+"""Formats of planes, which hold coordinates, colours, normals and labels."""
 
 
 def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Cloud:
@@ -100,7 +106,7 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         of a mesh, is in :attr:`torchrg.Cloud.notes`.
 
     Args:
-        path: A file with a suffix of :data:`FORMATS`, in any case.
+        path: A file with a suffix of :data:`FORMATS` or :data:`GROUP_FORMATS`, in any case.
         columns: Names of the columns of text and of a bare ``.npy`` array, in their order: ``x``,
             ``y``, ``z`` and any others, ``_`` for one to leave out. Default: those that the file
             says, else those of :data:`torchrg.io.fields.COLUMNS_RULE`.
@@ -217,10 +223,12 @@ def write_cloud(
         planes as :meth:`torchrg.structures.Planes.to_arrays` gives it in the input's coordinates,
         and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
         identifiers). Superpoints are ``superpoints``, and ``superpoints_1`` and so on for the
-        coarser levels; in ``.npz`` also ``plane_of_superpoint``.
+        coarser levels; in ``.npz`` also ``plane_of_superpoint``. ``.vg`` and ``.bvg`` hold
+        coordinates, colours, normals and the planes as vertex groups; see :mod:`torchrg.io.vg`.
 
     Args:
-        path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`.
+        path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`
+            or :data:`GROUP_FORMATS`.
         cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
             same bytes. Its chunks are gone through up to four times, for ``.npz`` without a
             segmentation once for each field. Tensors of the results are taken chunk by chunk, too,
@@ -268,6 +276,11 @@ def write_cloud(
         stream = stream.with_results(
             lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
         )
+    if found in GROUP_FORMATS.values() and segmentation is not None:
+        table = segmentation.planes.to_arrays(stream.origin)
+        equations = np.column_stack([table["plane_normal"], -table["plane_offset"]])
+        found.write(target, _checked(target, stream), equations)  # type: ignore[call-arg]
+        return
     found.write(target, _checked(target, stream))
 
 
@@ -340,7 +353,8 @@ def estimate_points(path: Path) -> int:
 
 def _format_of(path: Path) -> Format:
     """Return the format of a path."""
-    found = FORMATS.get(path.suffix.lower())
+    suffix = path.suffix.lower()
+    found = FORMATS.get(suffix) or GROUP_FORMATS.get(suffix)
     if found is None:
         known = " ".join(FORMATS)
         raise FormatError(

@@ -15,8 +15,10 @@ from torchrg.metrics.labels import (
     adjusted_rand_index,
     match_regions,
     normalized_mutual_information,
+    rand_index,
     score_labels,
     segmentation_covering,
+    variation_of_information,
 )
 from torchrg.metrics.matching import differing_rows, match_points
 from torchrg.metrics.normals import NormalScore, score_normals
@@ -26,6 +28,7 @@ from torchrg.metrics.protocols import (
     SegCompCounts,
     VoxelScore,
     count_segcomp,
+    planes_of_colors,
     score_evops,
     score_voxels,
 )
@@ -48,6 +51,8 @@ __all__ = [
     "match_points",
     "match_regions",
     "normalized_mutual_information",
+    "planes_of_colors",
+    "rand_index",
     "score_clusters",
     "score_evops",
     "score_labels",
@@ -55,6 +60,7 @@ __all__ = [
     "score_partition",
     "score_voxels",
     "segmentation_covering",
+    "variation_of_information",
 ]
 
 
@@ -62,8 +68,8 @@ class Index(NamedTuple):
     """What a number means.
 
     Attributes:
-        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""`` for shares and
-            ratios.
+        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"bit"``, ``"count"``, or ``""`` for
+            shares and ratios.
         higher_is_better: None where neither direction is better.
     """
 
@@ -78,7 +84,8 @@ _LABELS = {
     Index("count", False): "over_segmented under_segmented missed noise",
     Index("", True): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
     "evops_precision evops_recall evops_f1 evops_mean_iou evops_mean_dice "
-    "share_labeled covering ari nmi",
+    "share_labeled covering rand ari nmi",
+    Index("bit", False): "voi",
     Index("", False): "evops_over_segmented evops_under_segmented evops_missed evops_noise",
 }
 _SUPERPOINTS = {

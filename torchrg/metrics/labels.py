@@ -1,5 +1,6 @@
 """External indices: predicted plane labels against true ones."""
 
+import math
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -36,6 +37,8 @@ class LabelScore(NamedTuple):
             ``evops_*``.
         share_labeled: Scored points that lie in a region.
         covering: Segmentation covering: mean best IoU weighted by the size of the face.
+        rand: Rand index, as tables of planes in images have it; see :func:`rand_index`.
+        voi: Variation of information, in bits; see :func:`variation_of_information`.
         ari: Adjusted Rand index.
         nmi: Normalised mutual information, arithmetic mean.
     """
@@ -68,6 +71,8 @@ class LabelScore(NamedTuple):
     evops_noise: float
     share_labeled: float
     covering: float
+    rand: float
+    voi: float
     ari: float
     nmi: float
 
@@ -93,9 +98,9 @@ def score_labels(
         * They belong to no region, or to no face, so none is matched, missed or noise.
         * A point of no face still counts in its region's size, and lowers its precision and IoU;
           a point of no region counts in its face's size, and lowers its recall and IoU.
-        * For ``ari`` and ``nmi`` the unlabelled points of each side are one more part, as when
-          the labels are given to scikit-learn. Pass ``ignore=-1`` to leave out the points of no
-          face altogether.
+        * For ``rand``, ``voi``, ``ari`` and ``nmi`` the unlabelled points of each side are one more
+          part, as when the labels are given to scikit-learn. Pass ``ignore=-1`` to leave out the
+          points of no face altogether.
         * ``covering`` and ``mean_best_iou`` are over faces only.
 
     Args:
@@ -108,8 +113,8 @@ def score_labels(
 
     Returns:
         The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
-        the counts tell it from a real 0. ``ari`` and ``nmi`` are 1 where neither side divides
-        the points.
+        the counts tell it from a real 0. ``rand``, ``ari`` and ``nmi`` are 1 where neither side
+        divides the points.
 
     Raises:
         ShapeError: If the labels are not integers, or differ in length or device.
@@ -118,7 +123,8 @@ def score_labels(
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
         Normal Estimation, section III.B. The other indices name theirs: :func:`count_segcomp`,
-        :func:`score_evops`, :func:`adjusted_rand_index`, :func:`normalized_mutual_information`,
+        :func:`score_evops`, :func:`rand_index`, :func:`variation_of_information`,
+        :func:`adjusted_rand_index`, :func:`normalized_mutual_information`,
         :func:`segmentation_covering`.
 
     Example:
@@ -151,6 +157,8 @@ def score_labels(
         **{f"evops_{name}": value for name, value in evops._asdict().items()},
         share_labeled=share(int(table.region_sizes.sum()), table.num_points),
         covering=segmentation_covering(table),
+        rand=rand_index(table),
+        voi=variation_of_information(table),
         ari=adjusted_rand_index(table),
         nmi=normalized_mutual_information(table),
     )
@@ -268,12 +276,76 @@ def adjusted_rand_index(table: ContingencyTable) -> float:
         1.0
     """
     # Python's integers: products of two counts of pairs exceed 64 bits beyond 50,000 points.
+    together, predicted, true, pairs = _pairs_of_points(table)
+    scale = pairs * (predicted + true) - 2 * predicted * true
+    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
+
+
+def rand_index(table: ContingencyTable) -> float:
+    r"""Return the share of pairs of points that both labellings join, or both part [1].
+
+    Convention:
+        The unlabelled points of a side are one more part of it, as in :func:`adjusted_rand_index`.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        In [0, 1]; 1 without any pair of points.
+
+    References:
+        [1] W. Rand. Objective criteria for the evaluation of clustering methods. JASA, 1971.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([0, 0, 1]), torch.tensor([0, 1, 1]))
+        >>> round(rand_index(table), 4)
+        0.3333
+    """
+    together, predicted, true, pairs = _pairs_of_points(table)
+    return (pairs + 2 * together - predicted - true) / pairs if pairs else 1.0
+
+
+def variation_of_information(table: ContingencyTable) -> float:
+    r"""Return ``H(C | G) + H(G | C)``, what each of two labellings does not say of the other [1].
+
+    Convention:
+        In bits, as tables of planes in images have it. The unlabelled points of a side are one more
+        part of it.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        At least 0, which means equal partitions.
+
+    References:
+        [1] M. Meila. Comparing clusterings: an information based distance. J. Multivariate
+        Analysis, 2007.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([0, 0, 0, 0]), torch.tensor([0, 0, 1, 1]))
+        >>> variation_of_information(table)
+        1.0
+    """
+    both, regions, faces = _entropies(table)
+    return max((2 * both - regions - faces) / math.log(2), 0.0)
+
+
+def _pairs_of_points(table: ContingencyTable) -> tuple[int, int, int, int]:
+    """Return the pairs of points that are together in both, in regions, in faces, and all pairs."""
     together, predicted, true = (
         int((sizes * (sizes - 1) // 2).sum()) for sizes in _sizes_with_unlabeled(table)
     )
-    pairs = table.num_points * (table.num_points - 1) // 2
-    scale = pairs * (predicted + true) - 2 * predicted * true
-    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
+    return together, predicted, true, table.num_points * (table.num_points - 1) // 2
+
+
+def _entropies(table: ContingencyTable) -> tuple[float, float, float]:
+    """Return the entropies of overlaps, regions and faces, in nats."""
+    shares = (part.double() / table.num_points for part in _sizes_with_unlabeled(table))
+    both, regions, faces = (-float(torch.special.xlogy(part, part).sum()) for part in shares)
+    return both, regions, faces
 
 
 def normalized_mutual_information(table: ContingencyTable) -> float:
@@ -302,8 +374,7 @@ def normalized_mutual_information(table: ContingencyTable) -> float:
     sizes = _sizes_with_unlabeled(table)
     if len(sizes[1]) <= 1 and len(sizes[2]) <= 1:
         return 1.0
-    shares = [part.double() / table.num_points for part in sizes]
-    both, regions, faces = (-float(torch.special.xlogy(part, part).sum()) for part in shares)
+    both, regions, faces = _entropies(table)
     return min(max(2 * (regions + faces - both) / (regions + faces), 0.0), 1.0)
 
 

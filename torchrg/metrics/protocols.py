@@ -18,6 +18,28 @@ _MATCH_IOU, _PART_IOU = 0.75, 0.2
 one to one."""
 
 
+_COLOR_STEP = 100
+"""Planes next to each other in number are so far apart in the code of their colours."""
+
+
+def planes_of_colors(color: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Return the planes that colours stand for in ``planes.ply`` of PlaneRCNN and AirPlanes.
+
+    Args:
+        color: Red, green and blue, shape ``(N, 3)``, uint8.
+
+    Returns:
+        Plane of each point, shape ``(N,)``, -1 for none.
+
+    Example:
+        >>> planes_of_colors(np.array([[0, 0, 0], [0, 0, 100], [0, 1, 44], [1, 0, 0]], np.uint8))
+        array([ -1,   0,   2, 654])
+    """
+    code = color.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
+    planes: NDArray[np.int64] = code // _COLOR_STEP - 1
+    return planes
+
+
 class SegCompCounts(NamedTuple):
     """How the regions and faces are classified by the SegComp protocol.
 

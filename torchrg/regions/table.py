@@ -56,6 +56,20 @@ _LEAST_AREA_SHARE = 0.1
 _LEAST_WALL_SHARE = 0.5
 """A wall reaches over at least this share of the cloud's height."""
 
+_LEAST_WIDTH_SHARE = 0.2
+"""And is at least this share of it wide."""
+
+_TOP_SHARE = 0.1
+"""And reaches into this highest share of it; a window ended 14 % below."""
+
+_WALL_AREA_SHARE = 0.25
+"""A wall that ends below has at least this share of the largest vertical plane's area;
+doors and sides of cabinets have up to a sixth."""
+
+_MOST_BEND = 0.02
+"""A region whose points are off its plane by at most this share of its short side is flat enough to
+have a role: a wall with a bulge is a wall, and a pillar is none."""
+
 
 def summarize_planes(
     points: Tensor | NDArray[np.floating],
@@ -213,17 +227,18 @@ def _direction(up: Sequence[float] | str, points: Tensor) -> Tensor:
 
 
 def classify_planes(planes: Planes, up: Tensor) -> Tensor:
-    """Return a simple class for each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
+    """Return the role of each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
 
     A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
-    planes take up, a ceiling in the highest, if it is not small beside the largest horizontal one.
-    A plane within 15 degrees of vertical is a wall if it takes up half of that height. What is
-    left, and what is curved, is "other". A single horizontal plane is a floor.
+    planes take up, a ceiling in the highest, if it has at least a tenth of the area of the largest
+    horizontal one; else it is "horizontal". A plane within 15 degrees of vertical is a wall if it
+    takes up half of that height, is a fifth of it wide, as sides of pillars are not, and, unlike
+    doors and cabinets, either reaches into the highest 10 % or has a quarter of the area of the
+    largest vertical one; else it is "vertical". Planes between are "oblique". What is curved by
+    more than 2 % of its short side is "other". A single horizontal plane is a floor.
     """
-    other, floor, ceiling, wall = (
-        PLANE_KINDS.index(name) for name in ("other", "floor", "ceiling", "wall")
-    )
-    kind = torch.full_like(planes.count, other)
+    kinds = {name: place for place, name in enumerate(PLANE_KINDS)}
+    kind = torch.full_like(planes.count, kinds["other"])
     if len(kind) == 0:
         return kind
     up = up.to(planes.normal.dtype) / up.to(planes.normal.dtype).norm()
@@ -231,14 +246,25 @@ def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     height = (planes.center * up).sum(dim=1)
     reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2
     low, high = (height - reach).amin(), (height + reach).amax()
-    horizontal = ~planes.curved & (steepness >= math.cos(math.radians(MAX_TILT_DEG)))
-    largest = torch.where(horizontal, planes.area, 0).amax()
-    broad = horizontal & (planes.area >= _LEAST_AREA_SHARE * largest)
-    upright = ~planes.curved & (steepness <= math.sin(math.radians(MAX_TILT_DEG)))
-    kind[upright & (2 * reach >= _LEAST_WALL_SHARE * (high - low))] = wall
-    kind[broad & (height >= high - _END_SHARE * (high - low))] = ceiling
-    kind[broad & (height <= low + _END_SHARE * (high - low))] = floor
+    flat = ~planes.curved | (planes.rms <= _MOST_BEND * planes.extent[:, 1])
+    horizontal = flat & (steepness >= math.cos(math.radians(MAX_TILT_DEG)))
+    vertical = flat & (steepness <= math.sin(math.radians(MAX_TILT_DEG)))
+    kind[flat] = kinds["oblique"]
+    kind[horizontal] = kinds["horizontal"]
+    kind[vertical] = kinds["vertical"]
+    is_high = height + reach >= high - _TOP_SHARE * (high - low)
+    is_tall = vertical & (2 * reach >= _LEAST_WALL_SHARE * (high - low))
+    is_tall &= planes.extent[:, 1] >= _LEAST_WIDTH_SHARE * (high - low)
+    kind[is_tall & (is_high | _has_share(planes, vertical, _WALL_AREA_SHARE))] = kinds["wall"]
+    broad = horizontal & _has_share(planes, horizontal, _LEAST_AREA_SHARE)
+    kind[broad & (height >= high - _END_SHARE * (high - low))] = kinds["ceiling"]
+    kind[broad & (height <= low + _END_SHARE * (high - low))] = kinds["floor"]
     return kind
+
+
+def _has_share(planes: Planes, among: Tensor, share: float) -> Tensor:
+    """Return which planes have a share of the area of the largest among some."""
+    return planes.area >= share * torch.where(among, planes.area, 0).amax()
 
 
 def _outlines(

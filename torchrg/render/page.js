@@ -570,8 +570,24 @@ function showLegend() {
   }));
 }
 
+function listKinds(c, cloud) {
+  const ofKind = (kind) => cloud.order.filter((own) => cloud.planes[own].kind === kind);
+  const present = page.kinds.map((name, kind) => [name, ofKind(kind)]).filter(([, planes]) => planes.length);
+  $("kinds").replaceChildren(...present.map(([name, planes]) => {
+    const label = element("label", null), numHidden = planes.filter((own) => cloud.hidden.has(own)).length;
+    const box = element("input", null, { type: "checkbox", checked: numHidden < planes.length,
+      indeterminate: numHidden > 0 && numHidden < planes.length,
+      onchange: (event) => setHidden(c, planes, !event.target.checked) });
+    box.setAttribute("aria-label", `show ${name} planes`);
+    label.append(box, ` ${name} (${planes.length})`);
+    return label;
+  }));
+}
+
 function listPlanes() {
   const c = Number($("cloud").value), cloud = page.clouds[c];
+  const focused = document.activeElement?.getAttribute?.("aria-label");
+  listKinds(c, cloud);
   if (!cloud.order.length) {
     $("planes").replaceChildren(element("p", "This file has no plane labels.", { className: "soft" }));
     return;
@@ -591,11 +607,10 @@ function listPlanes() {
     row.append(...cells.map((content) => { const cell = element("td", null); cell.append(content); return cell; }));
     return row;
   }));
-  const focused = document.activeElement?.getAttribute?.("aria-label");
   $("planes").replaceChildren(table);
   if (cloud.order.length > MOST_ROWS)
     $("planes").append(element("p", `The largest ${MOST_ROWS} of ${cloud.order.length.toLocaleString("en")}.`, { className: "soft" }));
-  if (focused?.startsWith("show plane")) document.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
+  if (focused?.startsWith("show ")) document.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   markRow();
 }
 

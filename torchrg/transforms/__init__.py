@@ -32,10 +32,17 @@ with a positive one, x is reversed in both: ``F = diag(-1, 1, 1)`` makes ``M @ i
 
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
-from torchrg.transforms.planes import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
+from torchrg.transforms.planes import (
+    AlignAxes,
+    EstimateNormals,
+    GrowRegions,
+    MakeSuperpoints,
+    SegmentPlanes,
+)
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleVoxels
 
 __all__ = [
+    "AlignAxes",
     "CenterCloud",
     "DepthToCloud",
     "EstimateNormals",

@@ -1,7 +1,7 @@
 """Normals, plane labels and superpoints as modules."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -20,9 +20,10 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals import estimate_normals
 from torchrg.pipeline import segment_planes
-from torchrg.regions import grow_regions, partition_points
+from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.structures import UNLABELED
-from torchrg.transforms.sample import CloudTransform
+from torchrg.transforms.rows import rows_of_clouds
+from torchrg.transforms.sample import CloudTransform, SampleTransform
 
 
 class EstimateNormals(CloudTransform):
@@ -198,3 +199,66 @@ class MakeSuperpoints(CloudTransform):
             cloud["coord"], cloud["normal"], cloud["plane"].reshape(-1), self.config, colors
         )
         return {"superpoint": found.labels}
+
+
+class AlignAxes(SampleTransform):
+    """Set each cloud upright, its walls along x and y; see :func:`torchrg.align_axes`.
+
+    Reads ``coord`` ``(N, 3)``; changes it and ``normal`` ``(N, 3)``, if it is there, and adds
+    ``axis_align_matrix`` ``(B, 4, 4)``, float64, the motion of each cloud.
+
+    Args:
+        config: How the planes are found that say where floor and walls are: settings, or the name
+            of a preset.
+        up: Where up is, to within 30 degrees.
+        keys: Other names for the keys.
+
+    Raises:
+        ConfigError: If a cloud has neither floor nor walls, when it is called.
+
+    Example:
+        >>> from torchrg.scenes import make_room
+        >>> room = make_room(num_points=4_000, seed=0)
+        >>> turn = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+        >>> found = AlignAxes("classic")({"coord": room.points.float() @ turn.T})
+        >>> (found["axis_align_matrix"][0, :3, :3].float() @ turn).round(decimals=2).abs().tolist()
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+
+    def __init__(
+        self,
+        config: PipelineConfig | str = DEFAULT_PRESET,
+        *,
+        up: Sequence[float] = (0.0, 0.0, 1.0),
+        keys: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(keys=keys)
+        self.config = load_config(config) if isinstance(config, str) else config
+        self.up = tuple(up)
+
+    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+        """Return a new sample with moved coordinates and normals."""
+        coord = self.read(sample, "coord")
+        parts = rows_of_clouds(sample, len(coord))
+        motions = [
+            align_axes(segment_planes(coord[rows], self.config), up=self.up).to(coord.device)
+            for rows in parts
+        ]
+        moved = {"coord": _moved(coord, parts, motions, shifted=True)}
+        if self.key(sample, "normal") in sample:
+            moved["normal"] = _moved(self.read(sample, "normal"), parts, motions, shifted=False)
+        changes = {self.key(sample, name): values for name, values in moved.items()}
+        return self.changed(
+            sample, changes | {self.key(sample, "axis_align_matrix"): torch.stack(motions)}
+        )
+
+
+def _moved(
+    vectors: Tensor, parts: Sequence[slice], motions: list[Tensor], *, shifted: bool
+) -> Tensor:
+    """Return rows of vectors after the motion of their cloud, or after its turn only."""
+    moved = [
+        vectors[rows].double() @ motion[:3, :3].T + motion[:3, 3] * shifted
+        for rows, motion in zip(parts, motions, strict=True)
+    ]
+    return torch.cat(moved).to(vectors.dtype)

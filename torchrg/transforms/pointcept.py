@@ -23,7 +23,7 @@ import numpy as np
 
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
-from torchrg.transforms.planes import GrowRegions, MakeSuperpoints
+from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints
 from torchrg.transforms.rows import OUR_KEYS, with_listed
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
@@ -83,6 +83,7 @@ def point_collate_fn(batch: Sequence[Mapping[str, Any]], mix_prob: float = 0) ->
 
 
 _TRANSFORMS = (
+    AlignAxes,
     CenterCloud,
     EstimateNormals,
     GrowRegions,

@@ -1,0 +1,107 @@
+"""Nested levels of superpoints as Superpoint Transformer takes them: a NAG's list of ``Data``."""
+
+import importlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._checks import as_tensor, check_shapes
+from torchrg.errors import MissingDependencyError, ShapeError
+from torchrg.structures import Superpoints
+
+
+class Cluster(NamedTuple):
+    """Which nodes of the level below each node is made of: rows ``pointers[i]:pointers[i + 1]``.
+
+    Attributes:
+        pointers: Shape ``(M + 1,)``, int64, from 0 to the number of nodes below.
+        points: Nodes of the level below, shape ``(N,)``, int64, each once.
+    """
+
+    pointers: Tensor
+    points: Tensor
+
+
+def make_nag(
+    points: Tensor | NDArray[np.floating],
+    superpoints: Superpoints,
+    *,
+    data: Callable[..., Any] | None = None,
+    cluster: Callable[[Tensor, Tensor], Any] = Cluster,
+    **values: Tensor | NDArray[Any],
+) -> list[Any]:
+    """Return the levels of superpoints, the points first, as Superpoint Transformer nests them [1].
+
+    Of each level ``super_index`` is the node above, and ``sub`` holds the nodes below. There
+    ``NAG(make_nag(points, parts, data=Data, cluster=Cluster))`` with its own ``Data`` and
+    ``Cluster`` of ``src.data`` is a hierarchy in place of that of cut pursuit.
+
+    Args:
+        points: Points, shape ``(N, 3)``.
+        superpoints: What :func:`torchrg.make_superpoints` said about them.
+        data: Makes a level of entries by name. Default: PyG's ``Data``.
+        cluster: Makes ``sub`` of pointers and points.
+        values: Further entries of the points, of N rows: ``rgb``, ``normal``, ``y``.
+
+    Returns:
+        Of level 0 ``pos``, the values, and ``super_index``, ``(N,)``, int64; of each level above,
+        ``pos``, the mean of its points, ``node_size``, their number, ``sub``, and, but for the
+        last, ``super_index``.
+
+    Raises:
+        ShapeError: If some points have no superpoint, as those that are not finite.
+        MissingDependencyError: If PyG is not installed and ``data`` is not given.
+
+    References:
+        [1] D. Robert, H. Raguet, L. Landrieu. Efficient 3D semantic segmentation with superpoint
+        transformer. ICCV, 2023.
+
+    Example:
+        >>> fine, coarse = torch.tensor([0, 1, 1, 2]), torch.tensor([0, 0, 0, 1])
+        >>> parts = Superpoints(fine, torch.zeros(3), (coarse,))
+        >>> below, middle, above = make_nag(torch.eye(4, 3), parts, data=dict)
+        >>> middle["super_index"].tolist(), above["sub"].points.tolist()
+        ([0, 0, 1], [0, 1, 2])
+        >>> above["node_size"].tolist()
+        [3, 1]
+    """
+    pos = as_tensor("make_nag", "points", points)
+    check_shapes("make_nag", points=(pos, "N 3"), labels=(superpoints.labels, "N"))
+    without = int((superpoints.labels < 0).sum())
+    if without:
+        raise ShapeError(
+            f"make_nag: expected a superpoint of every point, got {without:,} points without one; "
+            "take out points that are not finite first."
+        )
+    make = _pyg_data() if data is None else data
+    entries: dict[str, Any] = {"pos": pos, **values}
+    below = torch.arange(len(pos), device=pos.device)
+    levels = []
+    for labels in (superpoints.labels, *superpoints.levels):
+        labels, count = labels.to(pos.device), int(labels.max()) + 1 if len(labels) else 0
+        # Every point of a node below is in one node here.
+        super_index = labels.new_empty(len(entries["pos"])).index_copy(0, below, labels)
+        levels.append(make(**entries, super_index=super_index))
+        order = super_index.argsort(stable=True)
+        pointers = torch.bincount(super_index, minlength=count).cumsum(0)
+        sizes = torch.bincount(labels, minlength=count)
+        sums = torch.zeros(count, 3, dtype=torch.float64, device=pos.device)
+        mean = sums.index_add(0, labels, pos.double()) / sizes[:, None]
+        sub = cluster(torch.nn.functional.pad(pointers, (1, 0)), order)
+        entries, below = {"pos": mean.to(pos.dtype), "node_size": sizes, "sub": sub}, labels
+    return [*levels, make(**entries)]
+
+
+def _pyg_data() -> Callable[..., Any]:
+    """Return PyG's class of samples."""
+    try:
+        found: Callable[..., Any] = importlib.import_module("torch_geometric.data").Data
+    except ImportError as error:
+        raise MissingDependencyError(
+            "make_nag: torch_geometric is not installed; pip install torch_geometric, or pass data."
+        ) from error
+    return found
