@@ -108,8 +108,8 @@ def _why_not_rising(scores: Scores) -> list[str]:
     )
     return [
         NOISY,
-        f"{NOISY} And leaves of doors, 4 cm thick and seen from both sides, break up: classic makes "
-        "one region of both sides, which still pairs with one of them, at half the precision.",
+        f"{NOISY} And leaves of doors, 4 cm thick and seen from both sides, break up; of classic "
+        "both sides are one region, which still pairs with one of them, at half the precision.",
         "F1 is of pairs alone, and the paper's method pairs more small faces than the others, with "
         "the lower precision that small faces have. Where a face without a region counts as 0 it "
         f"is: {every}.",

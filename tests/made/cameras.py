@@ -308,7 +308,7 @@ def make_mapped_room(
     seed: int = 0,
     *,
     num_frames: int = 48,
-    voxel: float = 0.012,
+    voxel: float = 0.011,
     drift: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
     """Make the map of a room that a Kinect v2 was carried through: the mean of what each voxel saw.
