@@ -210,8 +210,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
             if quick
             else make_mapped_room(POINTS["kinect"])
         ),
-        "an office as mapped from frames of a Kinect v2: its noise, errors of registration, the "
-        "mean of each voxel",
+        "an office as mapped from frames of a Kinect v2 at known places, the mean of each voxel",
     ),
     "room": (_room, "a furnished room, noise 3 mm"),
     "hall": (

@@ -48,6 +48,12 @@ class Faces(NamedTuple):
         precision, recall = (float(x[paired].mean()) for x in (self.precision, self.recall))
         return 2 * precision * recall / (precision + recall)
 
+    def f1_of_every(self) -> float | None:
+        """Return the paper's F1 if faces without a region had precision and recall 0, as well."""
+        paired = [values.nan_to_num(0.0) for values in (self.precision, self.recall)]
+        every = torch.ones_like(self.sizes, dtype=torch.bool)
+        return self._replace(precision=paired[0], recall=paired[1]).f1(every)
+
     def found(self, chosen: Tensor) -> float | None:
         """Return the share of some of the faces that a region has; None if there are none."""
         return float((self.best_iou[chosen] > FOUND).double().mean()) if chosen.any() else None
@@ -81,6 +87,7 @@ def score_faces(labels: Tensor, cloud: EvalCloud, at_edges: Tensor) -> Record:
     near = outcomes_of(labels, cloud.labels)[at_edges]
     scores = {
         "f1_large": faces.f1(large),
+        "f1_of_every": faces.f1_of_every(),
         "found_large": faces.found(large),
         "found_small": faces.found(~large),
         "right_at_edges": float((near == _RIGHT).double().mean()),
@@ -94,7 +101,9 @@ def score_faces(labels: Tensor, cloud: EvalCloud, at_edges: Tensor) -> Record:
         }
     if cloud.objects is not None:
         objects = match_faces(labels, cloud.objects)
-        scores["f1_objects"] = objects.f1(torch.ones_like(objects.sizes, dtype=torch.bool))
+        every = torch.ones_like(objects.sizes, dtype=torch.bool)
+        scores["f1_objects"] = objects.f1(every)
+        scores["f1_objects_exact"] = match_faces(cloud.labels, cloud.objects).f1(every)
     return scores
 
 

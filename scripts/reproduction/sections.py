@@ -28,14 +28,22 @@ def figure(file: str, caption: str, page: str = "") -> Block:
     return {"kind": "figure", "file": file, "caption": caption, "page": page}
 
 
-def claim(where: str, words: str, found: Mapping[str, tuple[bool, str]], why: str = "") -> Block:
+def claim(
+    where: str,
+    words: str,
+    found: Mapping[str, tuple[bool, str]],
+    why: str = "",
+    *,
+    quick_tells: bool = True,
+) -> Block:
     """Return a statement, and where it comes out.
 
     Args:
         where: Its place in the paper.
         words: What it says.
         found: On what it was tried; whether it came out there, and the numbers behind that.
-        why: What else is to be known.
+        why: What else is to be known: where it fails, the reason.
+        quick_tells: Whether small clouds can tell, too.
     """
     return {
         "where": where,
@@ -44,6 +52,7 @@ def claim(where: str, words: str, found: Mapping[str, tuple[bool, str]], why: st
         "fails": [place for place, (holds, _) in found.items() if not holds],
         "numbers": {place: numbers for place, (_, numbers) in found.items()},
         "why": why,
+        "quick_tells": quick_tells,
     }
 
 

@@ -63,7 +63,7 @@ def reproduce(run: Run) -> Record:
     sphere = {
         key: {method: score_sphere(run, key, method) for method in METHODS} for key in INDICES
     }
-    angles = {key: _angles(run, key) for key in ("cory", "kinect")}
+    angles = {key: _angles(run, key) for key in ("tutorial", "cory", "kinect")}
     blocks = [
         text(
             "Methods are presets. classic chooses seeds by curvature as PCL does; "
@@ -214,7 +214,7 @@ def angle_blocks(run: Run, key: str, record: Record) -> list[Block]:
         for angle, one in record["angles"].items()
     ]
     caption = (
-        f"**Figure 9**, {run.cloud(key).cloud.origin}: the paper's method at several angles, "
+        f"{run.cloud(key).cloud.origin}: the paper's method at several angles (Figure 9), "
         "which are those of sharp points and of growth."
     )
     return [

@@ -88,13 +88,22 @@ def score(run: Run, key: str, method: str) -> Record:
 
 
 def score_sphere(run: Run, key: str, method: str) -> Record:
-    """Return CP, SP, DBI and DVI of a segmentation."""
+    """Return CP, SP, DBI, DVI of a segmentation, and two of them over distinct ``directions``."""
     cloud = run.cloud(key).cloud
 
     def work() -> Record:
         found = read_segmented(run, key, method)
-        indices = score_clusters(found.normals, found.labels, sample_size=SAMPLE_SIZE)
-        return {"title": cloud.title, **indices._asdict()}
+        indices, directions = (
+            score_clusters(
+                found.normals, found.labels, sample_size=SAMPLE_SIZE, distinct_directions=distinct
+            )
+            for distinct in (False, True)
+        )
+        return {
+            "title": cloud.title,
+            **indices._asdict(),
+            "directions": {"sp": directions.sp, "dbi": directions.dbi},
+        }
 
     return run.folder.cell(f"sphere-{cloud.name}-{method}", work)
 

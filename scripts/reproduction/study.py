@@ -96,7 +96,12 @@ def _claims(records: list[Record]) -> list[Block]:
         shares = [f"{100 * found['largest']:.1f} %" for found in (middle, high)]
         largest[method] = (high["largest"] > middle["largest"], " < ".join(shares))
     return [
-        claim("II.B", "The 95th and 98th percentiles give nearly identical segments.", alike),
+        claim(
+            "II.B",
+            "The 95th and 98th percentiles give nearly identical segments.",
+            alike,
+            quick_tells=False,
+        ),
         claim("II.B", "At 2 degrees fewer points are labelled than at 5.", joined),
         claim("II.B", "At 8 degrees the largest region is larger than at 5.", largest),
     ]

@@ -47,8 +47,6 @@ _KINECT2_NOISE = (0.0015, -0.0005, 0.0003)
 """Standard deviation of its depth in metres: a polynomial of the depth in metres."""
 _KINECT2_SIZE, _KINECT2_FOCAL = (512, 424), 365.0
 """Pixels."""
-_DRIFT_METRES, _DRIFT_DEG = 0.004, 0.2
-"""Standard deviation of where a registration places a frame, and of how it turns it, by axis."""
 
 KINECT_LAYOUT = RoomLayout(
     size=(5.4, 4.4, 2.6),
@@ -306,19 +304,25 @@ def make_kinect_room(
 
 
 def make_mapped_room(
-    num_points: int = 968_520, seed: int = 0, *, num_frames: int = 48, voxel: float = 0.012
+    num_points: int = 968_520,
+    seed: int = 0,
+    *,
+    num_frames: int = 48,
+    voxel: float = 0.011,
+    drift: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
     """Make the map of a room that a Kinect v2 was carried through: the mean of what each voxel saw.
 
-    Frames are placed with the errors of a registration, some millimetres and tenths of a degree,
-    and a voxel has the mean of the points of all frames in it, as RTAB-Map exports its maps. The
-    points are a random subset of these, in random order; face and normal are of a point in each.
+    A voxel has the mean of the points of all frames in it, as RTAB-Map exports its maps. The points
+    are a random subset of these, in random order; face and normal are of one point in each.
 
     Args:
         num_points: Points of the map.
         seed: Of the room, the cameras, the noise and the errors.
         num_frames: Frames that were taken.
         voxel: Side of a voxel in metres.
+        drift: Standard deviation about each axis of where a frame is placed, in metres, and of how
+            it is turned, in degrees.
 
     Raises:
         ConfigError: If the map has fewer points.
@@ -337,7 +341,7 @@ def make_mapped_room(
         frame = render_depth(model, camera, sensor="kinect2", seed=seed * num_frames + number)
         pixels = np.flatnonzero(frame.depth.numpy().ravel() > 0)
         points, normals, faces = _to_world(frame, pixels)
-        shift, turn = rng.standard_normal((2, 3)) * [[_DRIFT_METRES], [np.radians(_DRIFT_DEG)]]
+        shift, turn = rng.standard_normal((2, 3)) * [[drift[0]], [np.radians(drift[1])]]
         points = points + shift + np.cross(turn, points - camera.frame.origin)
         parts.append((points, normals, faces))
     points, normals, faces = map(np.concatenate, zip(*parts, strict=True))

@@ -329,6 +329,7 @@ def scored(title, ari, f1=(60.0, 70, 80, 85, 90, 95)):
         "right_at_edges": 0.5,
         "none_at_edges": 0.1,
         "found_small": 0.1,
+        "f1_of_every": 5.0,
         "found_large": 0.9,
         "found_curved": 0.8,
         "found_flat": 0.7,
@@ -337,7 +338,7 @@ def scored(title, ari, f1=(60.0, 70, 80, 85, 90, 95)):
         method: {
             "title": title,
             "regions": 5,
-            "labels": {"ari": a, "f1": b, "mean_best_iou": 0.5},
+            "labels": {"ari": a, "f1": b, "mean_best_iou": 0.5, "faces": 7},
             "faces": faces,
         }
         for method, a, b in zip(METHODS, ari, f1, strict=True)
@@ -356,7 +357,14 @@ def test_claims_hold_only_where_the_numbers_say_so():
     printed["tutorial"]["paper"], printed["hallway"]["paper"] = (0.1, 0.7, 1.7, 5), (0.3, 0.2, 1, 5)
     names = ("cp", "sp", "dbi", "dvi")
     sphere = {
-        key: {m: {"title": key, **dict(zip(names, row, strict=True))} for m, row in rows.items()}
+        key: {
+            m: {
+                "title": key,
+                **dict(zip(names, row, strict=True)),
+                "directions": {"sp": 1.0, "dbi": 2.0},
+            }
+            for m, row in rows.items()
+        }
         for key, rows in printed.items()
     }
     by_angle = {"2": {"ari": 0.1}, "5": {"ari": 0.3}, "8": {"ari": 0.2}}
