@@ -8,7 +8,6 @@ and the folder of the page are as they were on the day.
 """
 
 import contextlib
-import glob
 import html
 import io
 import os
@@ -30,8 +29,8 @@ _MOST_LINES = 40
 _SHELL = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1"><style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 52rem; margin: 2rem auto; padding: 0 1rem; }}
-img {{ max-width: 100%; }} table {{ border-collapse: collapse; }} h1, h2, h3 {{ line-height: 1.2; }}
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 52rem; margin: 2rem auto; }}
+img {{ max-width: 100%; }} table {{ border-collapse: collapse; }}
 td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; vertical-align: top; }}
 pre {{ background: #f6f6f4; padding: .6rem; overflow-x: auto; }} code {{ font-size: 90%; }}
 pre.printed {{ background: none; border-left: 3px solid #ccc; margin-top: -.6rem; }}
@@ -75,6 +74,11 @@ def make_guide(guide: Path, folder: Path, modules: set[str]) -> Path:
     page = folder / f"{guide.stem}.html"
     page.write_text(render("".join([*parts, text[end:]]), modules, home="../"), encoding="utf-8")
     return page
+
+
+def names_in(markdown: str) -> list[str]:
+    """Return the dotted names of torchrg in backquotes, which become links."""
+    return re.findall(r"`(torchrg(?:\.\w+)*)`", _BLOCK.sub("", markdown))
 
 
 def render(markdown: str, modules: set[str], *, home: str = "") -> str:
@@ -130,9 +134,8 @@ def _run_command(line: str) -> None:
         return
     if words[0] != "torchrg":
         raise ValueError(f"expected a command of torchrg, got {line!r}")
-    arguments = [found for word in words[1:] for found in sorted(glob.glob(word)) or [word]]
     try:
-        code = main(arguments)
+        code = main(words[1:])
     except SystemExit as stop:  # As --help does.
         code = int(stop.code or 0)
     if code:
