@@ -1,6 +1,7 @@
-"""The reference of the API as HTML pages, made from the docstrings; see ``docs.sh``.
+"""The reference as HTML pages: guides, whose examples run, and the API; see ``docs.sh``.
 
-Ends with exit code 1 and a line for each reference (``:func:`` and the like) that leads nowhere.
+Ends with exit code 1 and a line for each reference (``:func:`` and the like), link or picture that
+leads nowhere, or with the example that failed.
 """
 
 import ast
@@ -8,16 +9,20 @@ import importlib
 import pkgutil
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import guide_pages
 import pdoc
 
 import torchrg
 
 ROLE = re.compile(r":(?:func|class|mod|data|meth|attr|exc|obj):`~?\.?([^`<]+)`")
 OUTPUT = Path("build/docs")
+_LINK = re.compile(r'<(?:a|img)\b[^>]*?\b(?:href|src)="([^"]+)"')
+_ANCHOR = re.compile(r'\bid="([^"]+)"')
 
 
 def modules() -> Iterator[ModuleType]:
@@ -65,20 +70,77 @@ def _reaches(start: object, dotted: str) -> bool:
     return True
 
 
-def main() -> int:
-    """Check all references, then write the pages."""
-    broken = [
+def public_modules() -> dict[str, ModuleType]:
+    """Return the modules that have a page: all but private ones and the command line."""
+    return {
+        module.__name__: module
+        for module in modules()
+        if not any(part.startswith("_") or part == "cli" for part in module.__name__.split("."))
+    }
+
+
+def broken_references() -> list[str]:
+    """Return a line for each reference in a docstring that leads nowhere."""
+    return [
         f"{module.__file__}:{line}: nothing is called {target!r}."
         for module in modules()
         for line, target in references(module)
         if not leads_somewhere(target, module)
     ]
+
+
+def broken_links(folder: Path) -> list[str]:
+    """Return a line for each link or picture in the pages of a folder that leads nowhere."""
+    pages = {page: page.read_text(encoding="utf-8") for page in sorted(folder.rglob("*.html"))}
+    anchors = {page.resolve(): set(_ANCHOR.findall(text)) for page, text in pages.items()}
+    broken = []
+    for page, text in pages.items():
+        for target in dict.fromkeys(_LINK.findall(text)):
+            place, _, anchor = target.partition("#")
+            if re.match(r"\w+:|\$\{", place):  # Elsewhere, or filled in by the search box.
+                continue
+            file = (page.parent / place).resolve() if place else page.resolve()
+            if not file.is_file() or (anchor and anchor not in anchors.get(file, {anchor})):
+                broken.append(f"{page.relative_to(folder)}: {target} leads nowhere.")
+    return broken
+
+
+def write_reference(folder: Path, found: dict[str, ModuleType]) -> None:
+    """Write a page for each module, and the index of guides and modules."""
+    pdoc.render.configure(docformat="google", math=True)
+    with warnings.catch_warnings():
+        # pdoc walks packages by itself, but for those that name what is public.
+        warnings.filterwarnings("ignore", "The module specification", UserWarning)
+        pdoc.pdoc(*found, output_directory=folder)
+    rows = [
+        f"| [{name}]({guide_pages.place_of(name, set(found))}) | {_first_line(module)} |"
+        for name, module in found.items()
+        if name.count(".") < 2
+    ]
+    index = (guide_pages.GUIDES / "index.md").read_text(encoding="utf-8")
+    index += "\n".join(["", "| module | |", "|---|---|", *rows, ""])
+    (folder / "index.html").write_text(guide_pages.render(index, set(found)), encoding="utf-8")
+
+
+def _first_line(module: ModuleType) -> str:
+    """Return the first line of a docstring without markup."""
+    line = (module.__doc__ or "").partition("\n")[0]
+    return ROLE.sub(r"\1", line).replace("`", "").replace("|", "\\|")
+
+
+def main() -> int:
+    """Check all references, run the guides, write the pages, and check the links in them."""
+    broken = broken_references()
+    if not broken:
+        found = public_modules()
+        write_reference(OUTPUT, found)
+        for guide in guide_pages.guide_files():
+            print(guide_pages.make_guide(guide, OUTPUT / "guides", set(found)), flush=True)
+        broken = broken_links(OUTPUT)
     if broken:
         print(*broken, sep="\n", file=sys.stderr)
         return 1
-    pdoc.render.configure(docformat="google", math=True)
-    pdoc.pdoc("torchrg", output_directory=OUTPUT)
-    print(f"{OUTPUT / 'index.html'}: the reference of the API")
+    print(f"{OUTPUT / 'index.html'}: guides, and the reference of the API")
     return 0
 
 

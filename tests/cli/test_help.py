@@ -86,11 +86,9 @@ def test_examples_are_understood(prog, capsys):
     for line in examples:
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
-        console.parse(
-            kind,
-            console.spell_counts(console.spell_counts(arguments, "--superpoints"), "--superpoint"),
-            prog=prog,
-        )
+        for flag in ("--superpoints", "--superpoint"):
+            arguments = console.spell_counts(arguments, flag)
+        console.parse(kind, arguments, prog=prog)
 
 
 def test_what_is_needed_has_names(capsys):

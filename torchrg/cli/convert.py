@@ -90,12 +90,12 @@ class CloudArguments(Arguments):
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
     in each level: --superpoint 1000,300."""
     level: int = 0
-    """Which level of the superpoints is written, 0 the finest."""
+    """Level of the superpoints that is written; 0 is the finest."""
     layout: console.Layout = "pointcept"
-    """Files to write. pointcept: a folder for each scan. The others have superpoints and planes
-    where these programs look for them: scannet: segs.json, for Mask3D's own preprocessing, SAI3D
-    and others. mmdet3d: OneFormer3D, UniDet3D, ESAM. spformer. isbnet: and Open3DIS, SphericalMask.
-    mask3d: what it trains on. npy: folders of bare arrays."""
+    """Files that are written: a folder for each scan (pointcept), or superpoints and planes where
+    other programs look for them: segs.json for Mask3D's own preprocessing, SAI3D and others
+    (scannet), files of OneFormer3D, UniDet3D and ESAM (mmdet3d), of SPFormer (spformer), of ISBNet,
+    Open3DIS and SphericalMask (isbnet), what Mask3D trains on (mask3d), bare arrays (npy)."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
     usual_preset: ClassVar[str] = DEFAULT_PRESET
@@ -123,8 +123,8 @@ class FolderArguments(CloudArguments):
 
     columns: console.ColumnsFlag = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
-    """Which files are clouds, by default those that torchrg segment reads; fewer where two differ
-    in the suffix alone."""
+    """Suffixes of the files that are clouds, by default all that torchrg segment reads. Name fewer
+    where two files differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
@@ -173,8 +173,9 @@ class ScanNetArguments(CloudArguments):
     of the preset scannet unless told otherwise.
 
     Examples:
-        torchrg convert scannet scans scannet --dry-run
-        torchrg convert scannet scans superpoints --layout mmdet3d --workers 4
+        torchrg convert scannet scannet out --dry-run
+        torchrg convert scannet scannet out --workers 4 --superpoint
+        torchrg convert scannet scannet out --layout mmdet3d
     """
 
     usual_preset: ClassVar[str] = "scannet"
