@@ -233,7 +233,7 @@ class AlignAxes(SampleTransform):
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keys=keys)
-        self.config = load_config(config) if isinstance(config, str) else config
+        self.config = settings_of("AlignAxes", PipelineConfig, config)
         self.up = tuple(up)
 
     def transform(self, sample: Any) -> Any:  # noqa: ANN401
