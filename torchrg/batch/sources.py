@@ -64,6 +64,8 @@ class CloudSource:
     layout: str = "pointcept"
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
     level: int = 0
+    bytes_per_point: ClassVar[int] = 96
+    """What the largest of the layouts takes."""
 
     def described(self, **options: Any) -> dict[str, Any]:  # noqa: ANN401
         """Return these settings, as far as they are not the usual ones, after others."""
@@ -140,7 +142,6 @@ class FolderSource(CloudSource):
     out: Path
     columns: tuple[str, ...] | None = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
-    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 4 + 4 + 4
 
     @property
     def in_place(self) -> bool:
@@ -224,7 +225,6 @@ class S3DISSource(CloudSource):
     areas: tuple[int, ...]
     class_order: str = "pointcept"
     in_place: ClassVar[bool] = False
-    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 2 + 2 + 4 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
@@ -273,7 +273,6 @@ class ScanNetSource(CloudSource):
     root: Path
     settings: PipelineConfig
     in_place: ClassVar[bool] = False
-    bytes_per_point: ClassVar[int] = 12 + 3 + 12 + 3 * 8 + 4 + 4 + 4
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
