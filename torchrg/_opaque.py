@@ -158,13 +158,18 @@ def _as_list(found: Any) -> list[Tensor]:  # noqa: ANN401
     return [tensor for tensor in tensors if tensor is not None]
 
 
-@torch.library.custom_op("torchrg::patchwise", mutates_args=())
+# With their schemas, as torch 2.4 infers none from list[Tensor].
+@torch.library.custom_op(
+    "torchrg::patchwise", mutates_args=(), schema="(Tensor[] tensors, str call) -> Tensor[]"
+)
 def _forward(tensors: list[Tensor], call: str) -> list[Tensor]:
     function, arguments = _parse(call, tensors)
     return _as_list(function.run(**arguments))
 
 
-@torch.library.custom_op("torchrg::patchwise_gradient", mutates_args=())
+@torch.library.custom_op(
+    "torchrg::patchwise_gradient", mutates_args=(), schema="(Tensor[] tensors, str call) -> Tensor"
+)
 def _backward(tensors: list[Tensor], call: str) -> Tensor:
     """Return the gradient of the first tensor; those of the outputs follow the inputs."""
     function, arguments = _parse(call, tensors)
