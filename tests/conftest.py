@@ -11,7 +11,8 @@ POINTCEPT = Path(__file__).parents[2] / "shared" / "pointcept"
 
 
 def pytest_addoption(parser):
-    parser.addoption("--device", default="cpu", help="cpu, cuda or all")
+    usual = "all" if torch.cuda.is_available() else "cpu"
+    parser.addoption("--device", default=usual, help="cpu, cuda or all")
     parser.addoption("--run-slow", action="store_true", help="run the tests marked slow too")
 
 
@@ -27,7 +28,9 @@ def pytest_generate_tests(metafunc):
     if "device" in metafunc.fixturenames:
         asked = metafunc.config.getoption("--device")
         names = ["cpu", "cuda"] if asked == "all" else [asked]
-        marks = [] if torch.cuda.is_available() else [pytest.mark.skip(reason="no CUDA device")]
+        marks = [pytest.mark.cuda]
+        if not torch.cuda.is_available():
+            marks.append(pytest.mark.skip(reason="no CUDA device"))
         metafunc.parametrize(
             "device", [pytest.param(n, marks=marks if n == "cuda" else []) for n in names]
         )

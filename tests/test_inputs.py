@@ -7,8 +7,25 @@ import torchrg
 from torchrg.config import NormalsConfig
 from torchrg.errors import ShapeError
 from torchrg.linalg import covariance, eigh3
-from torchrg.normals import ESTIMATORS, fit_jet, fit_normals_irls, fit_normals_pca
-from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, mad, qn, tau
+from torchrg.normals import (
+    ESTIMATORS,
+    fit_jet,
+    fit_normals_irls,
+    fit_normals_pca,
+    fit_normals_robust,
+    orient_normals,
+)
+from torchrg.robust import (
+    fit_detmcd,
+    fit_detmm,
+    fit_dets,
+    fit_fastmcd,
+    fit_mve,
+    mad,
+    median,
+    qn,
+    tau,
+)
 from torchrg.transforms import SegmentDepth
 
 PATCHES = {
@@ -17,6 +34,8 @@ PATCHES = {
     "pca": lambda x: fit_normals_pca(x).curvature,
     "jet": lambda x: fit_jet(x).principal_curvatures,
     "irls": lambda x: fit_normals_irls(x, noise=x.detach()[:, 0, 0] * 0, mu_decay=3.0).curvature,
+    "robust": lambda x: fit_normals_robust(x).curvature,
+    "median": median,
     "qn": qn,
     "mad": mad,
     "tau": tau,
@@ -37,6 +56,12 @@ CLOUDS |= {
     "planes": lambda x: torchrg.segment_planes(x).normals,
     "table": lambda x: torchrg.segment_planes(x).planes.offset,
     "superpoints": lambda x: torchrg.make_superpoints(x).labels,
+    "orient": lambda x: orient_normals(x, torch.ones(x.shape, dtype=x.dtype, device=x.device)),
+    "regions": lambda x: torchrg.grow_regions(
+        *(x, torch.ones(x.shape).to(x), torch.zeros(len(x)).to(x)),
+        torchrg.search_knn(x, 5),
+        "classic",
+    ),
     "neighbors": lambda x: torchrg.search_knn(x, 5).indices,
 }
 CALLS = PATCHES | CLOUDS

@@ -7,10 +7,24 @@ import torch
 from torch import nn
 from torch._dynamo.testing import CompileCounter
 
-from torchrg import estimate_normals, search_knn, segment_planes
+import torchrg
+from torchrg import (
+    estimate_normals,
+    grow_regions,
+    make_superpoints,
+    search_knn,
+    segment_planes,
+)
+from torchrg.depth import segment_depth
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import covariance, eigh3
-from torchrg.normals import fit_normals_irls, fit_normals_jet, fit_normals_pca, fit_normals_robust
+from torchrg.normals import (
+    fit_normals_irls,
+    fit_normals_jet,
+    fit_normals_pca,
+    fit_normals_robust,
+    orient_normals,
+)
 from torchrg.robust import (
     fit_detmcd,
     fit_detmm,
@@ -217,16 +231,25 @@ class Model(nn.Module):
         return self.after(self.middle(self.before(points)))
 
 
+def regions_of(points):
+    neighbors = search_knn(points, 5)
+    return grow_regions(points, points, points[:, 0], neighbors, "classic")
+
+
+CAMERA = torch.eye(3)
 NORMALS, PLANES = EstimateNormals(method="pca", k=8), SegmentPlanes("classic")
 MIDDLES = {
     "estimate_normals": lambda points: estimate_normals(points, method="pca", k=8).normals,
-    "EstimateNormals": lambda points: EstimateNormals(method="pca", k=8)({"coord": points})[
-        "normal"
-    ],
+    "EstimateNormals": lambda points: NORMALS({"coord": points})["normal"],
     "segment_planes": lambda points: points * (segment_planes(points).labels[:, None] + 1),
     "SegmentPlanes": lambda points: PLANES({"coord": points})["normal"],
     "search_knn": lambda points: points[search_knn(points, 3).indices[:, 2]],
+    "orient_normals": lambda points: orient_normals(points, points),
+    "make_superpoints": lambda points: points * (make_superpoints(points).labels[:, None] + 1),
+    "grow_regions": lambda points: points * (2 + regions_of(points)[:, None]),
+    "segment_depth": lambda points: points * (2 + segment_depth(points, CAMERA).labels),
 }
+OF_CLOUDS = set(MIDDLES) - {"EstimateNormals", "SegmentPlanes"}
 
 
 # Torch's own, when a graph goes on with a tensor in its middle.
@@ -246,7 +269,51 @@ def test_functions_of_clouds_break_a_graph_and_the_rest_is_compiled(name):
     assert model.before.weight.grad is None or model.before.weight.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("name", sorted(OF_CLOUDS))
 @pytest.mark.parametrize("call", [torch.vmap, torch.func.grad, torch.func.jacrev])
-def test_functions_of_clouds_say_where_they_do_not_run(call):
-    with pytest.raises(ShapeError, match="estimate_normals: expected points with values, got"):
-        call(lambda points: estimate_normals(points).normals.sum())(torch.rand(2, 9, 3))
+def test_functions_of_clouds_say_where_they_do_not_run(call, name):
+    with pytest.raises(ShapeError, match=r"\w+: expected points with values, got those of vmap"):
+        call(lambda points: MIDDLES[name](points).sum())(torch.rand(2, 9, 3))
+
+
+@of_torch
+@pytest.mark.parametrize("name", sorted(OF_CLOUDS))
+def test_functions_of_clouds_are_not_exported(name):
+    class Whole(nn.Module):
+        def forward(self, points):
+            return MIDDLES[name](points)
+
+    with pytest.raises(torch._dynamo.exc.Unsupported):
+        torch.export.export(Whole(), (torch.rand(40, 3),), strict=True)
+
+
+def table_of_the_reference():
+    """Return the cells of the table in the description of the package, by function and column."""
+    lines = torchrg.__doc__.splitlines()
+    first, second, last = (i for i, line in enumerate(lines) if line.startswith("===="))
+    header = lines[first + 1].split()[1:]
+    rows = [line.replace("not run", "not-run").split() for line in lines[second + 1 : last]]
+    return {name: dict(zip(header, cells, strict=True)) for name, *cells in rows}
+
+
+# What the tests of this file, and of test_inputs.py for autocast, take as long names.
+NAMES = {
+    "covariance": "covariance",
+    "eigh3": "eigh3",
+    "pca": "fit_normals_pca",
+    "jet": "fit_normals_jet",
+    "irls": "fit_normals_irls",
+    "robust normals": "fit_normals_robust",
+    **{name: name for name in ("median", "mad", "qn", "tau")},
+    **{name: f"fit_{name}" for name in ("detmcd", "fastmcd", "mve", "dets", "detmm")},
+}
+
+
+def test_the_table_of_the_reference_says_what_the_tests_show():
+    everywhere = dict.fromkeys(("autograd", "vmap", "func", "compile", "export", "autocast"), "yes")
+    expected = {NAMES[name]: everywhere | {"cuda": "not-run"} for name in FUNCTIONS}
+    refused = {"vmap": "refused", "func": "refused", "compile": "break", "export": "no"}
+    for name in OF_CLOUDS:
+        has = "yes" if name in ("estimate_normals", "orient_normals") else "none"
+        expected[name] = everywhere | refused | {"autograd": has, "cuda": "not-run"}
+    assert table_of_the_reference() == expected

@@ -332,6 +332,7 @@ def make_superpoints(
     return Superpoints(labels, found.plane, tuple(levels))
 
 
+@of_clouds
 def segment_mesh(
     vertices: Tensor | NDArray[np.floating],
     faces: Tensor | NDArray[np.integer] | None = None,

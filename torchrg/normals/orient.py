@@ -104,7 +104,7 @@ def orient_normals(
         >>> orient_normals(floor, down, towards="+z")[0] + 0
         tensor([0., 0., 1.])
     """
-    cloud = as_tensor("orient_normals", "points", points)
+    cloud = as_tensor("orient_normals", "points", points).detach()
     given = as_tensor("orient_normals", "normals", normals)
     check_shapes("orient_normals", points=(cloud, "N 3"), normals=(given, "N 3"))
     check_floating("orient_normals", points=cloud)
@@ -129,14 +129,15 @@ def orient_normals(
         return _face(upright, axis)
     turn = _turn_outwards if towards == "consistent" else _turn_inside
     if neighbors is not None:
-        return upright * turn(cloud, upright.to(cloud.dtype), neighbors)[:, None].to(given.dtype)
+        signs = turn(cloud, upright.detach().to(cloud.dtype), neighbors)
+        return upright * signs[:, None].to(given.dtype)
     rows = finite_rows(cloud)
     rows = rows[(upright[rows] != 0).any(dim=-1)]
     if len(rows) == 0:
         return upright
     kept, units = cloud[rows], upright[rows]
     near = search_knn(kept, min(_NUM_NEIGHBORS, len(kept)), canonical=True)
-    signs = turn(kept, units.to(cloud.dtype), near)[:, None].to(given.dtype)
+    signs = turn(kept, units.detach().to(cloud.dtype), near)[:, None].to(given.dtype)
     return upright.index_copy(0, rows, units * signs)
 
 
