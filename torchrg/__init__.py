@@ -1,4 +1,19 @@
-"""Robust normals, curvature and plane labels for indoor point clouds."""
+"""Robust normals, curvature and plane labels for indoor point clouds.
+
+From a file to planes and back: :func:`read_cloud`, :func:`segment_planes` with settings of
+:func:`load_config`, :func:`write_cloud`, :func:`read_result`. Single stages: :func:`search_knn`,
+:func:`estimate_normals`, :func:`grow_regions`, :func:`make_superpoints`, :func:`align_axes`. The
+modules of :mod:`torchrg.transforms` do the same to the samples of a loader,
+:mod:`torchrg.datasets` reads data sets, :mod:`torchrg.metrics` scores, :mod:`torchrg.config` has
+every setting, and :mod:`torchrg.robust` and :mod:`torchrg.nn` are for patches of points.
+
+Example:
+    >>> import torchrg
+    >>> room = torchrg.scenes.make_room(num_points=2000, noise=0.003, seed=0)
+    >>> seg = torchrg.segment_planes(room.points, torchrg.load_config("classic"))
+    >>> seg.labels.shape, seg.normals.shape, len(seg.planes.count) > 3
+    (torch.Size([2000]), torch.Size([2000, 3]), True)
+"""
 
 from torchrg import _display
 from torchrg.version import __version__ as __version__
