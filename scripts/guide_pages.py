@@ -1,10 +1,9 @@
 """Guides: pages of Markdown whose examples run while the page is made, with what they print.
 
-Blocks of ``python`` share their names within a page, blocks of ``bash`` hold commands of torchrg;
-both run in the folder in which the page is made, so that it shows the pictures that they draw.
-Blocks of another kind (``console``, ``yaml``, ``text``) are only shown, and those called ``python
-hidden`` only run. In what is printed, times
-and the folder of the page are as they were on the day.
+Blocks of ``python`` share their names within a page; blocks of ``bash`` hold commands of torchrg,
+and ``mkdir``. Both run in the folder in which the page is made, so that it shows the pictures that
+they draw. Blocks of another kind (``console``, ``yaml``, ``text``) are only shown, and those called
+``python hidden`` only run.
 """
 
 import contextlib
@@ -130,7 +129,10 @@ def _run(kind: str, lines: str, names: dict[str, Any], where: str) -> str:
 def _run_command(line: str) -> None:
     """Run a command of torchrg as a shell would; a line may end in a comment."""
     words = shlex.split(line, comments=True)
-    if not words:
+    if words[:1] == ["mkdir"]:
+        for name in words[1:]:
+            Path(name).mkdir(parents=True, exist_ok=True)
+    if not words or words[0] == "mkdir":
         return
     if words[0] != "torchrg":
         raise ValueError(f"expected a command of torchrg, got {line!r}")

@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import torchrg
+from torchrg.config import SuperpointsConfig
 from torchrg.render import color_planes, make_page, render_cloud, write_page
 from torchrg.result import Result
 
 FOLDER = Path(__file__).parent
 NUM_POINTS = 600_000
 NOISE, SEED = 0.003, 4
+NUM_PARTS = 300
 WIDTH = 620
 """Pixels of one of the three pictures."""
 AZIMUTH_DEG = 60.0
@@ -36,7 +38,7 @@ def draw_rooms(path: Path) -> Result:
     """Draw a room before, with its planes, and with its superpoints; return the result."""
     room = torchrg.scenes.make_room(NUM_POINTS, noise=NOISE, seed=SEED)
     seg = torchrg.segment_planes(room.points, torchrg.load_config("laser"))
-    parts = torchrg.make_superpoints(room.points, seg)
+    parts = torchrg.make_superpoints(room.points, seg, SuperpointsConfig(counts=(NUM_PARTS,)))
     grey = torch.full((NUM_POINTS, 3), _GREY, dtype=torch.uint8)
     pictures = [
         render_cloud(
@@ -45,7 +47,7 @@ def draw_rooms(path: Path) -> Result:
         for colors in (
             grey,
             color_planes(seg.labels, room.points),
-            color_planes(parts.levels[1], room.points),
+            color_planes(parts.labels, room.points),
         )
     ]
     _write(path, np.concatenate(pictures, axis=1))

@@ -1,12 +1,5 @@
 """Robust normals, curvature and plane labels for indoor point clouds.
 
-In PyTorch, functions of patches are like those of torch: they have gradients, and run under
-``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)`` and ``torch.export``. Functions of
-clouds search neighbours and grow regions on the CPU: a compiler breaks its graph there (``break``)
-and compiles the rest, and under ``vmap`` and ``torch.func`` they refuse in one line. Labels have no
-gradient (``none``). Every cell is a test, but on CUDA nothing was run yet.
-
-==================  ========  =======  =======  =======  =======  ========  =======
 function            autograd  vmap     func     compile  export   autocast  cuda
 ==================  ========  =======  =======  =======  =======  ========  =======
 covariance          yes       yes      yes      yes      yes      yes       not run
@@ -37,6 +30,27 @@ The robust fits, scales and ``fit_normals_irls`` are one operation of their own 
 torch 2.5), ``torch.func`` and compilers, and have no second derivatives there; the method
 ``consensus`` has no gradients, and refuses points that require them. The modules of
 :mod:`torchrg.nn` are like their functions.
+=======
+From a file to planes and back: :func:`read_cloud`, :func:`segment_planes` with settings of
+:func:`load_config`, :func:`write_cloud`, :func:`read_result`. Single stages: :func:`search_knn`,
+:func:`estimate_normals`, :func:`grow_regions`, :func:`make_superpoints`, :func:`align_axes`. The
+modules of :mod:`torchrg.transforms` do the same to the samples of a loader,
+:mod:`torchrg.datasets` reads data sets, :mod:`torchrg.metrics` scores, :mod:`torchrg.config` has
+every setting, and :mod:`torchrg.robust` and :mod:`torchrg.nn` are for patches of points.
+
+In PyTorch, functions of patches are like those of torch: they have gradients, and run under
+``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)`` and ``torch.export``. Functions of
+clouds search neighbours and grow regions on the CPU: a compiler breaks its graph there (``break``)
+and compiles the rest, and under ``vmap`` and ``torch.func`` they refuse in one line. Labels have no
+gradient (``none``). Every cell is a test, but on CUDA nothing was run yet.
+
+==================  ========  =======  =======  =======  =======  ========  
+Example:
+    >>> import torchrg
+    >>> room = torchrg.scenes.make_room(num_points=2000, noise=0.003, seed=0)
+    >>> seg = torchrg.segment_planes(room.points, torchrg.load_config("classic"))
+    >>> seg.labels.shape, seg.normals.shape, len(seg.planes.count) > 3
+    (torch.Size([2000]), torch.Size([2000, 3]), True)
 """
 
 from torchrg import _display

@@ -1,4 +1,7 @@
-"""Exceptions that torchrg raises on purpose."""
+"""Exceptions that torchrg raises on purpose.
+
+All are a :class:`TorchrgError`; the message says what was expected, what came, and the repair.
+"""
 
 
 class TorchrgError(Exception):

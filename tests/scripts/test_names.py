@@ -1,10 +1,9 @@
-"""Scripts are found by who reads the README, and use what torchrg and the made scenes show."""
+"""Scripts are found by who reads README and guides, and use public names alone."""
 
 import ast
 import re
 from pathlib import Path
 
-import docs
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -21,8 +20,9 @@ def commands():
     )
 
 
-def test_the_readme_names_every_script():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_readme_or_a_guide_names_every_script():
+    texts = [ROOT / "README.md", *(SCRIPTS / "guides").glob("*.md")]
+    text = "".join(path.read_text(encoding="utf-8") for path in texts)
     assert len(commands()) > 8
     for name in commands():
         place = (SCRIPTS / BEHIND[name]).read_text() if name in BEHIND else text
@@ -30,7 +30,8 @@ def test_the_readme_names_every_script():
 
 
 def test_every_script_that_is_named_is_there():
-    for path in (ROOT / "README.md", *(ROOT / "torchrg").rglob("*.py"), ROOT / ".ci" / "run"):
+    texts = (ROOT / "README.md", *(SCRIPTS / "guides").glob("*.md"), ROOT / ".ci" / "run")
+    for path in (*texts, *(ROOT / "torchrg").rglob("*.py")):
         for name in re.findall(r"scripts/([a-z_]+\.(?:py|sh))", path.read_text(encoding="utf-8")):
             assert (SCRIPTS / name).exists(), (path.name, name)
 
@@ -43,15 +44,3 @@ def test_scenes_are_made_by_what_the_package_of_scenes_shows(folder):
                 names = [alias.name for alias in node.names if alias.name.startswith("_")]
                 assert not names, (path.name, names)
                 assert not (node.module or "").startswith("torchrg.scenes."), path.name
-
-
-def test_references_of_the_reference_lead_somewhere():
-    modules = list(docs.modules())
-    assert len(modules) > 100
-    assert not [
-        (module.__name__, target)
-        for module in modules
-        for _, target in docs.references(module)
-        if not docs.leads_somewhere(target, module)
-    ]
-    assert not docs.leads_somewhere("torchrg.nothing", modules[0])

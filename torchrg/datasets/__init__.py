@@ -12,7 +12,7 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
 
 KPConv reads an area of S3DIS as ``original_ply/Area_1.ply``; after ``torchrg convert s3dis RAW OUT
 --class-order spt``, whose classes are in its order, these lines write it (the fields beyond
-``class`` stay unread until ``load_subsampled_clouds`` is told of them)::
+``class`` stay unread until ``load_subsampled_clouds`` is told of them):
 
     area = {key: np.asarray(value) for key, value in read_pointcept_area("OUT/Area_1").items()}
     fields = {"color": area["color"], "class": area["segment"].astype(np.int32)}
@@ -22,7 +22,7 @@ KPConv reads an area of S3DIS as ``original_ply/Area_1.ply``; after ``torchrg co
 Superpoint Transformer reads S3DIS as released and averages points over voxels, labels too: planes
 have to come after. With ``from torchrg.transforms import SegmentPlanes`` at the end of its
 ``src/transforms/__init__.py``, its configs name our transforms; in ``pre_transform``, after
-``GridSampling3D`` (``plane`` also goes into ``point_save_keys``)::
+``GridSampling3D`` (``plane`` also goes into ``point_save_keys``):
 
     - transform: SegmentPlanes
       params:
@@ -35,7 +35,7 @@ metres, z up, and know normals of meshes, which look into the room; zeros in the
 accuracy. Of a scan without normals these lines make the dict that their transforms begin with.
 In made rooms 99.5 % of the normals of floors, ceilings and walls look into the room then, and 96 %
 of all: those of plates thinner than two point spacings may not. ``torchrg align`` sets a scan
-upright before, and ``torchrg normals --orient interior`` writes the normals into a file::
+upright before, and ``torchrg normals --orient interior`` writes the normals into a file:
 
     cloud = torchrg.read_cloud("scan.ply")
     normals = torchrg.estimate_normals(cloud.points).normals
@@ -44,7 +44,7 @@ upright before, and ``torchrg normals --orient interior`` writes the normals int
     point = sonata.transform.default()(point | {"normal": normals.numpy()})
 
 OpenPCSeg reads scans of cars only (SemanticKITTI, Waymo), of which there is nothing to convert; in
-``__getitem__`` of a subclass, columns of ours go beside those of ``xyzret``::
+``__getitem__`` of a subclass, columns of ours go beside those of ``xyzret``:
 
     found = EstimateNormals()({"coord": torch.from_numpy(pc_data["xyzret"][:, :3])})
     columns = torch.column_stack([found["normal"], found["curvature"]]).numpy()

@@ -1,4 +1,8 @@
-"""Regions: which neighbours join, growth, the table of planes, and superpoints."""
+"""Regions: which neighbours join, growth, the table of planes, and superpoints.
+
+Everything here takes normals that are there and estimates none. :func:`torchrg.segment_planes`
+calls these functions one after the other, with what comes before and after them.
+"""
 
 from torchrg.regions.axes import align_axes
 from torchrg.regions.growth import grow_regions
