@@ -27,7 +27,7 @@ OURS = {"paper": "the two-stage method", "libra": "the two-stage method with LIB
 
 WHY = (
     "At 0.25 %, the least noise that the paper draws, its deviation is a tenth to a sixth of the "
-    "radius of 50 neighbours, and robust fits cannot tell faces from noise; at half they can. "
+    "radius of 50 neighbours, and robust fits cannot tell faces from noise; at half of it they do. "
     "Of a robust fit the error at an edge is 0 or that of the other face, 90 degrees, which a mean "
     "of squares counts most: DetMCD as published, on half of the neighbours, takes the other face "
     "more often than LIBRA's, on three quarters. The mean angle is on its side."
