@@ -4,7 +4,7 @@
     python scripts/trace_path.py consensus --brief
 
 The map to read the code by: each file with the functions by which other files enter it. What runs
-only at import does not count.
+only at import does not count, nor what a decorator wraps around a function.
 """
 
 import argparse
@@ -39,7 +39,8 @@ def trace(preset: str) -> dict[str, list[str]]:
     def note(frame: FrameType, event: str, _: object) -> None:
         code, caller = frame.f_code, frame.f_back
         path = Path(code.co_filename)
-        if event != "call" or PACKAGE not in path.parents:
+        is_wrapper = "<locals>.call" in code.co_qualname
+        if event != "call" or PACKAGE not in path.parents or is_wrapper:
             return
         doors = entered.setdefault(path.relative_to(PACKAGE).as_posix(), {})
         name, _, inner = code.co_qualname.partition(".")

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
     {"errors", "version", "_display"},
-    {"_checks", "_opaque", "_optional", "_parallel", "structures"},
-    {"linalg", "neighbors", "config"},
+    {"_checks", "_optional", "_parallel", "structures"},
+    {"_opaque", "linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},
     {"result"},

@@ -1,12 +1,17 @@
 """Argument checks that never read tensor values, so they cost no device synchronisation."""
 
-from typing import Any, get_args
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeGuard, TypeVar, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError, ShapeError
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
@@ -148,3 +153,62 @@ def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, .
         length == ((int(axis),) if axis.isdigit() else bound.setdefault(axis, length))
         for axis, length in [*leading, *lengths]
     )
+
+
+def is_tensor(value: object) -> TypeGuard[Tensor]:
+    """Return whether something is a tensor."""
+    return isinstance(value, Tensor)
+
+
+def has_values(*tensors: Tensor | None) -> bool:
+    """Return whether tensors hold numbers that may be read: not in a compiler, nor under vmap.
+
+    Example:
+        >>> has_values(torch.zeros(2)), has_values(torch.zeros(2, device="meta"))
+        (True, False)
+        >>> torch.vmap(lambda row: torch.tensor(has_values(row)))(torch.zeros(2, 3)).tolist()
+        [False, False]
+    """
+    if torch.compiler.is_compiling():
+        return False
+    try:
+        given = [t for t in tensors if t is not None and t.layout is torch.strided]
+        return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in given)
+    except RuntimeError:  # the answer of what stands for another tensor
+        return False
+
+
+def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Keep compilers out of a function of clouds, and refuse tensors without values.
+
+    A compiler breaks its graph there and compiles the rest of the model.
+    """
+
+    @wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if torch.compiler.is_compiling():
+            uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
+            found: Result = uncompiled(*args, **kwargs)
+            return found
+        if not has_values(*(given for given in (*args, *kwargs.values()) if is_tensor(given))):
+            raise ShapeError(
+                f"{function.__name__}: expected points with values, got those of vmap, torch.func "
+                "or the meta device; functions of clouds run outside of them."
+            )
+        return function(*args, **kwargs)
+
+    return call
+
+
+def in_own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Let a function that multiplies matrices keep its dtype under ``torch.autocast``."""
+
+    @wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+        if not kinds:
+            return function(*args, **kwargs)
+        with torch.autocast(kinds[0], enabled=False), torch.autocast(kinds[-1], enabled=False):
+            return function(*args, **kwargs)
+
+    return call

@@ -1,7 +1,6 @@
 """Functions that read values, made opaque to what has none: compilers, ``vmap``, ``torch.func``.
 
-These run a function on tensors that stand for others. Functions of clouds stay outside of them. A
-function of patches that sorts with NumPy,
+These run a function on tensors that stand for others. A function of patches that sorts with NumPy,
 or takes as many steps as its points need, is an operation of its own to them, with a rule for
 batches and one for gradients; called on ordinary tensors it is an ordinary function.
 """
@@ -11,69 +10,13 @@ import inspect
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
-from typing import Any, NamedTuple, ParamSpec, TypeGuard, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg.errors import ConfigError, ShapeError
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-
-def has_values(*tensors: Tensor | None) -> bool:
-    """Return whether tensors hold numbers that may be read: not in a compiler, nor under vmap.
-
-    Example:
-        >>> has_values(torch.zeros(2)), has_values(torch.zeros(2, device="meta"))
-        (True, False)
-        >>> torch.vmap(lambda row: torch.tensor(has_values(row)))(torch.zeros(2, 3)).tolist()
-        [False, False]
-    """
-    if torch.compiler.is_compiling():
-        return False
-    try:
-        given = [t for t in tensors if t is not None and t.layout is torch.strided]
-        return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in given)
-    except RuntimeError:  # the answer of what stands for another tensor
-        return False
-
-
-def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Keep compilers out of a function of clouds, and refuse tensors without values.
-
-    A compiler breaks its graph there and compiles the rest of the model.
-    """
-
-    @wraps(function)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        if torch.compiler.is_compiling():
-            uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
-            found: Result = uncompiled(*args, **kwargs)
-            return found
-        if not has_values(*(given for given in (*args, *kwargs.values()) if _is_tensor(given))):
-            raise ShapeError(
-                f"{function.__name__}: expected points with values, got those of vmap, torch.func "
-                "or the meta device; functions of clouds run outside of them."
-            )
-        return function(*args, **kwargs)
-
-    return call
-
-
-def in_own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Let a function that multiplies matrices keep its dtype under ``torch.autocast``."""
-
-    @wraps(function)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
-        if not kinds:
-            return function(*args, **kwargs)
-        with torch.autocast(kinds[0], enabled=False), torch.autocast(kinds[-1], enabled=False):
-            return function(*args, **kwargs)
-
-    return call
+from torchrg._checks import Arguments, Result, has_values, is_tensor
+from torchrg.errors import ConfigError
 
 
 class _Function(NamedTuple):
@@ -107,7 +50,7 @@ def opaque(
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             given: dict[str, Any] = {**dict(zip(parameters, args, strict=False)), **kwargs}
-            tensors = {key: given[key] for key in parameters if _is_tensor(given.get(key))}
+            tensors = {key: given[key] for key in parameters if is_tensor(given.get(key))}
             if has_values(*tensors.values()):
                 return function(*args, **kwargs)
             parts = [name, ",".join(tensors)]
@@ -122,10 +65,6 @@ def opaque(
         return call
 
     return decorate
-
-
-def _is_tensor(value: object) -> TypeGuard[Tensor]:
-    return isinstance(value, Tensor)
 
 
 def _check_literal(name: str, key: str, value: object) -> None:

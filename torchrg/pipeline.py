@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_points, check_shapes
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, of_clouds
 from torchrg._parallel import sequential_operations
 from torchrg.config import (
     GrowingConfig,
@@ -230,7 +229,8 @@ def segment_planes(
     if isinstance(points, Tensor | np.ndarray):
         points = as_tensor("segment_planes", "points", points).detach()
         check_points("segment_planes", points)
-    config = settings_of("segment_planes", PipelineConfig, config)
+    if not isinstance(config, PipelineConfig):
+        config = settings_of("segment_planes", PipelineConfig, config)
     store = MemoryStore() if store is None else store
     begin = on_stage or (lambda stage: None)
     store.begin(config={**dataclasses.asdict(config), "chunk_size": None}, voxel=voxel)

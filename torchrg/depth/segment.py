@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import sequential_operations
 from torchrg.config import DepthConfig
 from torchrg.depth.camera import has_depth, points_of_image, read_intrinsics

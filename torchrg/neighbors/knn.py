@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import ROWS_AT_ONCE, allowed_threads, chunks_of, sequential_operations
 from torchrg.errors import ShapeError
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties

@@ -24,8 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_points
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_points, of_clouds
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._opaque import in_own_precision
+from torchrg._checks import in_own_precision
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root
 from torchrg.linalg.moments import Columns, along, sq_lengths

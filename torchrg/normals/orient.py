@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import CHUNK_SIZE, map_chunks, sequential_operations
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, gather_patches, search_knn

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_floating, check_shapes
-from torchrg._opaque import has_values
+from torchrg._checks import check_floating, check_shapes, has_values
 from torchrg.linalg import coordinate_resolution, covariance, eigh3, rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
 from torchrg.structures import NormalFit

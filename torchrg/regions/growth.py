@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_operations
 from torchrg.config import GrowingConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError

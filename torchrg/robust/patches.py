@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._opaque import Arguments, opaque
+from torchrg._checks import Arguments, as_tensor, check_floating, check_shapes
+from torchrg._opaque import opaque
 from torchrg._parallel import map_chunks
 from torchrg.errors import ConfigError
 from torchrg.linalg import flatness_tolerance, second_moments, smallest_normal

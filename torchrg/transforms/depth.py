@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, of_clouds
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
 from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrg._checks import as_tensor, check_shapes
-from torchrg._opaque import of_clouds
+from torchrg._checks import as_tensor, check_shapes, of_clouds
 from torchrg.errors import ConfigError
 from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
