@@ -8,6 +8,7 @@ in ASCII files of other formats are read here, too.
 """
 
 import csv
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -200,7 +201,13 @@ def _parse(
     def parse(lines: list[str]) -> NDArray[np.void]:
         if decimal != ".":
             lines = [line.replace(decimal, ".") for line in lines]
-        return np.loadtxt(lines, dtype, delimiter=delimiter, comments=comments, ndmin=1)
+        # Before version 2.3 NumPy cuts numbers to fit an integer, and warns that it will not.
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)
+            try:
+                return np.loadtxt(lines, dtype, delimiter=delimiter, comments=comments, ndmin=1)
+            except DeprecationWarning as warning:
+                raise ValueError(str(warning)) from warning
 
     numbered = [
         (number, line)
