@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
+from torchrg.depth.hidden import hidden_contacts
 from torchrg.depth.normals import PixelPlanes
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
@@ -218,8 +219,12 @@ def _refine(
         planes = fit_inverse_planes(cloud, labels)
         reach = planes.times_thickness(config.absorb_reach)
         labels = absorb_points(cloud.points, labels, beside, planes, reach, valid=seen)
-        contacts, tolerance = beside.contacts(labels), config.merge_tolerance
-        merged = merge_coplanar(labels, contacts, planes, tolerance=tolerance)
+        hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
+        pairs = zip(beside.contacts(labels), hidden, strict=True)
+        contacts, counts = (torch.cat(part) for part in pairs)
+        merged = merge_coplanar(
+            labels, (contacts, counts), planes, tolerance=config.merge_tolerance
+        )
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
     reach = planes.times_thickness(config.absorb_reach)

@@ -1,6 +1,7 @@
 """The plane at each pixel of a depth image: that of the largest flat window around it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torchrg.depth.windows import (
     SIDE,
     WindowNoise,
     WindowPlanes,
+    find_jitter,
     fit_narrow_windows,
     fit_windows,
     noise_by_size,
@@ -35,9 +37,8 @@ as much would hide creases of 20 degrees."""
 _STEEPEST = 4.0
 """Inverse of the cosine of the steepest angle at which a surface may bend. Seen at a steeper angle,
 a step looks like a bend."""
-_JITTER = 0.15
-"""Pixels by which the ray of a depth may be off the middle of its pixel, standard deviation. It
-moves depth by as much of what the depth changes from one pixel to the next."""
+_STEEP_SIZE = 2
+"""Width of the cells of the windows that jitter is read from, in pixels."""
 _PIXELS_AT_ONCE = 2**14
 """Pixels whose narrow windows are fitted at once."""
 
@@ -136,7 +137,10 @@ def fit_pixels(
     choice = _Choice(inverse, seen, u, v)
     for size in CELL_SIZES:
         _offer_windows(choice, windows[size], windows.get(size // 2))
-    narrow = _NarrowWindows(first, *_flat_narrow_windows(choice, noises[CELL_SIZES[-1]], focal))
+    limits = partial(
+        _tolerances, noise=noises[1], size=1, focal=focal, jitter=find_jitter(planes[_STEEP_SIZE])
+    )
+    narrow = _NarrowWindows(first, *_flat_narrow_windows(choice, limits))
     _offer_narrow_windows(choice, narrow)
     every = [*windows.values(), narrow]
     return _pixel_planes(choice, seen, every, noises[CELL_SIZES[0]].at(inverse))
@@ -214,14 +218,14 @@ def _offer_windows(
 
 
 def _flat_narrow_windows(
-    choice: "_Choice", noise: WindowNoise, focal: tuple[float, float]
+    choice: "_Choice", limits: Callable[[WindowPlanes], _Tolerances]
 ) -> tuple[WindowPlanes, _Tolerances, Tensor, Tensor, Tensor, int]:
     """Return the flat ones among the narrow windows around pixels that have none, and of them."""
     pixels, parts = choice.waiting, []
     left = torch.zeros_like(choice.flat).index_fill(0, pixels, value=True)
     for some in torch.split(pixels, _PIXELS_AT_ONCE):
         planes, held = fit_narrow_windows(choice.values, left, choice.u, choice.v, some)
-        limit = _tolerances(planes, noise, 1, focal, jitter=_JITTER)
+        limit = limits(planes)
         shape, place = (planes.deviation <= _FLAT * limit.flat).nonzero().unbind(dim=1)
         at = shape * len(some) + place
         held = held.flatten(0, 1)[at]

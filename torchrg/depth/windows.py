@@ -34,6 +34,8 @@ _NUM_BINS = 12
 """Classes of depth that noise is fitted to."""
 _MOST_GROWTH = 1.4
 """Noise of windows grows at most by this from one size to the next."""
+_MOST_JITTER = 0.15
+"""Pixels by which rays may be off the middles of their pixels, standard deviation. More is noise."""
 _ROUNDING = 8.0
 """Least noise of inverse depth, in units of the rounding of the depth."""
 _LEAST_ROUNDING = 1e-7
@@ -199,6 +201,21 @@ def noise_by_size(
         factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)
     return noises
+
+
+def find_jitter(windows: WindowPlanes) -> float:
+    """Return by how many pixels the rays of an image are off the middles of their pixels.
+
+    It is a standard deviation, from 0 for exact rays to 0.15. Jitter moves a value by as much of
+    what it changes from one pixel to the next, so that it shows in windows that are steep: no flat
+    window deviates by less. Windows are classed by their steepness, and of the steeper half of the
+    classes the one counts where flat windows deviate least.
+    """
+    used = windows.deviation.isfinite()
+    slope, order = torch.hypot(windows.u_slope[used], windows.v_slope[used]).sort()
+    ratio = windows.deviation[used][order] / slope.clamp(min=torch.finfo(slope.dtype).tiny)
+    steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
+    return min([_MOST_JITTER, *(float(_low_quantile(part)) for part in steep if len(part))])
 
 
 def _low_quantile(values: Tensor) -> Tensor:
