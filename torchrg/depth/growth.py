@@ -10,6 +10,7 @@ from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.hidden import hidden_contacts
 from torchrg.depth.normals import PixelPlanes
+from torchrg.depth.strips import join_strips
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, RegionPlanes
@@ -97,9 +98,14 @@ def grow_pixels(
     if not bool((labels >= 0).any()):
         return labels, normals.new_empty(0, 3), pixels.flat.new_empty(0)
     labels, fit = _refine(cloud, labels, config)
+    return labels, _normals_in_space(fit), fit.curved
+
+
+def _normals_in_space(fit: RegionPlanes) -> Tensor:
+    """Return unit normals towards the camera ``(M, 3)`` of the planes of an inverse cloud."""
     distance = (fit.normal * fit.center).sum(dim=1)
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
-    return labels, -away / away.norm(dim=1, keepdim=True), fit.curved
+    return -away / away.norm(dim=1, keepdim=True)
 
 
 def _joins(
@@ -227,6 +233,11 @@ def _refine(
         )
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
+    shape, normals = cloud.seen.shape, _normals_in_space(planes)
+    image, w, noise = (part.view(shape) for part in (labels, cloud.points[:, 2], cloud.noise))
+    joined = number_by_size(join_strips(image, w, noise, normals).flatten(), config.min_size)
+    if not torch.equal(joined, labels):
+        labels, planes = joined, fit_inverse_planes(cloud, joined)
     reach = planes.times_thickness(config.absorb_reach)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
