@@ -105,7 +105,8 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
     """Return unit normals towards the camera ``(M, 3)`` of the planes of an inverse cloud."""
     distance = (fit.normal * fit.center).sum(dim=1)
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
-    return -away / away.norm(dim=1, keepdim=True)
+    normals: Tensor = -away / away.norm(dim=1, keepdim=True)
+    return normals
 
 
 def _joins(
@@ -233,15 +234,27 @@ def _refine(
         )
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
-    shape, normals = cloud.seen.shape, _normals_in_space(planes)
-    image, w, noise = (part.view(shape) for part in (labels, cloud.points[:, 2], cloud.noise))
-    joined = number_by_size(join_strips(image, w, noise, normals).flatten(), config.min_size)
+    joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
     if not torch.equal(joined, labels):
         labels, planes = joined, fit_inverse_planes(cloud, joined)
     reach = planes.times_thickness(config.absorb_reach)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)
+
+
+def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
+    """Return what :func:`join_strips` does for the regions of an inverse cloud ``(H * W,)``."""
+    shape, pixels = cloud.seen.shape, torch.arange(len(labels), device=labels.device)
+    rays, noise = _rays(cloud, pixels).view(*shape, 3), cloud.noise.view(shape)
+    image, normals = labels.view(shape), _normals_in_space(fit)
+    return join_strips(image, rays, noise, _planes_over_rays(fit), normals).flatten()
+
+
+def _planes_over_rays(fit: RegionPlanes) -> Tensor:
+    """Return planes ``(M, 3)`` that times a ray ``(x, y, 1)`` are the last coordinate."""
+    offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
+    return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
 
 
 def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
@@ -304,9 +317,8 @@ def move_to_creases(
 
     ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
     """
-    offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
-    planes = torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
-    middles = torch.cat([fit.center[:, :2], torch.ones_like(offset)], dim=1)
+    planes = _planes_over_rays(fit)
+    middles = torch.cat([fit.center[:, :2], torch.ones_like(planes[:, :1])], dim=1)
     labels = labels.clone()
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))

@@ -34,8 +34,9 @@ def hidden_contacts(
     """Return the pairs of regions of one plane that only what is nearer parts, and their contacts.
 
     The middle of the smaller of two regions is on the plane of the larger, and along some rows or
-    columns nothing between the two is behind that plane, and half of it or more is in front. Whatever is seen behind a plane shows that it ends there, as the floor between two
-    tables of one height does.
+    columns nothing between the two is behind that plane, and half of it or more is in front.
+    Whatever is seen behind a plane shows that it ends there, as the floor between two tables of one
+    height does.
 
     ``points`` ``(H * W, 3)`` and ``seen`` ``(H, W)`` are those of
     :class:`torchrg.depth.growth.InverseCloud`; ``reach`` ``(M,)`` is the distance from a plane that
@@ -52,8 +53,7 @@ def hidden_contacts(
         if lines >= _LEAST_LINES:
             pairs.append((min(larger, smaller), max(larger, smaller)))
             contacts.append(lines * _EVERY)
-    found = labels.new_tensor(pairs).view(-1, 2), labels.new_tensor(contacts)
-    return found
+    return labels.new_tensor(pairs).view(-1, 2), labels.new_tensor(contacts)
 
 
 def _aligned_pairs(planes: RegionPlanes) -> list[tuple[int, int]]:

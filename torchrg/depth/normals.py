@@ -48,10 +48,10 @@ class PixelPlanes(NamedTuple):
 
     The planes are in columns and rows from the optical axis. ``window`` tells pixels of one window
     from those of others, ``sides`` ``(2, H, W)`` are its rows and columns, and ``middle``
-    ``(2, H, W)`` row and column of its middle. ``valid`` tells which pixels have a plane, ``flat`` whether their window
-    is flat, ``edge`` whether it is but could not lie around the pixel; ``noise`` is the standard
-    deviation of inverse depth, as large windows see it, and ``tolerance`` what a flat window may
-    deviate by. All others are of shape ``(H, W)``.
+    ``(2, H, W)`` row and column of its middle. ``valid`` tells which pixels have a plane, ``flat``
+    whether their window is flat, ``edge`` whether it is but could not lie around the pixel;
+    ``noise`` is the standard deviation of inverse depth, as large windows see it, and
+    ``tolerance`` what a flat window may deviate by. All others are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes
@@ -72,7 +72,8 @@ class PixelPlanes(NamedTuple):
         """
         rows, columns = (side.flatten()[pixels] for side in self.sides)
         sq_tolerance, count = self.tolerance.flatten()[pixels].square(), rows * columns
-        return 6 * sq_tolerance * (1 / (rows * rows) + 1 / (columns * columns)) / count
+        variance: Tensor = 6 * sq_tolerance * (1 / (rows * rows) + 1 / (columns * columns)) / count
+        return variance
 
     def holds(self, pixels: Tensor, others: Tensor) -> Tensor:
         """Return whether the windows of some pixels hold others, all by row-major place."""
@@ -80,7 +81,8 @@ class PixelPlanes(NamedTuple):
         row, column = (part.flatten()[pixels] for part in self.middle)
         rows, columns = (side.flatten()[pixels] for side in self.sides)
         down, right = (others // width - row).abs(), (others % width - column).abs()
-        return (down <= rows / 2) & (right <= columns / 2)
+        inside: Tensor = (down <= rows / 2) & (right <= columns / 2)
+        return inside
 
 
 class _Tolerances(NamedTuple):
@@ -142,7 +144,7 @@ def fit_pixels(
     )
     narrow = _NarrowWindows(first, *_flat_narrow_windows(choice, limits))
     _offer_narrow_windows(choice, narrow)
-    every = [*windows.values(), narrow]
+    every: list[_SquareWindows | _NarrowWindows] = [*windows.values(), narrow]
     return _pixel_planes(choice, seen, every, noises[CELL_SIZES[0]].at(inverse))
 
 

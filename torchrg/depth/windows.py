@@ -35,7 +35,7 @@ _NUM_BINS = 12
 _MOST_GROWTH = 1.4
 """Noise of windows grows at most by this from one size to the next."""
 _MOST_JITTER = 0.15
-"""Pixels by which rays may be off the middles of their pixels, standard deviation. More is noise."""
+"""Pixels by which rays may be off the middles of their pixels, standard deviation."""
 _ROUNDING = 8.0
 """Least noise of inverse depth, in units of the rounding of the depth."""
 _LEAST_ROUNDING = 1e-7
@@ -211,9 +211,11 @@ def find_jitter(windows: WindowPlanes) -> float:
     window deviates by less. Windows are classed by their steepness, and of the steeper half of the
     classes the one counts where flat windows deviate least.
     """
-    used = windows.deviation.isfinite()
-    slope, order = torch.hypot(windows.u_slope[used], windows.v_slope[used]).sort()
-    ratio = windows.deviation[used][order] / slope.clamp(min=torch.finfo(slope.dtype).tiny)
+    # Windows stand a cell apart and overlap.
+    some = WindowPlanes(*(part[::REACH, ::REACH] for part in windows))
+    used = some.deviation.isfinite()
+    slope, order = torch.hypot(some.u_slope[used], some.v_slope[used]).sort()
+    ratio = some.deviation[used][order] / slope.clamp(min=torch.finfo(slope.dtype).tiny)
     steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
     return min([_MOST_JITTER, *(float(_low_quantile(part)) for part in steep if len(part))])
 
