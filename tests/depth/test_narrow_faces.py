@@ -107,6 +107,9 @@ def test_planes_that_end_stay_apart():
     depth[:, 140:170] = 3.0
     seg = segment_depth(depth, CAMERA)
     assert len(seg.planes.count) == 3
+    # Nor does it help that a post stands in most of the gap.
+    depth[:, 140:163] = 1.0
+    assert len(segment_depth(depth, CAMERA).planes.count) == 4
     # Behind the post one side is 5 cm farther away.
     depth[:, 140:170], depth[:, 170:] = 1.0, 2.05
     assert len(segment_depth(depth, CAMERA).planes.count) == 3
