@@ -113,7 +113,8 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         top, bottom, left, right = squares[int(found.window.flatten()[pixel])]
         row, column = divmod(other, width)
         expected.append(top <= row < bottom and left <= column < right)
-        assert bottom - top == found.side.flatten()[pixel]
+        assert bottom - top == found.sides[0].flatten()[pixel]
+        assert right - left == found.sides[1].flatten()[pixel]
     assert found.holds(pixels, others).tolist() == expected
     assert any(expected)
     assert not all(expected)

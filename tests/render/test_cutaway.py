@@ -57,6 +57,14 @@ def test_cutaway_leaves_out_ceiling_and_near_walls_only(rng, azimuth_deg):
     assert min(walls[0], walls[1]) < 0.1 < max(walls[0], walls[1])
 
 
+def test_a_ceiling_much_sparser_than_the_rest_is_left_out(rng):
+    points, faces = box_room(rng)
+    kept = (faces != 1) | (torch.rand(len(faces), generator=rng) < 0.03)
+    shares = kept_share(points[kept], faces[kept], "cutaway", azimuth_deg=30.0)
+    assert float(shares[1]) == 0
+    assert float(shares[[0, 6]].amin()) > 0.85
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1e3])
 @pytest.mark.parametrize("turn_deg", [0.0, 28.0])
 def test_cut_does_not_depend_on_unit_heading_or_origin(rng, scale, turn_deg):

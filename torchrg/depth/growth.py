@@ -8,7 +8,9 @@ from torch import Tensor
 
 from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
+from torchrg.depth.hidden import hidden_contacts
 from torchrg.depth.normals import PixelPlanes
+from torchrg.depth.strips import join_strips
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, RegionPlanes
@@ -96,9 +98,15 @@ def grow_pixels(
     if not bool((labels >= 0).any()):
         return labels, normals.new_empty(0, 3), pixels.flat.new_empty(0)
     labels, fit = _refine(cloud, labels, config)
+    return labels, _normals_in_space(fit), fit.curved
+
+
+def _normals_in_space(fit: RegionPlanes) -> Tensor:
+    """Return unit normals towards the camera ``(M, 3)`` of the planes of an inverse cloud."""
     distance = (fit.normal * fit.center).sum(dim=1)
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
-    return labels, -away / away.norm(dim=1, keepdim=True), fit.curved
+    normals: Tensor = -away / away.norm(dim=1, keepdim=True)
+    return normals
 
 
 def _joins(
@@ -218,14 +226,35 @@ def _refine(
         planes = fit_inverse_planes(cloud, labels)
         reach = planes.times_thickness(config.absorb_reach)
         labels = absorb_points(cloud.points, labels, beside, planes, reach, valid=seen)
-        contacts, tolerance = beside.contacts(labels), config.merge_tolerance
-        merged = merge_coplanar(labels, contacts, planes, tolerance=tolerance)
+        hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
+        pairs = zip(beside.contacts(labels), hidden, strict=True)
+        contacts, counts = (torch.cat(part) for part in pairs)
+        merged = merge_coplanar(
+            labels, (contacts, counts), planes, tolerance=config.merge_tolerance
+        )
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
+    joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
+    if not torch.equal(joined, labels):
+        labels, planes = joined, fit_inverse_planes(cloud, joined)
     reach = planes.times_thickness(config.absorb_reach)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)
+
+
+def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
+    """Return what :func:`join_strips` does for the regions of an inverse cloud ``(H * W,)``."""
+    shape, pixels = cloud.seen.shape, torch.arange(len(labels), device=labels.device)
+    rays, noise = _rays(cloud, pixels).view(*shape, 3), cloud.noise.view(shape)
+    image, normals = labels.view(shape), _normals_in_space(fit)
+    return join_strips(image, rays, noise, _planes_over_rays(fit), normals).flatten()
+
+
+def _planes_over_rays(fit: RegionPlanes) -> Tensor:
+    """Return planes ``(M, 3)`` that times a ray ``(x, y, 1)`` are the last coordinate."""
+    offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
+    return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
 
 
 def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
@@ -288,9 +317,8 @@ def move_to_creases(
 
     ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
     """
-    offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
-    planes = torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
-    middles = torch.cat([fit.center[:, :2], torch.ones_like(offset)], dim=1)
+    planes = _planes_over_rays(fit)
+    middles = torch.cat([fit.center[:, :2], torch.ones_like(planes[:, :1])], dim=1)
     labels = labels.clone()
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))

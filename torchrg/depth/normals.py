@@ -1,6 +1,7 @@
 """The plane at each pixel of a depth image: that of the largest flat window around it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -8,10 +9,13 @@ from torch import Tensor
 
 from torchrg.depth.windows import (
     CELL_SIZES,
+    NARROW,
     REACH,
     SIDE,
     WindowNoise,
     WindowPlanes,
+    find_jitter,
+    fit_narrow_windows,
     fit_windows,
     noise_by_size,
 )
@@ -33,22 +37,26 @@ as much would hide creases of 20 degrees."""
 _STEEPEST = 4.0
 """Inverse of the cosine of the steepest angle at which a surface may bend. Seen at a steeper angle,
 a step looks like a bend."""
+_STEEP_SIZE = 2
+"""Width of the cells of the windows that jitter is read from, in pixels."""
+_PIXELS_AT_ONCE = 2**14
+"""Pixels whose narrow windows are fitted at once."""
 
 
 class PixelPlanes(NamedTuple):
     """A plane in inverse depth for each pixel: that of a window.
 
     The planes are in columns and rows from the optical axis. ``window`` tells pixels of one window
-    from those of others, ``side`` is its side in pixels, and ``middle`` ``(2, H, W)`` row and
-    column of its middle. ``valid`` tells which pixels have a plane, ``flat`` whether their window
-    is flat, ``edge`` whether it is but could not lie around the pixel; ``noise`` is the standard
-    deviation of inverse depth, as large windows see it, and ``tolerance`` what a flat window may
-    deviate by. All others are of shape ``(H, W)``.
+    from those of others, ``sides`` ``(2, H, W)`` are its rows and columns, and ``middle``
+    ``(2, H, W)`` row and column of its middle. ``valid`` tells which pixels have a plane, ``flat``
+    whether their window is flat, ``edge`` whether it is but could not lie around the pixel;
+    ``noise`` is the standard deviation of inverse depth, as large windows see it, and
+    ``tolerance`` what a flat window may deviate by. All others are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes
     window: Tensor
-    side: Tensor
+    sides: Tensor
     middle: Tensor
     valid: Tensor
     flat: Tensor
@@ -59,17 +67,22 @@ class PixelPlanes(NamedTuple):
     def sq_slope_noise(self, pixels: Tensor) -> Tensor:
         """Return the variance of the slopes of the windows of some pixels, by row-major place.
 
-        That of least squares over n^2 pixels of variance (n^2 - 1) / 12 along either axis.
+        That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean
+        of both axes.
         """
-        side = self.side.flatten()[pixels]
-        return 12 * (self.tolerance.flatten()[pixels] / (side * side)).square()
+        rows, columns = (side.flatten()[pixels] for side in self.sides)
+        sq_tolerance, count = self.tolerance.flatten()[pixels].square(), rows * columns
+        variance: Tensor = 6 * sq_tolerance * (1 / (rows * rows) + 1 / (columns * columns)) / count
+        return variance
 
     def holds(self, pixels: Tensor, others: Tensor) -> Tensor:
         """Return whether the windows of some pixels hold others, all by row-major place."""
         width = self.window.shape[1]
         row, column = (part.flatten()[pixels] for part in self.middle)
-        away = torch.maximum((others // width - row).abs(), (others % width - column).abs())
-        return away <= self.side.flatten()[pixels] / 2
+        rows, columns = (side.flatten()[pixels] for side in self.sides)
+        down, right = (others // width - row).abs(), (others % width - column).abs()
+        inside: Tensor = (down <= rows / 2) & (right <= columns / 2)
+        return inside
 
 
 class _Tolerances(NamedTuple):
@@ -102,8 +115,9 @@ def fit_pixels(
     quarters do from planes of their own; one across a step or an edge is not. For each size, the
     largest first, a pixel takes the window around its cell if that is flat; else the flattest
     window that holds it [2]; in both cases only if the pixel itself is on the plane. Where none is
-    flat but the smallest is smooth, as on a column without noise, it takes that. Pixels in no flat
-    window have the smallest around them.
+    flat but the smallest is smooth, as on a column without noise, it takes that. What is left then,
+    on faces seen at a grazing angle or a few pixels wide, is seen again by itself, with narrow
+    windows. Pixels in no flat window have the smallest square around them.
 
     ``inverse`` ``(H, W)``, float64, is anything finite where not ``seen``; columns ``u`` ``(W,)``
     and rows ``v`` ``(H, 1)`` count from the optical axis; ``focal`` are the focal lengths along
@@ -117,18 +131,24 @@ def fit_pixels(
     """
     planes = fit_windows(inverse, seen, u, v)
     noises = noise_by_size(planes, noise, dtype)
-    windows, first = dict[int, _SizedWindows](), 0
+    windows, first = dict[int, _SquareWindows](), 0
     for size, found in planes.items():
         limit = _tolerances(found, noises[size], size, focal)
-        windows[size] = _SizedWindows(size, first, found, noises[size], limit)
+        windows[size] = _SquareWindows(size, first, found, noises[size], limit)
         first += found.mean.numel()
     choice = _Choice(inverse, seen, u, v)
     for size in CELL_SIZES:
         _offer_windows(choice, windows[size], windows.get(size // 2))
-    return _pixel_planes(choice, seen, windows.values(), noises[CELL_SIZES[0]].at(inverse))
+    limits = partial(
+        _tolerances, noise=noises[1], size=1, focal=focal, jitter=find_jitter(planes[_STEEP_SIZE])
+    )
+    narrow = _NarrowWindows(first, *_flat_narrow_windows(choice, limits))
+    _offer_narrow_windows(choice, narrow)
+    every: list[_SquareWindows | _NarrowWindows] = [*windows.values(), narrow]
+    return _pixel_planes(choice, seen, every, noises[CELL_SIZES[0]].at(inverse))
 
 
-class _SizedWindows(NamedTuple):
+class _SquareWindows(NamedTuple):
     """The windows of one size; they are numbered through all sizes, these from ``first`` on."""
 
     size: int
@@ -137,9 +157,54 @@ class _SizedWindows(NamedTuple):
     noise: WindowNoise
     limit: _Tolerances
 
+    @property
+    def sides(self) -> tuple[Tensor, Tensor]:
+        """Rows and columns of each window, each ``(h, w)``."""
+        side = torch.full_like(self.planes.mean, SIDE * self.size)
+        return side, side
+
+    @property
+    def middles(self) -> tuple[Tensor, Tensor]:
+        """Row and column of the middle pixel of each window, each ``(h, w)``."""
+        mean, size = self.planes.mean, self.size
+        row, column = (
+            torch.arange(length, device=mean.device, dtype=mean.dtype) * size + (size - 1) / 2
+            for length in mean.shape
+        )
+        return row[:, None].expand_as(mean), column.expand_as(mean)
+
+
+class _NarrowWindows(NamedTuple):
+    """Flat narrow windows ``(k,)``, and the pixels that they hold ``(k, 27)``, -1 for none.
+
+    ``shape`` is 0 or 1, the row of :data:`torchrg.depth.windows.NARROW`, and ``pixel`` the one in
+    the middle, by row-major place in an image of so many columns.
+    """
+
+    first: int
+    planes: WindowPlanes
+    limit: _Tolerances
+    shape: Tensor
+    pixel: Tensor
+    held: Tensor
+    width: int
+    size: int = 1
+
+    @property
+    def sides(self) -> tuple[Tensor, Tensor]:
+        """Rows and columns of each window, each ``(k,)``."""
+        sides = self.planes.mean.new_tensor(NARROW)[self.shape]
+        return sides[:, 0], sides[:, 1]
+
+    @property
+    def middles(self) -> tuple[Tensor, Tensor]:
+        """Row and column of the middle pixel of each window, each ``(k,)``."""
+        pixel = self.pixel.to(self.planes.mean.dtype)
+        return (pixel / self.width).floor(), pixel % self.width
+
 
 def _offer_windows(
-    choice: "_Choice", windows: _SizedWindows, quarters: _SizedWindows | None
+    choice: "_Choice", windows: _SquareWindows, quarters: _SquareWindows | None
 ) -> None:
     """Offer pixels the flat windows of a size; the smallest has no ``quarters``."""
     limit, deviation = windows.limit, windows.planes.deviation
@@ -154,7 +219,49 @@ def _offer_windows(
     choice.offer(windows, torch.where(least <= _FLAT, places, -1), reach, beside=True)
 
 
-def _flatness(windows: _SizedWindows, quarters: _SizedWindows | None) -> Tensor:
+def _flat_narrow_windows(
+    choice: "_Choice", limits: Callable[[WindowPlanes], _Tolerances]
+) -> tuple[WindowPlanes, _Tolerances, Tensor, Tensor, Tensor, int]:
+    """Return the flat ones among the narrow windows around pixels that have none, and of them."""
+    pixels, parts = choice.waiting, []
+    left = torch.zeros_like(choice.flat).index_fill(0, pixels, value=True)
+    for some in torch.split(pixels, _PIXELS_AT_ONCE):
+        planes, held = fit_narrow_windows(choice.values, left, choice.u, choice.v, some)
+        limit = limits(planes)
+        shape, place = (planes.deviation <= _FLAT * limit.flat).nonzero().unbind(dim=1)
+        at = shape * len(some) + place
+        held = held.flatten(0, 1)[at]
+        parts.append([*planes.take(at), *(part.flatten()[at] for part in limit), shape])
+        parts[-1] += [some[place], held]
+    *numbers, shape, pixel, held = (torch.cat(part) for part in zip(*parts, strict=True))
+    planes, limit = WindowPlanes(*numbers[:5]), _Tolerances(*numbers[5:])
+    return planes, limit, shape, pixel, held, choice.shape[1]
+
+
+def _offer_narrow_windows(choice: "_Choice", narrow: _NarrowWindows) -> None:
+    """Offer pixels the flatter narrow window around them, then the flattest that holds them."""
+    relative = narrow.planes.deviation / narrow.limit.flat
+    reach = torch.maximum(_OWN_REACH * narrow.limit.noise, narrow.limit.flat)
+    window = torch.arange(len(relative), device=relative.device)
+    choice.offer(narrow, _least_by_pixel(choice, narrow.pixel, window, relative), reach)
+    held, beside = narrow.held.flatten(), window.repeat_interleave(narrow.held.shape[1])
+    on_plane = (held >= 0) & choice.is_near(narrow.planes, held.clamp(min=0), beside, reach)
+    held, beside = held[on_plane], beside[on_plane]
+    places = _least_by_pixel(choice, held, beside, relative[beside])
+    choice.offer(narrow, places, reach, beside=True)
+
+
+def _least_by_pixel(choice: "_Choice", pixels: Tensor, windows: Tensor, cost: Tensor) -> Tensor:
+    """Return the window of the least cost for each pixel ``(H, W)``, of equal ones the first."""
+    none = len(windows)
+    least = cost.new_full((choice.window.numel(),), torch.inf)
+    least = least.scatter_reduce(0, pixels, cost, "amin")
+    ranked = torch.where(cost == least[pixels], windows, none)
+    first = torch.full_like(choice.window, none).scatter_reduce(0, pixels, ranked, "amin")
+    return torch.where(first < none, first, -1).view(choice.shape)
+
+
+def _flatness(windows: _SquareWindows, quarters: _SquareWindows | None) -> Tensor:
     """Return what windows deviate by in units of the tolerance; inf if their quarters do less."""
     limit, deviation = windows.limit, windows.planes.deviation
     relative = deviation / limit.flat
@@ -176,58 +283,73 @@ class _Choice:
 
     def __init__(self, inverse: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> None:
         self.shape = inverse.shape
-        self._values = inverse.flatten()
-        self._u, self._v = (place.expand_as(inverse).flatten() for place in (u, v))
+        self.values, self.u, self.v = inverse, u, v
         self.window = torch.arange(inverse.numel(), device=inverse.device)
         self.flat = torch.zeros_like(self.window, dtype=torch.bool)
         self.edge = torch.zeros_like(self.flat)
-        self._waiting = seen.flatten().nonzero().squeeze(1)
+        self.waiting = seen.flatten().nonzero().squeeze(1)
 
     def take(self, images: Sequence[Tensor]) -> Tensor:
         """Return the values of the pixels' windows ``(H, W)`` from those of each size."""
         return torch.cat([part.flatten() for part in images])[self.window].view(self.shape)
 
+    def is_near(
+        self, planes: WindowPlanes, pixels: Tensor, windows: Tensor, reach: Tensor
+    ) -> Tensor:
+        """Return whether pixels are within the reach of windows, both by place, of their planes."""
+        plane, width = planes.take(windows), self.shape[1]
+        u, v = self.u[pixels % width], self.v.flatten()[pixels // width]
+        value = plane.u_slope * u + plane.v_slope * v + plane.origin
+        return (self.values.flatten()[pixels] - value).abs() <= reach.flatten()[windows]
+
     def offer(
-        self, windows: _SizedWindows, places: Tensor, reach: Tensor, *, beside: bool = False
+        self,
+        windows: _SquareWindows | _NarrowWindows,
+        places: Tensor,
+        reach: Tensor,
+        *,
+        beside: bool = False,
     ) -> None:
         """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
 
         A pixel takes it if it is within reach ``(h, w)`` of the window's plane; ``beside`` tells
         that the windows are not around the cells.
         """
-        width, size, waiting = self.shape[1], windows.size, self._waiting
+        width, size, waiting = self.shape[1], windows.size, self.waiting
         cells = (waiting // width // size) * places.shape[1] + waiting % width // size
         chosen = places.flatten()[cells]
         has = (chosen >= 0).nonzero().squeeze(1)
         pixels, chosen = waiting[has], chosen[has]
-        plane = windows.planes.take(chosen)
-        value = plane.u_slope * self._u[pixels] + plane.v_slope * self._v[pixels] + plane.origin
-        near = (self._values[pixels] - value).abs() <= reach.flatten()[chosen]
+        near = self.is_near(windows.planes, pixels, chosen, reach)
         taken = pixels[near]
         self.window[taken] = chosen[near] + windows.first
         self.flat[taken] = True
         self.edge[taken] = beside
-        self._waiting = waiting[~self.flat[waiting]]
+        self.waiting = waiting[~self.flat[waiting]]
 
 
 def _pixel_planes(
-    choice: _Choice, seen: Tensor, windows: Iterable[_SizedWindows], noise: Tensor
+    choice: _Choice,
+    seen: Tensor,
+    windows: Sequence[_SquareWindows | _NarrowWindows],
+    noise: Tensor,
 ) -> PixelPlanes:
     """Return the planes of the windows that pixels chose."""
-    sizes = list(windows)
-    table = zip(*(part.planes for part in sizes), strict=True)
+    table = zip(*(part.planes for part in windows), strict=True)
     planes = WindowPlanes(*(choice.take(part) for part in table))
-    tolerance = choice.take([part.limit.flat for part in sizes])
-    side = choice.take([torch.full_like(w.planes.mean, SIDE * w.size) for w in sizes])
-    middles = zip(*(_middles(part) for part in sizes), strict=True)
+    tolerance = choice.take([part.limit.flat for part in windows])
+    sides, middles = (
+        torch.stack([choice.take(part) for part in zip(*pairs, strict=True)])
+        for pairs in ([part.sides for part in windows], [part.middles for part in windows])
+    )
     flat = choice.flat.view(choice.shape)
     is_smooth = flat & (planes.deviation > _FLAT * tolerance)
     tolerance = torch.where(is_smooth, planes.deviation, torch.maximum(tolerance, noise))
     return PixelPlanes(
         planes,
         choice.window.view(choice.shape),
-        side,
-        torch.stack([choice.take(part) for part in middles]),
+        sides,
+        middles,
         flat | (seen & planes.deviation.isfinite()),
         flat,
         choice.edge.view(choice.shape),
@@ -236,26 +358,22 @@ def _pixel_planes(
     )
 
 
-def _middles(windows: _SizedWindows) -> tuple[Tensor, Tensor]:
-    """Return row and column of the middle pixel of each window, each ``(h, w)``."""
-    mean, size = windows.planes.mean, windows.size
-    row, column = (
-        torch.arange(length, device=mean.device, dtype=mean.dtype) * size + (size - 1) / 2
-        for length in mean.shape
-    )
-    return row[:, None].expand_as(mean), column.expand_as(mean)
-
-
 def _tolerances(
-    planes: WindowPlanes, noise: WindowNoise, size: int, focal: tuple[float, float]
+    planes: WindowPlanes,
+    noise: WindowNoise,
+    size: int,
+    focal: tuple[float, float],
+    *,
+    jitter: float = 0.0,
 ) -> _Tolerances:
-    """Return what windows of a size may deviate by.
+    """Return what windows of a size may deviate by; jitter is that of the rays, in pixels.
 
     A bend is a share of half a window's side on the surface. On a plane at a distance d from the
     camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
     depth is one of ``d z e`` from the plane.
     """
-    (fx, fy), by_noise = focal, noise.at(planes.mean)
+    (fx, fy), slope = focal, torch.hypot(planes.u_slope, planes.v_slope)
+    by_noise = torch.hypot(noise.at(planes.mean), jitter * slope)
     sq_nearness = (
         (planes.u_slope * fx).square() + (planes.v_slope * fy).square() + planes.origin.square()
     )

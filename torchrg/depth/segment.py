@@ -141,13 +141,16 @@ def _curvature(
     """
     z, planes = 1 / torch.where(inverse > 0, inverse, 1.0), pixels.planes
     across = distance * z * torch.where(pixels.valid, planes.deviation, 0.0)
-    spread = (pixels.side * pixels.side - 1) / 12
+    rows, columns = pixels.sides
     ray = x * x + y * y + 1
     along = torch.zeros_like(z)
-    for slope, length, place in ((planes.u_slope, focal[0], x), (planes.v_slope, focal[1], y)):
-        step = slope * z
-        along += step * step * ray - 2 / length * step * place + 1 / length**2
-    along *= spread * z * z
+    for side, slope, length, place in (
+        (columns, planes.u_slope, focal[0], x),
+        (rows, planes.v_slope, focal[1], y),
+    ):
+        step, spread = slope * z, (side * side - 1) / 12
+        along += spread * (step * step * ray - 2 / length * step * place + 1 / length**2)
+    along *= z * z
     across *= across
     total = across + along
     return (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)

@@ -1,7 +1,8 @@
-"""Planes of square windows all over a depth image, and the noise they tell.
+"""Planes of square windows all over a depth image, of narrow ones here and there, and their noise.
 
 Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows stand a cell
-apart, so that the sums over all large ones together cost less than those over the smallest.
+apart, so that the sums over all large ones together cost less than those over the smallest. Narrow
+windows have 3 by 9 pixels; they are for the few pixels that no square serves.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,8 @@ REACH = 2
 """A window reaches over so many cells around its middle one."""
 SIDE = 2 * REACH + 1
 """Cells along a side of a window."""
+NARROW = ((3, 9), (9, 3))
+"""Rows and columns of narrow windows in pixels; each has about as many as the smallest square."""
 _LEAST_SHARE = 0.4
 """Least share of a window's pixels that must be seen for it to have a plane."""
 _LEAST_SPREAD = 0.2
@@ -31,6 +34,8 @@ _NUM_BINS = 12
 """Classes of depth that noise is fitted to."""
 _MOST_GROWTH = 1.4
 """Noise of windows grows at most by this from one size to the next."""
+_MOST_JITTER = 0.15
+"""Pixels by which rays may be off the middles of their pixels, standard deviation."""
 _ROUNDING = 8.0
 """Least noise of inverse depth, in units of the rounding of the depth."""
 _LEAST_ROUNDING = 1e-7
@@ -70,9 +75,33 @@ def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int,
     moments = [ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w]
     sums = zip(*map_tasks(_window_sums, moments, values.device), strict=True)
     return {
-        size: _fit_planes(some, SIDE * size)
+        size: _fit_planes(some, (SIDE * size, SIDE * size))
         for size, some in zip(sorted(CELL_SIZES), sums, strict=True)
     }
+
+
+def fit_narrow_windows(
+    values: Tensor, seen: Tensor, u: Tensor, v: Tensor, pixels: Tensor
+) -> tuple[WindowPlanes, Tensor]:
+    """Fit a plane to the window of either narrow shape around some pixels ``(n,)``.
+
+    The other arguments are those of :func:`fit_windows`. Returns planes of shape ``(2, n)``, and
+    the pixels that the windows hold ``(2, n, 27)``, by row-major place; -1 for those not seen.
+    """
+    (height, width), usable = values.shape, seen.flatten()
+    held = []
+    for rows, columns in NARROW:
+        step = torch.arange(rows * columns, device=pixels.device)
+        row = pixels[:, None] // width + step // columns - rows // 2
+        column = pixels[:, None] % width + step % columns - columns // 2
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        place = torch.where(inside, row * width + column, 0)
+        held.append(torch.where(inside & usable[place], place, -1))
+    places = torch.stack(held)
+    at, ones = places.clamp(min=0), (places >= 0).to(values.dtype)
+    mu, mv, w = u[at % width] * ones, v.flatten()[at // width] * ones, values.flatten()[at] * ones
+    products = [ones, mu, mv, w, mu * mu, mu * mv, mv * mv, w * mu, w * mv, w * w]
+    return _fit_planes([part.sum(dim=2) for part in products], NARROW[0]), places
 
 
 def _window_sums(image: Tensor) -> list[Tensor]:
@@ -104,16 +133,17 @@ def _sums_around(cells: Tensor) -> Tensor:
     return cells
 
 
-def _fit_planes(sums: Sequence[Tensor], side: int) -> WindowPlanes:
-    """Return the planes of windows with so many pixels along a side, from sums of moments."""
+def _fit_planes(sums: Sequence[Tensor], sides: tuple[int, int]) -> WindowPlanes:
+    """Return the planes of windows with so many pixels along their sides, from sums of moments."""
     count, *moments = sums
     share = 1 / count.clamp(min=1)
     mean_u, mean_v, mean_w, uu, uv, vv, uw, vw, ww = (part * share for part in moments)
     uu, uv, vv = uu - mean_u * mean_u, uv - mean_u * mean_v, vv - mean_v * mean_v
     uw, vw, ww = uw - mean_u * mean_w, vw - mean_v * mean_w, ww - mean_w * mean_w
     spread = uu * vv - uv * uv
-    full = (side * side - 1) / 12
-    found = (count >= _LEAST_SHARE * side**2) & (spread > _LEAST_SPREAD * full**2)
+    one, other = sides
+    full = (one * one - 1) * (other * other - 1) / 144
+    found = (count >= _LEAST_SHARE * one * other) & (spread > _LEAST_SPREAD * full)
     spread = torch.where(found, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
     variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
@@ -171,6 +201,23 @@ def noise_by_size(
         factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)
     return noises
+
+
+def find_jitter(windows: WindowPlanes) -> float:
+    """Return by how many pixels the rays of an image are off the middles of their pixels.
+
+    It is a standard deviation, from 0 for exact rays to 0.15. Jitter moves a value by as much of
+    what it changes from one pixel to the next, so that it shows in windows that are steep: no flat
+    window deviates by less. Windows are classed by their steepness, and of the steeper half of the
+    classes the one counts where flat windows deviate least.
+    """
+    # Windows stand a cell apart and overlap.
+    some = WindowPlanes(*(part[::REACH, ::REACH] for part in windows))
+    used = some.deviation.isfinite()
+    slope, order = torch.hypot(some.u_slope[used], some.v_slope[used]).sort()
+    ratio = some.deviation[used][order] / slope.clamp(min=torch.finfo(slope.dtype).tiny)
+    steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
+    return min([_MOST_JITTER, *(float(_low_quantile(part)) for part in steep if len(part))])
 
 
 def _low_quantile(values: Tensor) -> Tensor:

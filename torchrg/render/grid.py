@@ -15,6 +15,8 @@ _FEW = 12
 """Occupied voxels in a cube from which on they tell how dense a surface is."""
 _FEWEST = 5
 """Occupied voxels in a cube from which on they tell a plane: two more than always lie on one."""
+_COARSER = 2
+"""Levels above that of the cells where normals of sparse cells are looked for."""
 _FLAT = 0.1
 """Largest ratio of the two smallest eigenvalues of a cube that is flat."""
 _MOSTLY = 0.6
@@ -179,8 +181,10 @@ def local_spacing(grid: CloudGrid) -> Tensor:
 def surface_cells(grid: CloudGrid, *, max_cells: int = 60_000) -> Cells:
     """Fit a plane to the content of each cube of one level.
 
-    The level is the finest one of at most ``max_cells`` cubes whose voxels are mostly in cubes with
-    enough of them; in noisy clouds, one of the next two, where more cubes are flat.
+    A cube with too few voxels, as on a ceiling that is much sparser than the rest, has the normal
+    of the smallest cube around it with enough of them, if that is flat. The level is the finest one
+    of at most ``max_cells`` cubes whose voxels are mostly in cubes with enough of them; in noisy
+    clouds, one of the next two, where more cubes are flat.
     """
     start = next(
         number
@@ -201,6 +205,16 @@ def surface_cells(grid: CloudGrid, *, max_cells: int = 60_000) -> Cells:
     cell_of = grid.cell_of
     for level in grid.levels[:number]:
         cell_of = level.parents[cell_of]
+    row = torch.arange(len(normals), device=normals.device)
+    waiting = grid.levels[number].counts < _FEWEST
+    for child, level in zip(
+        grid.levels[number:], grid.levels[number + 1 : number + 1 + _COARSER], strict=False
+    ):
+        row = child.parents[row]
+        _, of_level, _ = _fit_cells(level, grid.voxel_size)
+        enough = waiting & (level.counts >= _FEWEST)[row]
+        normals = torch.where(enough[:, None], of_level[row], normals)
+        waiting &= ~enough
     return Cells(centers, normals, cell_of, grid.levels[number].size)
 
 
