@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrg._compile import kernel
 from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg import signs
 from torchrg.linalg.moments import (
@@ -12,7 +13,7 @@ from torchrg.linalg.moments import (
     split_columns,
     sq_lengths,
 )
-from torchrg.neighbors import gather_patches
+from torchrg.neighbors import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
 from torchrg.normals.consensus.noise import Survey
@@ -46,34 +47,50 @@ def smooth_planes(
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        near = neighbors.at(chosen)
-        columns = split_columns(gather_patches(points, near.indices))
-        x, y, z = (near.of(part) for part in parts)
-        a, b, c = (part.index_select(0, chosen)[:, None] for part in parts)
-        cosines = x * a + y * b + z * c
-        sign = signs(cosines)
-        offset = near.of(planes.offsets)
-        rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
-        sq_chords = 2 * (1 - cosines.abs())
-        sq_error = near.of(errors).square()
-        sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
-        reach = constants.SMOOTHING_REACH * noise[chosen][:, None]
-        weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
-        weights *= (1 - (rests / reach).square_()).clamp_(min=0)
-        weights *= _falling(columns, constants.FIT_FALLOFF)
-        if near.valid is not None:
-            weights *= near.valid
-        weights = _balanced(columns, weights) * sign
-        mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
-        length = (mean * mean).sum(dim=1).sqrt_()
-        found = length > 0
-        safe = torch.where(found, length, 1.0)
-        normals[chosen] = torch.where(found[:, None], mean / safe[:, None], normals[chosen])
-        moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
-        offsets[chosen] = torch.where(found, moved, offsets[chosen])
+        normals[chosen], offsets[chosen] = _smoothed(
+            points, *neighbors, parts, planes.offsets, noise, errors, chosen
+        )
 
     map_chunks(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
+
+
+@kernel("N 3", "N K", "N K", "3 N", "N", "N", "N", "n")
+def _smoothed(
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    parts: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    errors: Tensor,
+    rows: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the smoothed normals and offsets of some points; ``parts`` are the normals' columns."""
+    near = Neighbors(indices, valid).at(rows)
+    columns = gather_columns(points, near.indices)
+    x, y, z = (near.of(part) for part in parts.unbind())
+    a, b, c = (part.index_select(0, rows)[:, None] for part in parts.unbind())
+    cosines = x * a + y * b + z * c
+    sign = signs(cosines)
+    rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
+    sq_chords = 2 * (1 - cosines.abs())
+    sq_error = near.of(errors).square()
+    sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
+    reach = constants.SMOOTHING_REACH * noise[rows][:, None]
+    weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
+    weights *= (1 - (rests / reach).square_()).clamp_(min=0)
+    weights *= _falling(columns, constants.FIT_FALLOFF)
+    if near.valid is not None:
+        weights *= near.valid
+    weights = _balanced(columns, weights) * sign
+    mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
+    length = (mean * mean).sum(dim=1).sqrt_()
+    found = length > 0
+    safe = torch.where(found, length, 1.0)
+    normals = torch.where(found[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
+    moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
+    return normals, torch.where(found, moved, offsets[rows])
 
 
 def choose_planes(
