@@ -45,6 +45,9 @@ COMPILERS = 2
 _EXAMPLE_LENGTH = 11
 """Length of the first axis that a kernel is traced with; the others are longer, all different."""
 
+_LEAST_LENGTH = 3
+"""Length of an axis other than that of rows, below which kernels run as they are written."""
+
 _SETTINGS: dict[str, Any] = {"cpp.threads": 1, "assert_indirect_indexing": False}
 """Of torch's compiler: one thread inside, as ours are outside; and no check of every row number."""
 
@@ -74,16 +77,19 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Outputs:  # noqa: ANN401
         """Return what the function returns."""
-        if not _is_active.get():
+        if torch.compiler.is_compiling() or not _is_active.get():
             return self.function(*arguments)
         signature = tuple(map(_kind, arguments))
         needed = _needed.get(None)
-        if needed is not None:
-            needed[self, signature] = None
-            return self.function(*arguments)
         num_rows = self._num_rows(arguments)
-        if num_rows == 0:
-            return self.function(*arguments)
+        if needed is not None and num_rows:
+            needed[self, signature] = None
+        if needed is not None or num_rows == 0:
+            token = _is_active.set(False)  # kernels within kernels are a part of them
+            try:
+                return self.function(*arguments)
+            finally:
+                _is_active.reset(token)
         run = self._code.get(signature) or self._load(signature)
         tensors = [value.contiguous() for value in arguments if isinstance(value, Tensor)]
         if num_rows > 1:
@@ -102,12 +108,12 @@ class Kernel:
         for axes, value in zip(self.axes, arguments, strict=True):
             if not isinstance(value, Tensor):
                 continue
-            if value.device.type != "cpu":
+            if value.device.type != "cpu" or value.requires_grad or value.dim() != len(axes):
                 return 0
             for letter, length in zip(axes, value.shape, strict=True):
                 if letter == ROWS:
                     num_rows = length
-                elif length < 2 and not letter.isdigit():
+                elif length < _LEAST_LENGTH and not letter.isdigit():
                     return 0
         return num_rows
 
@@ -124,9 +130,7 @@ class Kernel:
 
     def _run_eagerly(self, signature: Signature, tensors: Sequence[Tensor]) -> Outputs:
         left = iter(tensors)
-        return self.function(
-            *(next(left) if isinstance(kind, str) else kind for kind in signature)
-        )
+        return self.function(*(next(left) if isinstance(kind, str) else kind for kind in signature))
 
     def path(self, signature: Signature) -> Path | None:
         """Return where the code for such arguments is kept; None without a folder."""
@@ -147,7 +151,8 @@ class Kernel:
                 shape = [lengths.get(letter) or int(letter) for letter in axes]
                 tensors.append(torch.zeros(shape, dtype=getattr(torch, kind)))
                 sizes.append({axes.index(letter): letter for letter in letters})
-        dims = {letter: torch.export.Dim(letter, min=2) for letter in lengths}
+        least = {letter: 2 if letter == ROWS else _LEAST_LENGTH for letter in lengths}
+        dims = {letter: torch.export.Dim(letter, min=least[letter]) for letter in lengths}
         shapes = tuple({axis: dims[letter] for axis, letter in own.items()} for own in sizes)
         run = partial(self._run_eagerly, signature)
 
@@ -166,7 +171,7 @@ def kernel(*axes: str) -> Callable[[Callable[..., Outputs]], Kernel]:
 
     Args:
         axes: For each argument the letters of its axes, equal letters for equal lengths, ``n`` for
-            rows, any other for a length of two and more; a number for an axis of that length.
+            rows, any other for a length of three and more; a number for an axis of that length.
 
     Example:
         >>> @kernel("n K", "n")
@@ -180,13 +185,13 @@ def kernel(*axes: str) -> Callable[[Callable[..., Outputs]], Kernel]:
 
 @contextlib.contextmanager
 def compiled(active: bool = True) -> Iterator[None]:
-    """Let kernels run compiled, or as they are written.
+    """Let kernels run compiled, or leave all as it is.
 
     Example:
         >>> with compiled(False):
         ...     pass
     """
-    token = _is_active.set(active)
+    token = _is_active.set(active or _is_active.get())
     try:
         yield
     finally:
@@ -229,7 +234,7 @@ def compile_kernels(
     """Compile those kernels that are not there yet; False, after a warning, if that fails."""
     paths = [one.path(signature) for one, signature in wanted]
     folder = cache_folder()
-    missing = [number for number, path in enumerate(paths) if path and not _is_whole(path)]
+    missing = [path for path in paths if path is not None and not _is_whole(path)]
     if folder is not None and not missing:
         return True
     if folder is None or not os.access(folder, os.W_OK):
@@ -239,9 +244,9 @@ def compile_kernels(
 
     with filelock.FileLock(folder / "lock"):
         jobs = [
-            (one.function.__module__, one.function.__name__, signature, str(paths[number]))
-            for number, (one, signature) in enumerate(wanted)
-            if number in missing and not _is_whole(paths[number])
+            (one.function.__module__, one.function.__name__, signature, str(path))
+            for path, (one, signature) in zip(paths, wanted, strict=True)
+            if path is not None and not _is_whole(path)
         ]
         if not jobs:
             return True
@@ -293,10 +298,11 @@ def _build(job: tuple[str, str, Sequence[Kind], str]) -> str:
     one = getattr(sys.modules.get(module) or importlib.import_module(module), name)
     try:
         program = one.export(tuple(signature))
-        files = torch._inductor.aot_compile(program.module(), *program.example_inputs, options=_SETTINGS)
+        model, inputs = program.module(), program.example_inputs[0]
+        made = torch._inductor.aot_compile(model, inputs, options=_SETTINGS)  # noqa: SLF001
     except Exception as error:  # noqa: BLE001
         return f"{name}: {type(error).__name__}: {str(error).strip().splitlines()[0]}"
-    code = Path(files).read_bytes()
+    code = Path(str(made)).read_bytes()
     part = Path(f"{target}.{os.getpid()}")
     part.write_bytes(code + hashlib.sha256(code).digest())
     part.replace(target)

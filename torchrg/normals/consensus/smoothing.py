@@ -66,7 +66,7 @@ def _smoothed(
     errors: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the smoothed normals and offsets of some points; ``parts`` are the normals' columns."""
+    """Return the smoothed planes of some points; ``parts`` are the columns of all normals."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
     x, y, z = (near.of(part) for part in parts.unbind())
@@ -160,7 +160,7 @@ def standard_errors(
     errors: Tensor = 2 * survey.noise / (radius * num_points**0.5)
 
     def work(rows: Tensor) -> None:
-        count, values = _inliers(points, neighbors, planes, survey.noise, rows)
+        count, values = _inliers(points, *neighbors, *planes, survey.noise, rows)
         width = (count * values[:, 1].clamp(min=0)).sqrt_()
         error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
         errors[rows] = torch.maximum(errors[rows], error)
@@ -183,7 +183,7 @@ def describe_inliers(
     curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
 
     def work(rows: Tensor) -> None:
-        _, values = _inliers(points, neighbors, planes, noise, rows)
+        _, values = _inliers(points, *neighbors, *planes, noise, rows)
         smallest, total = values[:, 0].clamp(min=0), values.clamp(min=0).sum(dim=1)
         bent = (smallest - noise[rows].square()).clamp_(min=0)
         curvature[rows] = bent / torch.where(total > 0, total, 1.0)
@@ -193,14 +193,21 @@ def describe_inliers(
     return curvature, residual_rms
 
 
+@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n")
 def _inliers(
-    points: Tensor, neighbors: Neighbors, planes: TangentPlanes, noise: Tensor, rows: Tensor
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    normals: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
-    columns = split_columns(gather_patches(points, neighbors.indices[rows]))
-    rests = residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
+    columns = gather_columns(points, indices[rows])
+    rests = residuals(columns, normals[rows], offsets[rows]).abs()
     near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]
-    weights = (near & neighbors.counted(rows)).to(points.dtype)
+    weights = (near & Neighbors(indices, valid).counted(rows)).to(points.dtype)
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 
