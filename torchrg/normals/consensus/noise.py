@@ -224,15 +224,15 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
     columns = split_columns(patches[:, :count])
-    return _of_few(*columns, counted[:, :count], count)[0]
+    return _of_few(*columns, counted[:, :count])[0]
 
 
-@kernel("n S", "n S", "n S", "n S", "")
-def _of_few(x: Tensor, y: Tensor, z: Tensor, counted: Tensor, count: int) -> tuple[Tensor]:
+@kernel("n S", "n S", "n S", "n S")
+def _of_few(x: Tensor, y: Tensor, z: Tensor, counted: Tensor) -> tuple[Tensor]:
     """Return deviations of the points that count from their plane; inf if the last one does not."""
     normals, offsets, values = fit_weighted_planes((x, y, z), counted)
     rests = residuals((x, y, z), normals, offsets)
-    spread = (rests * rests).sum(dim=1) / (count - 3)
+    spread = (rests * rests).sum(dim=1) / (x.shape[1] - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
     return (torch.where(broad, spread.sqrt_(), torch.inf),)
 

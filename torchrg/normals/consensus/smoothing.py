@@ -4,16 +4,16 @@ import torch
 from torch import Tensor
 
 from torchrg._compile import kernel
-from torchrg._parallel import map_chosen, map_chunks
+from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
 from torchrg.linalg import signs
 from torchrg.linalg.moments import (
     Columns,
+    along,
     fit_weighted_planes,
     residuals,
-    split_columns,
     sq_lengths,
 )
-from torchrg.neighbors import gather_columns, gather_patches
+from torchrg.neighbors import gather_columns
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
 from torchrg.normals.consensus.noise import Survey
@@ -111,32 +111,52 @@ def choose_planes(
     shape ``(n,)``. Returns the planes of all points.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
+    ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        indices = neighbors.indices[chosen]
-        columns = split_columns(gather_patches(points, indices))
-        weights = _falling(columns, constants.VOTE_FALLOFF)
-        if neighbors.valid is not None:
-            weights *= neighbors.valid[chosen]
-        total, scale = weights.sum(dim=1), noise[chosen]
-        best = torch.full_like(scale, -torch.inf)
-        for rank in range(0, indices.shape[1], constants.CHOICE_STEP):
-            other = indices[:, rank]
-            normal = planes.normals.index_select(0, other)
-            place = torch.stack([column[:, rank] for column in columns], dim=-1)
-            offset = planes.offsets.index_select(0, other) + (normal * place).sum(dim=1)
-            rests = residuals(columns, normal, offset) / (constants.VOTE_REACH * scale)[:, None]
-            own = offset / scale
-            score = support_scores(rests, weights) / total - constants.CHOICE_COST * own * own
-            usable = (own.abs() < constants.INLIER_REACH) & ((normal * normal).sum(dim=1) > 0)
-            better = usable & (score > best)
-            best = torch.where(better, score, best)
-            normals[chosen] = torch.where(better[:, None], normal, normals[chosen])
-            offsets[chosen] = torch.where(better, offset, offsets[chosen])
+        normals[chosen], offsets[chosen] = _chosen(
+            points, *neighbors, *planes, noise, chosen, ranks
+        )
 
-    map_chunks(work, len(rows), chunk_size, rows.device)
+    size = max(min(chunk_size, ROWS_IN_CACHE // len(ranks)), 1)
+    map_chunks(work, len(rows), size, rows.device)
     return TangentPlanes(normals, offsets)
+
+
+@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n", "R")
+def _chosen(
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    normals: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    rows: Tensor,
+    ranks: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the best planes for some points among those of their neighbours of some ranks."""
+    near = Neighbors(indices, valid).at(rows)
+    columns = gather_columns(points, near.indices)
+    weights = _falling(columns, constants.VOTE_FALLOFF)
+    if near.valid is not None:
+        weights *= near.valid
+    scale = noise[rows][:, None]
+    other = near.indices.index_select(1, ranks).long()
+    axes = normals[other]
+    places = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
+    moved = offsets[other] + (axes * places).sum(dim=-1)
+    rests = along((columns[0][:, None], columns[1][:, None], columns[2][:, None]), axes)
+    rests = (rests - moved[:, :, None]) / (constants.VOTE_REACH * scale)[:, :, None]
+    own = moved / scale
+    support = support_scores(rests, weights[:, None]) / weights.sum(dim=1)[:, None]
+    score = support - constants.CHOICE_COST * own * own
+    usable = (own.abs() < constants.INLIER_REACH) & ((axes * axes).sum(dim=-1) > 0)
+    best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
+    found = usable.gather(1, best)
+    normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
+    offset = torch.where(found, moved.gather(1, best), offsets[rows][:, None])
+    return torch.where(found, normal, normals[rows]), offset.squeeze(1)
 
 
 def standard_errors(
