@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
     {"errors", "version", "_display"},
-    {"_checks", "_opaque", "_optional", "_parallel", "structures"},
+    {"_checks", "_compile", "_opaque", "_optional", "_parallel", "structures"},
     {"linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

@@ -10,8 +10,8 @@ for a row whatever rows there are beside it.
 import contextlib
 import ctypes
 import hashlib
-import importlib
 import json
+import multiprocessing
 import os
 import platform
 import subprocess
@@ -257,8 +257,10 @@ def compile_kernels(
                 "TORCHINDUCTOR_COMPILE_THREADS": "1",
                 "OMP_NUM_THREADS": "1",
             }
-            done = subprocess.run(
-                [sys.executable, "-c", "from torchrg._compile import serve; serve()"],
+            modules = sorted({"torch._inductor.compile_fx", *(module for module, *_ in jobs)})
+            script = f"import {', '.join(modules)}; from torchrg import _compile; _compile.serve()"
+            done = subprocess.run(  # noqa: S603
+                [sys.executable, "-c", script],
                 input=json.dumps(jobs),
                 capture_output=True,
                 text=True,
@@ -277,25 +279,21 @@ def _give_up(reason: str) -> bool:
 
 def serve() -> None:
     """Compile the kernels that the standard input names, in several processes."""
-    import multiprocessing
-
-    import torch._inductor.compile_fx  # once, before the others begin
-
-    assert torch._inductor.compile_fx  # noqa: S101, SLF001
     jobs = json.load(sys.stdin)
-    for module, *_ in jobs:
-        importlib.import_module(module)
-    start = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-    with multiprocessing.get_context(start).Pool(min(COMPILERS, len(jobs))) as pool:
-        errors = [error for error in pool.imap_unordered(_build, jobs, chunksize=1) if error]
-    if errors:
-        sys.exit(errors[0])
+    if "fork" in multiprocessing.get_all_start_methods():
+        # What has been imported is there in each of them.
+        with multiprocessing.get_context("fork").Pool(min(COMPILERS, len(jobs))) as pool:
+            errors = pool.map(_build, jobs, chunksize=1)
+    else:
+        errors = list(map(_build, jobs))
+    if any(errors):
+        sys.exit(max(errors))
 
 
 def _build(job: tuple[str, str, Sequence[Kind], str]) -> str:
     """Compile a kernel to its file; return why that failed, or nothing."""
     module, name, signature, target = job
-    one = getattr(sys.modules.get(module) or importlib.import_module(module), name)
+    one: Kernel = getattr(sys.modules[module], name)
     try:
         program = one.export(tuple(signature))
         model, inputs = program.module(), program.example_inputs[0]
