@@ -239,7 +239,7 @@ def compile_kernels(
         return True
     if folder is None or not os.access(folder, os.W_OK):
         return _give_up("no folder for them can be written, set TORCHRG_CACHE_DIR to one")
-    announce(f"compiling {len(missing)} kernels, which the next run will find done")
+    announce(f"compiling kernels, {len(missing)} in all, which the next run will find done")
     import filelock  # torch needs it too
 
     with filelock.FileLock(folder / "lock"):

@@ -237,11 +237,7 @@ def segment_planes(
     if isinstance(points, Tensor | np.ndarray):
         points = as_tensor("segment_planes", "points", points).detach()
         check_points("segment_planes", points)
-<<<<<<< HEAD
     config = settings_of("segment_planes", PipelineConfig, config)
-    store = MemoryStore() if store is None else store
-=======
-    config = load_config() if config is None else config
     if compile is not None:
         config = dataclasses.replace(config, compile=compile)
     config = prepare_kernels(config, getattr(points, "dtype", torch.float32))
