@@ -13,6 +13,7 @@ from torchrg._compile import Kernel, compiled, kernel
 from torchrg.metrics import score_labels
 from torchrg.normals.consensus import constants, hypotheses, noise
 from torchrg.scenes import make_room
+from torchrg.tiles import TileStore
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 
@@ -156,7 +157,7 @@ def test_code_gives_the_same_bits_for_any_rows_and_is_made_anew_if_torn(folder):
 
 @needs_compiler
 @pytest.mark.slow
-def test_compiled_results_do_not_depend_on_order_chunks_or_threads():
+def test_compiled_results_do_not_depend_on_order_chunks_threads_or_tiles(tmp_path):
     """And they are those of the written code, to rounding; the code stays in the user's folder."""
     points = make_room(20_000, 0.003, seed=5).points
     config = dataclasses.replace(load_config("consensus"), compile=True)
@@ -172,6 +173,9 @@ def test_compiled_results_do_not_depend_on_order_chunks_or_threads():
         torch.set_num_threads(1)
     assert torch.equal(again.labels, expected.labels)
     assert torch.equal(again.normals, expected.normals)
+    in_tiles = segment_planes(points, config, store=TileStore(tmp_path, tile_size=6000))
+    assert torch.equal(torch.as_tensor(in_tiles.labels), expected.labels)
+    assert torch.equal(torch.as_tensor(in_tiles.normals), expected.normals)
     written = segment_planes(points, load_config("consensus"))
     assert score_labels(written.labels, expected.labels).ari > 0.9999
     script = "from torchrg import _compile; print('torch._dynamo' in __import__('sys').modules)"
