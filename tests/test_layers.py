@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
     {"errors", "version", "_display"},
-    {"_checks", "_optional", "_parallel", "structures"},
+    {"_checks", "_compile", "_optional", "_parallel", "structures"},
     {"_opaque", "linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import Context, ContextVar, copy_context
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -111,7 +111,9 @@ def map_tasks(
         if num_threads < 2:
             return [work(task) for task in tasks]
         with ThreadPoolExecutor(
-            num_threads, initializer=_begin_thread, initargs=(torch.is_grad_enabled(),)
+            num_threads,
+            initializer=_begin_thread,
+            initargs=(torch.is_grad_enabled(), copy_context()),
         ) as pool:
             return list(pool.map(work, tasks))
 
@@ -166,8 +168,11 @@ def allowed_threads() -> int:
     return _THREADS.get() or torch.get_num_threads()
 
 
-def _begin_thread(grad_enabled: bool) -> None:
-    """Let a thread work alone on each operation, with the setting of the one that started it."""
+def _begin_thread(grad_enabled: bool, context: Context) -> None:
+    """Let a thread work alone on each operation, with the settings of the one that started it."""
+    for variable, value in context.items():
+        variable.set(value)
+    _THREADS.set(1)
     # Torch gives a thread its number of threads when the thread first asks for it.
     torch.get_num_threads()
     _set_own_threads([1] * (1 + len(_openmp_libraries())))

@@ -8,6 +8,7 @@ the cloud; in a folder it is a tile.
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, of_clouds
+from torchrg._compile import compiled, prepare
 from torchrg._parallel import sequential_operations
 from torchrg.config import (
     GrowingConfig,
@@ -159,6 +161,9 @@ class MemoryStore:
         return grow_along(self.get("edges"), order, lists, config)
 
 
+REHEARSED_POINTS, REHEARSED_NOISE = 4000, 0.003
+"""Points of a room, and metres, that all kernels are needed for."""
+
 Store = MemoryStore | TileStore
 """Where the arrays of a run are."""
 
@@ -172,6 +177,7 @@ def segment_planes(
     voxel: float | None = None,
     store: Store | None = None,
     on_stage: Callable[[str], None] | None = None,
+    compile: bool | None = None,  # noqa: A002 - torch's word
 ) -> Segmentation:
     """Segment a cloud into planes: neighbours, normals, regions, plane table.
 
@@ -198,6 +204,8 @@ def segment_planes(
             found on the voxels. Default: all points are segmented.
         store: Where arrays are kept: a new :class:`MemoryStore` by default.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
+        compile: Whether to run kernels compiled; see :func:`prepare_kernels`. Default: what
+            ``config`` says.
 
     Returns:
         Labels, normals, curvature and masks in the order of the points, and the table of planes. A
@@ -231,7 +239,54 @@ def segment_planes(
         check_points("segment_planes", points)
     if not isinstance(config, PipelineConfig):
         config = settings_of("segment_planes", PipelineConfig, config)
-    store = MemoryStore() if store is None else store
+    if compile is not None:
+        config = dataclasses.replace(config, compile=compile)
+    config = prepare_kernels(config, getattr(points, "dtype", torch.float32))
+    with compiled() if config.compile else nullcontext():
+        return _segment(points, config, voxel, MemoryStore() if store is None else store, on_stage)
+
+
+def prepare_kernels(
+    config: PipelineConfig,
+    dtype: torch.dtype = torch.float32,
+    announce: Callable[[str], None] = lambda text: None,
+) -> PipelineConfig:
+    """Compile the kernels that clouds of a dtype need, if the settings ask for it.
+
+    That takes a minute or two, and 2 GB of memory, the first time on a machine. They are kept in
+    the folder ``$TORCHRG_CACHE_DIR``, by default ``~/.cache/torchrg``, which machines of one kind
+    may share. Results differ from those without them by rounding, and are the same for any order of
+    the points, chunk size, number of threads and size of tiles.
+
+    Args:
+        config: Settings.
+        dtype: That of the points.
+        announce: Called with a line of text where there is something to compile.
+
+    Returns:
+        The settings, with ``compile`` False after a warning if there is no compiler.
+    """
+    if not config.compile:
+        return config
+    settings = dataclasses.replace(config, compile=False, chunk_size=PipelineConfig.chunk_size)
+
+    def rehearse() -> None:
+        from torchrg.scenes import make_room
+
+        segment_planes(make_room(REHEARSED_POINTS, REHEARSED_NOISE).points.to(dtype), settings)
+
+    is_ready = prepare(repr((settings, dtype)), rehearse, announce)
+    return config if is_ready else dataclasses.replace(config, compile=False)
+
+
+def _segment(
+    points: Tensor | Iterable[Cloud],
+    config: PipelineConfig,
+    voxel: float | None,
+    store: Store,
+    on_stage: Callable[[str], None] | None,
+) -> Segmentation:
+    """Do what :func:`segment_planes` says: the steps, in their order."""
     begin = on_stage or (lambda stage: None)
     store.begin(config={**dataclasses.asdict(config), "chunk_size": None}, voxel=voxel)
 

@@ -142,7 +142,8 @@ class Neighbors(NamedTuple):
         if self.valid is not None:
             return self.valid[rows]
         own = self.indices[rows, :1]
-        return torch.ones(len(own), self.indices.shape[1], dtype=torch.bool, device=own.device)
+        shape = own.shape[0], self.indices.shape[1]
+        return torch.ones(shape, dtype=torch.bool, device=own.device)
 
 
 class NormalFit(NamedTuple):

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._compile import compiled
 from torchrg._parallel import sequential_operations
 from torchrg.config import GrowingConfig, NormalsConfig, PipelineConfig
 from torchrg.io.files import check_space
@@ -74,7 +75,7 @@ class TileTask:
             What has been written, to be noted with the task.
         """
         store = TileStore(self.folder)
-        with sequential_operations(), torch.no_grad():
+        with sequential_operations(), torch.no_grad(), compiled(self.config.compile):
             self.work(store, slice(*self.rows), self.number, self.config)
         return store.written
 

@@ -38,11 +38,15 @@ class Case(Benchmark):
     """Presets, and kinds of depth frames."""
     sizes: tuple[int, ...] = (200_000,)
     """Points of the room."""
+    compile: bool = False
+    """Whether presets run compiled."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         keys = [(name, size) for name in self.work for size in (self.sizes, (0,))[name in FRAMES]]
         return {
-            f"{name}, {size:,} points" if size else name: partial(Workers, name, size, self.threads)
+            f"{name}, {size:,} points" if size else name: partial(
+                Workers, name, size, self.threads, self.compile
+            )
             for name, size in keys
         }
 
@@ -75,16 +79,17 @@ CONDITIONS = ("twice", "beside one", "beside two", "one thread")
 class Workers(contextlib.ExitStack):
     """Processes that do the same work, each started when it is first asked for."""
 
-    def __init__(self, name: str, size: int, threads: int) -> None:
+    def __init__(self, name: str, size: int, threads: int, compiled: bool) -> None:
         super().__init__()
-        self.name, self.size, self.threads = name, size, threads
+        self.name, self.size, self.threads, self.compiled = name, size, threads, compiled
         self._found: dict[tuple[int, int], Worker] = {}
 
     def get(self, number: int = 0, threads: int | None = None) -> Worker:
         """Return one of several with so many threads."""
         key = (number, threads or self.threads)
         if key not in self._found:
-            worker = Worker("benchmarks.steady:prepare", self.name, self.size, threads=key[1])
+            work = "benchmarks.steady:prepare", self.name, self.size, self.compiled
+            worker = Worker(*work, threads=key[1])
             self._found[key] = self.enter_context(worker)
         return self._found[key]
 
@@ -114,7 +119,7 @@ def _busy(number: int) -> Iterator[None]:
             other.wait()
 
 
-def prepare(name: str, size: int) -> Callable[[], None]:
+def prepare(name: str, size: int, compiled: bool) -> Callable[[], None]:
     """Return the work of a process, done once already on little."""
     if name in FRAMES:
         height, sensor = FRAMES[name]
@@ -125,5 +130,5 @@ def prepare(name: str, size: int) -> Callable[[], None]:
         return lambda: torchrg.depth.segment_depth(depth, camera.intrinsics) and None
     config = torchrg.load_config(name)
     points: torch.Tensor = torchrg.scenes.make_room(size, noise=NOISE, seed=SEED).points
-    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config)
-    return lambda: torchrg.segment_planes(points, config) and None
+    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config, compile=compiled)
+    return lambda: torchrg.segment_planes(points, config, compile=compiled) and None

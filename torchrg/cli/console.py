@@ -29,6 +29,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
 from torchrg.io.fields import COLUMNS_RULE, notes_on_results
 from torchrg.io.files import check_place, make_folder
+from torchrg.pipeline import prepare_kernels
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
 
@@ -268,6 +269,13 @@ def without(target: Path, fields: Collection[str]) -> str:
 def _is_archive(target: Path) -> bool:
     """Whether a result goes to the format that holds it alone, without fields of the cloud."""
     return target.suffix.lower() == ".npz"
+
+
+def prepared(settings: PlaneSettings) -> PlaneSettings:
+    """Compile the kernels that the settings need if they ask for it; a line says so."""
+    with warnings_as_lines():
+        found = prepare_kernels(settings.resolved, announce=lambda text: print(text, flush=True))
+    return dataclasses.replace(settings, resolved=found)
 
 
 def use_threads(threads: int | None) -> None:

@@ -246,6 +246,9 @@ def run(argv: list[str]) -> int:
         start = dataclasses.replace(start, settings=settings)
     arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
+    if isinstance(arguments, CloudArguments) and not arguments.dry_run:
+        settings = console.prepared(arguments.settings)
+        arguments = dataclasses.replace(arguments, settings=settings)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with console.warnings_as_lines():
         jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from torchrg._compile import compiled
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
@@ -50,6 +51,9 @@ class Arguments:
     chunk_size: int = PipelineConfig.chunk_size
     """Number of points that are handled at a time. It bounds the memory and never changes a
     result."""
+    compile: bool = False
+    """Whether a C++ compiler makes kernels, once for all runs on this machine. They are faster, and
+    equal to rounding."""
     threads: int | None = None
     """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None
@@ -68,6 +72,9 @@ def run(argv: list[str]) -> int:
     console.ColumnNames.parse(arguments.columns, arguments.inputs)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     console.check_apart(outputs, arguments.inputs)
+    wanted = PipelineConfig(arguments.normals, compile=arguments.compile)
+    settings = console.prepared(console.PlaneSettings(resolved=wanted))
+    arguments = replace(arguments, compile=settings.resolved.compile)
     return run_each(
         _estimate_file, arguments, list(map(str, arguments.inputs)), arguments.inputs, outputs
     )
@@ -84,7 +91,8 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     settings, size = arguments.normals, arguments.chunk_size
     with console.stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")
-        fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
+        with compiled(arguments.compile):
+            fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
         advance("orientation")
         if (way := arguments.orient) != "none":
             place = arguments.viewpoint
@@ -93,6 +101,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
             fit = fit._replace(normals=turned)
     provenance = describe_run(source, settings)
     provenance |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
+    provenance |= {"compile": arguments.compile}
     if arguments.columns is not None:
         provenance["columns"] = arguments.columns
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp

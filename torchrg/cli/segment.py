@@ -147,6 +147,7 @@ def run(argv: list[str]) -> int:
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
+    arguments = dataclasses.replace(arguments, settings=console.prepared(arguments.settings))
     code = run_each(
         _segment, arguments, [_name_of(cloud) for cloud in clouds], clouds, outputs, pictures
     )

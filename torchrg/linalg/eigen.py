@@ -149,9 +149,22 @@ def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
             _rotate(a, v, p, q, r)
     values = torch.stack([a[i][i] for i in range(3)], dim=-1)
     vectors = torch.stack([torch.stack(row, dim=-1) for row in v], dim=-2)
-    values, order = torch.sort(values, dim=-1)
+    values, order = _sort3(values) if torch.compiler.is_compiling() else values.sort(dim=-1)
     vectors = vectors.gather(-1, order[..., None, :].expand_as(vectors))
     return values * safe.squeeze(-1), vectors
+
+
+def _sort3(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Sort values ``(*, 3)`` by comparisons and say whence they are, as ``sort`` does."""
+    a, b, c = values.unbind(dim=-1)
+    i, j, k = (torch.full_like(a, place, dtype=torch.int64) for place in range(3))
+    swap = a > b
+    a, b, i, j = (torch.where(swap, *pair) for pair in ((b, a), (a, b), (j, i), (i, j)))
+    swap = b > c
+    b, c, j, k = (torch.where(swap, *pair) for pair in ((c, b), (b, c), (k, j), (j, k)))
+    swap = a > b
+    a, b, i, j = (torch.where(swap, *pair) for pair in ((b, a), (a, b), (j, i), (i, j)))
+    return torch.stack([a, b, c], dim=-1), torch.stack([i, j, k], dim=-1)
 
 
 def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -202,8 +215,10 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     coefficients = torch.stack([values.reshape(-1) for values in (trace, minors, determinant)])
     root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
     # Convergence is quadratic but near a double root: few need the other steps.
-    rows = (step.abs() > _CONVERGED * coefficients[0]).nonzero().squeeze(1)
-    if len(rows):
+    moving = step.abs() > _CONVERGED * coefficients[0]
+    if torch.compiler.is_compiling():
+        root = torch.where(moving, _newton(root, coefficients, _MORE_STEPS)[0], root)
+    elif len(rows := moving.nonzero().squeeze(1)):
         root[rows] = _newton(root[rows], coefficients[:, rows], _MORE_STEPS)[0]
     return torch.where(root.isfinite(), root, 0.0).view_as(trace)
 
@@ -242,20 +257,35 @@ def _kernel(
     length = (u * u + v * v + w * w).sqrt()
     u, v, w = u / length, v / length, w / length
     rank_one = best < _NEARLY_EQUAL
-    if bool(rank_one.any()):
-        rows = torch.stack([*diagonal, *beside], dim=-1)[rank_one][:, [0, 5, 4, 5, 1, 3, 4, 3, 2]]
-        u[rank_one], v[rank_one], w[rank_one] = _across(rows.reshape(-1, 3, 3)).unbind(dim=-1)
+    if torch.compiler.is_compiling():
+        across = _across((x, xy, xz), (xy, y, yz), (xz, yz, z))
+        u, v, w = (torch.where(rank_one, a, b) for a, b in zip(across, (u, v, w), strict=True))
+    elif bool(rank_one.any()):
+        x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *beside))
+        u[rank_one], v[rank_one], w[rank_one] = _across((x, xy, xz), (xy, y, yz), (xz, yz, z))
     return u, v, w
 
 
-def _across(matrices: Tensor) -> Tensor:
-    """Return a unit vector across the direction of rank-one matrices ``(n, 3, 3)``."""
-    largest = matrices.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
-    along = matrices[torch.arange(len(matrices), device=matrices.device), largest]
-    axis = torch.nn.functional.one_hot(along.abs().argmin(dim=-1), 3).to(along.dtype)
-    across = torch.linalg.cross(along, axis)
-    length = (across * across).sum(dim=-1, keepdim=True).sqrt()
-    return torch.where(length > 0, across / length, axis)
+def _across(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return unit vectors across the direction of matrices of rank one, given by their rows."""
+    first, second, third = rows
+    # The row of the largest diagonal entry, and the axis that it is least along.
+    use = second[1] > first[0]
+    a, b, c = (torch.where(use, q, p) for p, q in zip(first, second, strict=True))
+    use = third[2] > torch.maximum(first[0], second[1])
+    a, b, c = (torch.where(use, q, p) for p, q in zip((a, b, c), third, strict=True))
+    sizes = a.abs(), b.abs(), c.abs()
+    y = sizes[1] < sizes[0]
+    z = sizes[2] < torch.minimum(sizes[0], sizes[1])
+    i, j, k = (~y & ~z).to(a.dtype), (y & ~z).to(a.dtype), z.to(a.dtype)
+    u, v, w = b * k - c * j, c * i - a * k, a * j - b * i
+    length = (u * u + v * v + w * w).sqrt()
+    some = length > 0
+    return (
+        torch.where(some, u / length, i),
+        torch.where(some, v / length, j),
+        torch.where(some, w / length, k),
+    )
 
 
 def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int) -> None:

@@ -42,9 +42,15 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
     """
     check_shapes("covariance", patches=(patches, "* K P"), mask=(mask, "* K"))
     check_floating("covariance", patches=patches)
-    columns = patches.unbind(dim=-1)
+    return covariance_of_columns(patches.unbind(dim=-1), mask)
+
+
+def covariance_of_columns(
+    columns: Sequence[Tensor], mask: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Do as :func:`covariance`, for points given by the columns ``(*, K)`` of their coordinates."""
     first = [column[..., :1] for column in columns]
-    count: Tensor | int = patches.shape[-2]
+    count: Tensor | int = columns[0].shape[-1]
     if mask is not None:
         # Any counted point serves as the local origin: the one with the largest mask value.
         anchor = mask.to(torch.uint8).argmax(dim=-1, keepdim=True)
@@ -57,7 +63,7 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 
     shifted = moved(columns, first)
     means = [column.sum(dim=-1, keepdim=True) / count for column in shifted]
-    total = count if isinstance(count, int) else count.squeeze(-1)
+    total = count.squeeze(-1) if isinstance(count, Tensor) else count
     matrix = second_moments(moved(shifted, means), total=total)
     center = torch.cat([start + mean for start, mean in zip(first, means, strict=True)], dim=-1)
     if mask is not None:

@@ -1,6 +1,6 @@
 """Neighbourhoods: exact search, canonical order, patches, voxels."""
 
-from torchrg.neighbors.knn import gather_patches, search_knn, search_nearest
+from torchrg.neighbors.knn import gather_columns, gather_patches, search_knn, search_nearest
 from torchrg.neighbors.order import canonical_order, finite_rows, restore_rows
 from torchrg.neighbors.voxels import Voxels, restore_points, sample_voxels
 
@@ -8,6 +8,7 @@ __all__ = [
     "Voxels",
     "canonical_order",
     "finite_rows",
+    "gather_columns",
     "gather_patches",
     "restore_points",
     "restore_rows",

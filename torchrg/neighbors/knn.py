@@ -279,3 +279,16 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
         column = points[:, axis].index_select(0, flat).view(indices.shape)
         torch.sub(column, column[:, :1], out=patches[axis])
     return patches.movedim(0, -1)
+
+
+def gather_columns(points: Tensor, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the columns of :func:`gather_patches`, each ``(n, K)`` and contiguous.
+
+    Example:
+        >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
+        >>> gather_columns(points, torch.tensor([[0, 1]]))[0].tolist()
+        [[0.0, 2.0]]
+    """
+    flat = indices.reshape(-1)
+    x, y, z = (points[:, axis].index_select(0, flat).view(indices.shape) for axis in range(3))
+    return x - x[:, :1], y - y[:, :1], z - z[:, :1]

@@ -4,8 +4,10 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes, has_values
+from torchrg._compile import kernel
 from torchrg.linalg import coordinate_resolution, covariance, eigh3, rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
+from torchrg.linalg.moments import covariance_of_columns
 from torchrg.structures import NormalFit
 
 _NARROW = 0.03
@@ -59,12 +61,11 @@ def fit_plane(
     patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> tuple[NormalFit, PrincipalFrame]:
     """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
-    _, matrix = covariance(patches, mask)
-    frame = principal_frame(matrix)
+    *parts, total = _frames(*patches.unbind(dim=-1), mask)
+    frame = PrincipalFrame(*parts)
     with torch.no_grad():
         valid = _spans_plane(patches, mask, frame.values, resolution)
     normals, smallest = frame.normals, frame.smallest
-    total = matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
     curvature = (smallest / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
     fit = NormalFit(
         torch.where(valid[..., None], normals, 0.0),
@@ -73,6 +74,13 @@ def fit_plane(
         residual_rms=torch.where(valid, root(smallest), 0.0),
     )
     return fit, frame
+
+
+@kernel("n K", "n K", "n K", "n K")
+def _frames(x: Tensor, y: Tensor, z: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
+    """Return the principal frame of patches, by columns, and the trace of their covariance."""
+    _, matrix = covariance_of_columns((x, y, z), mask)
+    return *principal_frame(matrix), matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
 
 
 def check_patches(

@@ -222,9 +222,10 @@ def _are_smooth(
 ) -> Tensor:
     """Tell at which points the surface bends no more than is usual in their region."""
     shares = torch.zeros_like(part.curvature, dtype=torch.float64)
+    rows, limit = torch.arange(len(shares), device=shares.device), deg_to_sq_chord(max_angle_deg)
     for some in chunks_of(len(shares), chunk_size):
-        counted = part.neighbors.counted(some)
-        alike = within_angle(part, some, max_angle_deg, signed=False) & counted
+        near, counted = part.neighbors.at(some), part.neighbors.counted(some)
+        alike = within_angle(near, rows[some], part.normals.T, limit, signed=False) & counted
         shares[some] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
@@ -242,8 +243,8 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
     counted &= near.counted()
     own = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
     return cloud._replace(
-        points=cloud.points[rows],
-        normals=cloud.normals[rows],
+        points=cloud.points.T[:, rows].T,
+        normals=cloud.normals.T[:, rows].T,
         curvature=cloud.curvature[rows],
         neighbors=Neighbors(torch.where(counted, places, own), counted),
         valid=cloud.valid[rows],

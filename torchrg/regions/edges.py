@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._compile import kernel
 from torchrg._parallel import allowed_threads, chunks_of, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, sq_chords
@@ -183,15 +184,22 @@ def accept_edges(
     the two are connected, only known where it joins, None without ``connect``, which tells it of
     the edges that it is asked for.
     """
-    joins = are_valid(cloud, rows)
+    own = rows
+    if isinstance(own, slice):
+        own = torch.arange(own.start, own.stop, device=cloud.points.device)
+    near, signed = cloud.neighbors.at(rows), cloud.signed_normals
     max_angle_deg = cloud.angle_share * config.max_angle_deg
-    joins &= within_angle(cloud, rows, max_angle_deg, signed=cloud.signed_normals)
-    if config.max_distance is not None:
-        joins &= within_distance(cloud, rows, cloud.points, config.max_distance)
+    limits: list[Tensor | None] = [
+        cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg)),
+        None if config.max_distance is None else cloud.points.new_tensor(config.max_distance**2),
+    ]
+    if max_angle_deg >= 90 and not signed:
+        limits[0] = None
+    columns = cloud.points.T, cloud.normals.T
+    (joins,) = _pass(*near, own, *columns, cloud.valid, cloud.reach, *limits, signed)
     if cloud.colors is not None:
-        joins &= within_distance(cloud, rows, cloud.colors, cloud.max_color_distance)
-    if cloud.reach is not None:
-        joins &= on_planes(cloud, rows, cloud.reach)
+        limit = cloud.points.new_tensor(cloud.max_color_distance**2)
+        joins &= within_distance(near, own, cloud.colors.T, limit)
     connected: Tensor | None = None
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
@@ -204,6 +212,31 @@ def accept_edges(
         if config.connectivity_scope == "region":
             joins &= connected
     return joins, connected
+
+
+@kernel("n K", "n K", "n", "3 N", "3 N", "N", "N", "", "", "")
+def _pass(
+    indices: Tensor,
+    mask: Tensor | None,
+    rows: Tensor,
+    points: Tensor,
+    normals: Tensor,
+    valid: Tensor,
+    reach: Tensor | None,
+    max_sq_chord: Tensor | None,
+    max_sq_distance: Tensor | None,
+    signed: bool,
+) -> tuple[Tensor]:
+    """Tell which neighbours of some points pass the criteria of places and normals."""
+    near = Neighbors(indices, mask)
+    joins = are_valid(near, rows, valid)
+    if max_sq_chord is not None:
+        joins &= within_angle(near, rows, normals, max_sq_chord, signed=signed)
+    if max_sq_distance is not None:
+        joins &= within_distance(near, rows, points, max_sq_distance)
+    if reach is not None:
+        joins &= on_planes(near, rows, points, normals, reach)
+    return (joins,)
 
 
 def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], Tensor] | None:
@@ -265,45 +298,44 @@ def _pack(
     return EdgeLists(np.concatenate([[0], *counts]).cumsum(dtype=dtype), targets[:used]), rest
 
 
-def are_valid(cloud: GrowingCloud, rows: Rows) -> Tensor:
+def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
     """Tell which edges lead from one valid point to another one that is its neighbour."""
-    neighbors, own = cloud.neighbors, rows
-    if isinstance(own, slice):
-        own = torch.arange(own.start, own.stop, device=cloud.points.device)
-    passed = neighbors.of(cloud.valid, rows) & cloud.valid[rows, None]
-    passed &= neighbors.indices[rows] != own[:, None]
-    return passed if neighbors.valid is None else passed & neighbors.valid[rows]
+    passed = near.of(valid) & valid[rows][:, None]
+    passed &= near.indices != rows[:, None]
+    return passed if near.valid is None else passed & near.valid
 
 
-def within_angle(cloud: GrowingCloud, rows: Rows, max_angle_deg: float, *, signed: bool) -> Tensor:
-    """Tell which neighbours' normals are within an angle of the point's, eq. (8)."""
-    if max_angle_deg >= 90 and not signed:
-        return torch.ones_like(cloud.neighbors.indices[rows], dtype=torch.bool)
-    columns = cloud.normals.unbind(dim=1)
-    own = [column[rows, None] for column in columns]
-    theirs = [cloud.neighbors.of(column, rows) for column in columns]
-    return sq_chords(own, theirs, signed=signed) <= deg_to_sq_chord(max_angle_deg)
+def within_angle(
+    near: Neighbors, rows: Tensor, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
+) -> Tensor:
+    """Tell which neighbours' normals ``(3, N)`` are within an angle of the point's, eq. (8)."""
+    own = [column[rows][:, None] for column in normals.unbind()]
+    theirs = [near.of(column) for column in normals.unbind()]
+    return sq_chords(own, theirs, signed=signed) <= max_sq_chord
 
 
-def within_distance(cloud: GrowingCloud, rows: Rows, values: Tensor, limit: float) -> Tensor:
-    """Tell which neighbours' values ``(N, C)``, places or colours, are within a distance."""
+def within_distance(
+    near: Neighbors, rows: Tensor, values: Tensor, max_sq_distance: Tensor
+) -> Tensor:
+    """Tell which neighbours' values ``(C, N)``, places or colours, are within a distance."""
     total = values.new_zeros(())
-    for column in values.unbind(dim=1):
-        difference = cloud.neighbors.of(column, rows) - column[rows, None]
+    for column in values.unbind():
+        difference = near.of(column) - column[rows][:, None]
         total = difference.mul_(difference).add_(total)
-    return total <= limit**2
+    return total <= max_sq_distance
 
 
-def on_planes(cloud: GrowingCloud, rows: Rows, reach: Tensor) -> Tensor:
+def on_planes(
+    near: Neighbors, rows: Tensor, points: Tensor, normals: Tensor, reach: Tensor
+) -> Tensor:
     """Tell which neighbours are within reach ``(N,)`` of the point's plane, and it of theirs."""
-    own = theirs = cloud.points.new_zeros(())
-    columns = zip(cloud.points.unbind(dim=1), cloud.normals.unbind(dim=1), strict=True)
-    for place, normal in columns:
-        away = cloud.neighbors.of(place, rows) - place[rows, None]
-        own = (away * normal[rows, None]).add_(own)
-        theirs = away.mul_(cloud.neighbors.of(normal, rows)).add_(theirs)
-    on_own = own.abs_() <= reach[rows, None]
-    return on_own & (theirs.abs_() <= cloud.neighbors.of(reach, rows))
+    own = theirs = points.new_zeros(())
+    for place, normal in zip(points.unbind(), normals.unbind(), strict=True):
+        away = near.of(place) - place[rows][:, None]
+        own = (away * normal[rows][:, None]).add_(own)
+        theirs = away.mul_(near.of(normal)).add_(theirs)
+    on_own = own.abs_() <= reach[rows][:, None]
+    return on_own & (theirs.abs_() <= near.of(reach))
 
 
 def are_coplanar(

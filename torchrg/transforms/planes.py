@@ -134,6 +134,7 @@ class SegmentPlanes(CloudTransform):
 
     Args:
         config: Settings, or the name of a preset.
+        compile: Whether to run kernels compiled; see :func:`torchrg.segment_planes`.
         keys: Other names for the keys.
 
     Example:
@@ -146,10 +147,13 @@ class SegmentPlanes(CloudTransform):
         self,
         config: PipelineConfig | str = DEFAULT_PRESET,
         *,
+        compile: bool | None = None,  # noqa: A002 - torch's word
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keys=keys)
-        self.config = settings_of("SegmentPlanes", PipelineConfig, config)
+        config = settings_of("SegmentPlanes", PipelineConfig, config)
+        is_compiled = config.compile if compile is None else compile
+        self.config = dataclasses.replace(config, compile=is_compiled)
 
     def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return plane labels, normals and curvature of a cloud."""

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg._compile import kernel
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.linalg import above, at_most
 from torchrg.linalg.moments import (
@@ -63,26 +64,18 @@ def vote_planes(
     nearness = sq_distances / torch.where(farthest > 0, farthest, 1.0)
     weights = (1 - constants.VOTE_FALLOFF * nearness) * counted
     reach = constants.VOTE_REACH * noise
-    best, normals = _score(columns, weights, start, reach), start
     pairs = _pairs(sq_distances.shape[1], constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
-    candidates, spanned = _planes_through(columns, pairs)
-    # Few points are scored for several candidates in one step.
-    for some in chunks_of(len(candidates), max(1, ROWS_IN_CACHE // max(len(noise), 1))):
-        scores = _score(columns, weights, candidates[some], reach)
-        scores = torch.where(spanned[some], scores, -torch.inf)
-        for candidate, score in zip(candidates[some], scores, strict=True):
-            better = score > best
-            best = torch.where(better, score, best)
-            normals = torch.where(better[:, None], candidate, normals)
-    offsets = torch.zeros_like(noise)
+    ranks = torch.tensor(pairs, dtype=torch.int64, device=noise.device).view(-1, 2)
+    normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
+    for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(pairs)), 1)):
+        own = [part[some] for part in (*columns, weights, start, reach)]
+        (normals[some],) = _most_supported(*own, ranks)
     for _ in range(constants.NUM_REFITS):
-        near = _within(residuals(columns, normals, offsets), reach)
-        normals, offsets = _refit(columns, weights * near, normals, offsets)
+        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, False)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
     reach = constants.FIT_REACH * noise
     for _ in range(constants.NUM_REFITS):
-        near = _within(residuals(columns, normals, offsets), reach).square_()
-        normals, offsets = _refit(columns, weights * near, normals, offsets)
+        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, True)
     return normals, offsets
 
 
@@ -94,10 +87,18 @@ def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
     return support - torch.minimum(over, under)
 
 
-def _score(columns: Columns, weights: Tensor, normals: Tensor, reach: Tensor) -> Tensor:
-    """Return the score of planes through the points."""
-    scaled = normals / reach[:, None]
-    return support_scores(along(columns, scaled), weights)
+@kernel("n K", "n K", "n K", "n K", "n 3", "n", "P 2")
+def _most_supported(
+    x: Tensor, y: Tensor, z: Tensor, weights: Tensor, start: Tensor, reach: Tensor, ranks: Tensor
+) -> tuple[Tensor]:
+    """Return the normals of the best planes through the points: the first ones, or by ranks."""
+    candidates, spanned = _planes_through((x, y, z), ranks)
+    candidates = torch.cat([start[:, None], candidates], dim=1)
+    rests = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
+    scores = support_scores(rests, weights[:, None])
+    spanned = torch.cat([torch.ones_like(spanned[:, :1]), spanned], dim=1)
+    best = torch.where(spanned, scores, -torch.inf).argmax(dim=1, keepdim=True)
+    return (candidates.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1),)
 
 
 def _within(rests: Tensor, reach: Tensor) -> Tensor:
@@ -106,24 +107,32 @@ def _within(rests: Tensor, reach: Tensor) -> Tensor:
     return (1 - rests * rests).clamp_(min=0)
 
 
-def _refit(
-    columns: Columns, weights: Tensor, normals: Tensor, offsets: Tensor
+@kernel("n K", "n K", "n K", "n K", "n 3", "n", "n", "")
+def _refitted(
+    x: Tensor,
+    y: Tensor,
+    z: Tensor,
+    weights: Tensor,
+    normals: Tensor,
+    offsets: Tensor,
+    reach: Tensor,
+    bisquare: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Return fitted planes; the given ones where the weighted points span none."""
-    fitted, moved, values = fit_weighted_planes(columns, weights)
+    """Return planes fitted to the points near planes; those where these points span none."""
+    near = _within(residuals((x, y, z), normals, offsets), reach)
+    near = near.square_() if bisquare else near
+    fitted, moved, values = fit_weighted_planes((x, y, z), weights * near)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
     return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
 
 
-def _planes_through(columns: Columns, pairs: tuple[tuple[int, int], ...]) -> tuple[Tensor, Tensor]:
-    """Return planes through the points and two neighbours of some ranks, where they span one.
+def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
+    """Return planes through the points and two neighbours of ranks ``(P, 2)``, where they span one.
 
-    Unit normals ``(P, n, 3)`` and flags ``(P, n)`` of P pairs of ranks.
+    Unit normals ``(n, P, 3)`` and flags ``(n, P)``.
     """
-    ranks = torch.tensor(pairs, dtype=torch.int64, device=columns[0].device).view(-1, 2)
-    by_rank = [column.t() for column in columns]
-    a, b, c = (column.index_select(0, ranks[:, 0]) for column in by_rank)
-    d, e, f = (column.index_select(0, ranks[:, 1]) for column in by_rank)
+    a, b, c = (column.index_select(1, ranks[:, 0]) for column in columns)
+    d, e, f = (column.index_select(1, ranks[:, 1]) for column in columns)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
     sq_area = x * x + y * y + z * z
     spanned = sq_area > 0
@@ -237,16 +246,25 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     second, first = _beyond(rests, noise), _near(rests, noise)
     present = torch.ones_like(noise, dtype=torch.bool)
     for _ in range(constants.NUM_ALTERNATIONS):
-        present &= _all_present((first, second))
-        planes = fit_planes_to_each(columns, (first, second))
-        inside = (
-            _inside(residuals(columns, *planes[0]), second),
-            _inside(residuals(columns, *planes[1]), first),
-        )
-        outer = torch.minimum(*inside)
-        first = above(inside[1], inside[0])
-        second = 1 - first
-    return Wedge(_summary(planes, (first, second), outer, present), first, outer)
+        first, second, outer, present, *planes = _wedge(*columns, first, second, present)
+    pairs = list(zip(planes[::2], planes[1::2], strict=True))
+    return Wedge(_summary(pairs, (first, second), outer, present), first, outer)
+
+
+@kernel("n K", "n K", "n K", "n K", "n K", "n")
+def _wedge(
+    x: Tensor, y: Tensor, z: Tensor, first: Tensor, second: Tensor, present: Tensor
+) -> tuple[Tensor, ...]:
+    """Return the points of two planes that meet, anew, their distances, and the planes."""
+    columns = x, y, z
+    present = present & _all_present((first, second))
+    planes = fit_planes_to_each(columns, (first, second))
+    inside = (
+        _inside(residuals(columns, *planes[0]), second),
+        _inside(residuals(columns, *planes[1]), first),
+    )
+    first = above(inside[1], inside[0])
+    return first, 1 - first, torch.minimum(*inside), present, *planes[0], *planes[1]
 
 
 def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
@@ -260,21 +278,43 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
     """
     first, second, third = groups
     present = torch.ones_like(first[:, 0], dtype=torch.bool)
-    side: Tensor | None = None
+    side = torch.zeros_like(columns[0][:, 0])
     for _ in range(constants.NUM_ALTERNATIONS):
-        present &= _all_present((first, second, third))
-        planes = fit_planes_to_each(columns, (first, second, third))
-        rests = [residuals(columns, *plane) for plane in planes]
-        inside = _inside(rests[0], second), _inside(rests[1], first)
-        wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
-        if side is None:
-            side = _side((wedge * third).sum(dim=1))
-        wedge *= side
-        outer = torch.minimum(added, wedge) * side
-        third = above(wedge, added)
-        first = above(inside[1], inside[0]).mul_(1 - third)
-        second = 1 - third - first
-    return _summary(planes, (first, second, third), outer, present)
+        first, second, third, outer, present, side, *planes = _corner(
+            *columns, first, second, third, present, side
+        )
+    pairs = list(zip(planes[::2], planes[1::2], strict=True))
+    return _summary(pairs, (first, second, third), outer, present)
+
+
+@kernel("n K", "n K", "n K", "n K", "n K", "n K", "n", "n")
+def _corner(
+    x: Tensor,
+    y: Tensor,
+    z: Tensor,
+    first: Tensor,
+    second: Tensor,
+    third: Tensor,
+    present: Tensor,
+    side: Tensor,
+) -> tuple[Tensor, ...]:
+    """Return the points of three planes, anew, their distances, the side, and the planes.
+
+    ``side`` tells whether the third cuts the wedge or is added to it, 0 where that is to be found.
+    """
+    columns = x, y, z
+    present = present & _all_present((first, second, third))
+    planes = fit_planes_to_each(columns, (first, second, third))
+    rests = [residuals(columns, *plane) for plane in planes]
+    inside = _inside(rests[0], second), _inside(rests[1], first)
+    wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
+    side = torch.where(side == 0, _side((wedge * third).sum(dim=1)).squeeze(1), side)
+    wedge *= side[:, None]
+    outer = torch.minimum(added, wedge) * side[:, None]
+    third = above(wedge, added)
+    first = above(inside[1], inside[0]).mul_(1 - third)
+    fitted = (part for plane in planes for part in plane)
+    return first, 1 - third - first, third, outer, present, side, *fitted
 
 
 def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:

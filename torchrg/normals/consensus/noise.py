@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks
-from torchrg.linalg import above, coordinate_resolution, covariance
+from torchrg._compile import kernel
+from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, places_of
+from torchrg.linalg import above, coordinate_resolution
 from torchrg.linalg.moments import (
-    Columns,
     along,
     fit_parallel_planes,
     fit_weighted_planes,
@@ -18,7 +18,7 @@ from torchrg.linalg.moments import (
     split_columns,
     sq_lengths,
 )
-from torchrg.neighbors import gather_patches
+from torchrg.neighbors import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.structures import Neighbors, NormalFit
 
@@ -85,9 +85,20 @@ def survey_noise(
     small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
 
     def work(block: slice) -> None:
-        found = _deviations(points, neighbors, fit, block)
-        for values, part in zip((offsets, radius, whole, layered, *small), found, strict=True):
-            values[block] = part
+        indices, mask = neighbors.at(block)
+        offsets[block], radius[block], whole[block], low, again = _deviations(
+            points, indices, mask, fit.normals[block], fit.valid[block]
+        )
+        layered[block] = torch.inf
+        if len(rows := places_of(low)):
+            near, own = Neighbors(indices, mask).at(rows), rows + block.start
+            layered[own] = _layered_deviations(points, near, fit.normals[own], whole[own])
+        for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
+            values[block] = _of_nearest(points, Neighbors(indices, mask), size)
+        if len(rows := places_of(again)):
+            patches, counted = _each_place_once(points, Neighbors(indices, mask).at(rows))
+            for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
+                values[rows + block.start] = _small_deviations(patches, counted, size)
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
@@ -146,69 +157,66 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
     return noise
 
 
+@kernel("N 3", "n K", "n K", "n 3", "n")
 def _deviations(
-    points: Tensor, neighbors: Neighbors, fit: NormalFit, block: slice
+    points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return offsets, radius and deviations from planes of all and of the nearest neighbours."""
-    indices, mask = neighbors.at(block)
-    patches = gather_patches(points, indices)
-    columns = split_columns(patches)
-    counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
-    normals, valid = fit.normals[block], fit.valid[block]
-    count = counted.sum(dim=1)
-    center = covariance(patches, mask)[0]
-    offsets = (normals * center).sum(dim=1)
-    rests = residuals(columns, normals, offsets)
-    spread = (rests * rests * counted).sum(dim=1) / (count - 3).clamp_(min=1)
-    whole = torch.where(valid & (count > 3), spread.sqrt_(), torch.inf)
-    radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
-    layered = _layered_deviations(columns, counted, rests, whole)
-    patches, counted = _each_place_once(patches, counted)
-    small = [_small_deviations(patches, counted, size) for size in constants.NOISE_COUNTS]
-    return offsets, radius, whole, layered, *small
+    """Return offsets, deviations and radius of planes of all neighbours, and what to look at again.
 
-
-def _layered_deviations(columns: Columns, counted: Tensor, rests: Tensor, whole: Tensor) -> Tensor:
-    """Return deviations from two parallel planes, the faces of a plate; inf where there are none.
-
-    ``rests`` are the residuals from one plane and ``whole`` their deviation. Those of two planes
-    have low kurtosis, which spares most points the fits.
+    That is where the residuals have the low kurtosis of two parallel planes, and where several
+    neighbours are at one place.
     """
-    found = torch.full_like(whole, torch.inf)
+    columns = gather_columns(points, indices)
+    counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
+    count = counted.sum(dim=1)
+    center = [(column * counted).sum(dim=1) / count.clamp(min=1) for column in columns]
+    offsets = (normals * torch.stack(center, dim=-1)).sum(dim=1)
+    rests = residuals(columns, normals, offsets)
     squares = rests * rests * counted
     second, fourth = squares.sum(dim=1), squares.square().sum(dim=1)
-    flat = fourth * counted.sum(dim=1) < constants.MAX_LAYERED_KURTOSIS * second * second
-    rows = (flat & whole.isfinite()).nonzero().squeeze(-1)
-    some: Columns = (columns[0][rows], columns[1][rows], columns[2][rows])
-    counted = counted[rows]
-    upper = above(rests[rows], 0) * counted
+    whole = torch.where(valid & (count > 3), (second / (count - 3).clamp(min=1)).sqrt_(), torch.inf)
+    radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
+    low = fourth * count < constants.MAX_LAYERED_KURTOSIS * second * second
+    moves = sum((column[:, 1:] - column[:, :-1]).abs_() for column in columns)
+    assert isinstance(moves, Tensor)  # noqa: S101
+    return offsets, radius, whole, low & whole.isfinite(), (moves == 0).any(dim=1)
+
+
+def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole: Tensor) -> Tensor:
+    """Return deviations from two parallel planes, the faces of a plate; inf where there are none.
+
+    ``normals`` are those of one plane and ``whole`` are the deviations from it.
+    """
+    columns = gather_columns(points, near.indices)
+    counted = near.counted().to(points.dtype)
+    count = counted.sum(dim=1)
+    center = [(column * counted).sum(dim=1) / count.clamp(min=1) for column in columns]
+    offsets = (normals * torch.stack(center, dim=-1)).sum(dim=1)
+    upper = above(residuals(columns, normals, offsets), 0) * counted
     for _ in range(constants.NUM_REFITS):
-        normals, offsets, rest = fit_parallel_planes(some, (upper, counted - upper))
-        upper = above(along(some, normals), offsets.mean(dim=0)[:, None]) * counted
-    count, num_upper = counted.sum(dim=1), upper.sum(dim=1)
+        normals, two, rest = fit_parallel_planes(columns, (upper, counted - upper))
+        upper = above(along(columns, normals), two.mean(dim=0)[:, None]) * counted
+    num_upper = upper.sum(dim=1)
     deviations = (rest * count / (count - _LAYER_PARAMETERS).clamp_(min=1)).sqrt_()
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
-    layered &= deviations <= constants.MAX_LAYERED_SHARE * whole[rows]
-    found[rows] = torch.where(layered, deviations, torch.inf)
-    return found
+    layered &= deviations <= constants.MAX_LAYERED_SHARE * whole
+    return torch.where(layered, deviations, torch.inf)
 
 
-def _each_place_once(patches: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+def _each_place_once(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
     """Move neighbours at the place of the one before to the end, where they do not count."""
-    if patches.shape[1] < 2:
-        return patches, counted
-    moves = torch.zeros_like(counted[:, 1:])
-    for column in patches.unbind(dim=-1):
-        moves += (column[:, 1:] - column[:, :-1]).abs_()
-    rows = (moves.amin(dim=1) == 0).nonzero().squeeze(-1)
-    if len(rows) == 0:
-        return patches, counted
-    again = torch.zeros_like(counted[rows], dtype=torch.bool)
-    again[:, 1:] = moves[rows] == 0
+    patches, counted = gather_patches(points, near.indices), near.counted()
+    again = torch.zeros_like(counted)
+    again[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=-1)
     order = again.to(torch.uint8).argsort(dim=1, stable=True)
-    once = (counted[rows] * ~again).gather(1, order)
-    moved = patches[rows].gather(1, order[:, :, None].expand(-1, -1, 3))
-    return patches.index_copy(0, rows, moved), counted.index_copy(0, rows, once)
+    once = (counted & ~again).gather(1, order).to(points.dtype)
+    return patches.gather(1, order[:, :, None].expand(-1, -1, 3)), once
+
+
+def _of_nearest(points: Tensor, near: Neighbors, count: int) -> Tensor:
+    """Return deviations of so many nearest points from their plane."""
+    patches = gather_patches(points, near.indices[:, :count])
+    return _small_deviations(patches, near.counted()[:, :count].to(points.dtype), count)
 
 
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
@@ -216,11 +224,17 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
     columns = split_columns(patches[:, :count])
-    normals, offsets, values = fit_weighted_planes(columns, counted[:, :count])
-    rests = residuals(columns, normals, offsets)
-    spread = (rests * rests).sum(dim=1) / (count - 3)
-    broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, count - 1] > 0)
-    return torch.where(broad, spread.sqrt_(), torch.inf)
+    return _of_few(*columns, counted[:, :count])[0]
+
+
+@kernel("n S", "n S", "n S", "n S")
+def _of_few(x: Tensor, y: Tensor, z: Tensor, counted: Tensor) -> tuple[Tensor]:
+    """Return deviations of the points that count from their plane; inf if the last one does not."""
+    normals, offsets, values = fit_weighted_planes((x, y, z), counted)
+    rests = residuals((x, y, z), normals, offsets)
+    spread = (rests * rests).sum(dim=1) / (x.shape[1] - 3)
+    broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
+    return (torch.where(broad, spread.sqrt_(), torch.inf),)
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:

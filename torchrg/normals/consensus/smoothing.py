@@ -3,16 +3,17 @@
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_chosen, map_chunks
+from torchrg._compile import kernel
+from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
 from torchrg.linalg import signs
 from torchrg.linalg.moments import (
     Columns,
+    along,
     fit_weighted_planes,
     residuals,
-    split_columns,
     sq_lengths,
 )
-from torchrg.neighbors import gather_patches
+from torchrg.neighbors import gather_columns
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
 from torchrg.normals.consensus.noise import Survey
@@ -46,34 +47,50 @@ def smooth_planes(
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        near = neighbors.at(chosen)
-        columns = split_columns(gather_patches(points, near.indices))
-        x, y, z = (near.of(part) for part in parts)
-        a, b, c = (part.index_select(0, chosen)[:, None] for part in parts)
-        cosines = x * a + y * b + z * c
-        sign = signs(cosines)
-        offset = near.of(planes.offsets)
-        rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - offset
-        sq_chords = 2 * (1 - cosines.abs())
-        sq_error = near.of(errors).square()
-        sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
-        reach = constants.SMOOTHING_REACH * noise[chosen][:, None]
-        weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
-        weights *= (1 - (rests / reach).square_()).clamp_(min=0)
-        weights *= _falling(columns, constants.FIT_FALLOFF)
-        if near.valid is not None:
-            weights *= near.valid
-        weights = _balanced(columns, weights) * sign
-        mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
-        length = (mean * mean).sum(dim=1).sqrt_()
-        found = length > 0
-        safe = torch.where(found, length, 1.0)
-        normals[chosen] = torch.where(found[:, None], mean / safe[:, None], normals[chosen])
-        moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
-        offsets[chosen] = torch.where(found, moved, offsets[chosen])
+        normals[chosen], offsets[chosen] = _smoothed(
+            points, *neighbors, parts, planes.offsets, noise, errors, chosen
+        )
 
     map_chunks(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
+
+
+@kernel("N 3", "N K", "N K", "3 N", "N", "N", "N", "n")
+def _smoothed(
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    parts: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    errors: Tensor,
+    rows: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the smoothed planes of some points; ``parts`` are the columns of all normals."""
+    near = Neighbors(indices, valid).at(rows)
+    columns = gather_columns(points, near.indices)
+    x, y, z = (near.of(part) for part in parts.unbind())
+    a, b, c = (part.index_select(0, rows)[:, None] for part in parts.unbind())
+    cosines = x * a + y * b + z * c
+    sign = signs(cosines)
+    rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
+    sq_chords = 2 * (1 - cosines.abs())
+    sq_error = near.of(errors).square()
+    sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
+    reach = constants.SMOOTHING_REACH * noise[rows][:, None]
+    weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
+    weights *= (1 - (rests / reach).square_()).clamp_(min=0)
+    weights *= _falling(columns, constants.FIT_FALLOFF)
+    if near.valid is not None:
+        weights *= near.valid
+    weights = _balanced(columns, weights) * sign
+    mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
+    length = (mean * mean).sum(dim=1).sqrt_()
+    found = length > 0
+    safe = torch.where(found, length, 1.0)
+    normals = torch.where(found[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
+    moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
+    return normals, torch.where(found, moved, offsets[rows])
 
 
 def choose_planes(
@@ -94,32 +111,52 @@ def choose_planes(
     shape ``(n,)``. Returns the planes of all points.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
+    ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        indices = neighbors.indices[chosen]
-        columns = split_columns(gather_patches(points, indices))
-        weights = _falling(columns, constants.VOTE_FALLOFF)
-        if neighbors.valid is not None:
-            weights *= neighbors.valid[chosen]
-        total, scale = weights.sum(dim=1), noise[chosen]
-        best = torch.full_like(scale, -torch.inf)
-        for rank in range(0, indices.shape[1], constants.CHOICE_STEP):
-            other = indices[:, rank]
-            normal = planes.normals.index_select(0, other)
-            place = torch.stack([column[:, rank] for column in columns], dim=-1)
-            offset = planes.offsets.index_select(0, other) + (normal * place).sum(dim=1)
-            rests = residuals(columns, normal, offset) / (constants.VOTE_REACH * scale)[:, None]
-            own = offset / scale
-            score = support_scores(rests, weights) / total - constants.CHOICE_COST * own * own
-            usable = (own.abs() < constants.INLIER_REACH) & ((normal * normal).sum(dim=1) > 0)
-            better = usable & (score > best)
-            best = torch.where(better, score, best)
-            normals[chosen] = torch.where(better[:, None], normal, normals[chosen])
-            offsets[chosen] = torch.where(better, offset, offsets[chosen])
+        normals[chosen], offsets[chosen] = _chosen(
+            points, *neighbors, *planes, noise, chosen, ranks
+        )
 
-    map_chunks(work, len(rows), chunk_size, rows.device)
+    size = max(min(chunk_size, ROWS_IN_CACHE // len(ranks)), 1)
+    map_chunks(work, len(rows), size, rows.device)
     return TangentPlanes(normals, offsets)
+
+
+@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n", "R")
+def _chosen(
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    normals: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    rows: Tensor,
+    ranks: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the best planes for some points among those of their neighbours of some ranks."""
+    near = Neighbors(indices, valid).at(rows)
+    columns = gather_columns(points, near.indices)
+    weights = _falling(columns, constants.VOTE_FALLOFF)
+    if near.valid is not None:
+        weights *= near.valid
+    scale = noise[rows][:, None]
+    other = near.indices.index_select(1, ranks).long()
+    axes = normals[other]
+    places = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
+    moved = offsets[other] + (axes * places).sum(dim=-1)
+    rests = along((columns[0][:, None], columns[1][:, None], columns[2][:, None]), axes)
+    rests = (rests - moved[:, :, None]) / (constants.VOTE_REACH * scale)[:, :, None]
+    own = moved / scale
+    support = support_scores(rests, weights[:, None]) / weights.sum(dim=1)[:, None]
+    score = support - constants.CHOICE_COST * own * own
+    usable = (own.abs() < constants.INLIER_REACH) & ((axes * axes).sum(dim=-1) > 0)
+    best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
+    found = usable.gather(1, best)
+    normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
+    offset = torch.where(found, moved.gather(1, best), offsets[rows][:, None])
+    return torch.where(found, normal, normals[rows]), offset.squeeze(1)
 
 
 def standard_errors(
@@ -143,7 +180,7 @@ def standard_errors(
     errors: Tensor = 2 * survey.noise / (radius * num_points**0.5)
 
     def work(rows: Tensor) -> None:
-        count, values = _inliers(points, neighbors, planes, survey.noise, rows)
+        count, values = _inliers(points, *neighbors, *planes, survey.noise, rows)
         width = (count * values[:, 1].clamp(min=0)).sqrt_()
         error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
         errors[rows] = torch.maximum(errors[rows], error)
@@ -166,7 +203,7 @@ def describe_inliers(
     curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
 
     def work(rows: Tensor) -> None:
-        _, values = _inliers(points, neighbors, planes, noise, rows)
+        _, values = _inliers(points, *neighbors, *planes, noise, rows)
         smallest, total = values[:, 0].clamp(min=0), values.clamp(min=0).sum(dim=1)
         bent = (smallest - noise[rows].square()).clamp_(min=0)
         curvature[rows] = bent / torch.where(total > 0, total, 1.0)
@@ -176,14 +213,21 @@ def describe_inliers(
     return curvature, residual_rms
 
 
+@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n")
 def _inliers(
-    points: Tensor, neighbors: Neighbors, planes: TangentPlanes, noise: Tensor, rows: Tensor
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    normals: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
-    columns = split_columns(gather_patches(points, neighbors.indices[rows]))
-    rests = residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
+    columns = gather_columns(points, indices[rows])
+    rests = residuals(columns, normals[rows], offsets[rows]).abs()
     near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]
-    weights = (near & neighbors.counted(rows)).to(points.dtype)
+    weights = (near & Neighbors(indices, valid).counted(rows)).to(points.dtype)
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._compile import kernel
 from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg.moments import Columns, split_columns
-from torchrg.neighbors import gather_patches
+from torchrg.neighbors import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import fit_meeting_planes, vote_planes
 from torchrg.normals.consensus.noise import Survey
@@ -67,10 +68,8 @@ def fit_surfaces(
     bent = survey.deviations.clone()
 
     def bend(rows: Tensor) -> None:
-        columns, counted = _gather(points, neighbors, rows)
-        normals[rows], offsets[rows], bent[rows] = fit_paraboloids(
-            columns, fit.normals[rows], counted
-        )
+        found = _paraboloids(points, *neighbors, fit.normals, rows)
+        normals[rows], offsets[rows], bent[rows] = found
 
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
     map_chosen(bend, not_flat, chunk_size)
@@ -107,10 +106,13 @@ def fit_surfaces(
     return Surfaces(TangentPlanes(normals, offsets), voted | meets, voted)
 
 
-def _gather(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Columns, Tensor]:
-    """Return columns of the neighbours, and which of these count, as 0 or 1."""
-    columns = split_columns(gather_patches(points, neighbors.indices[rows]))
-    return columns, neighbors.counted(rows).to(points.dtype)
+@kernel("N 3", "N K", "N K", "N 3", "n")
+def _paraboloids(
+    points: Tensor, indices: Tensor, valid: Tensor | None, normals: Tensor, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what :func:`torchrg.normals.jet.fit_paraboloids` does, of some points."""
+    counted = Neighbors(indices, valid).counted(rows).to(points.dtype)
+    return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
 
 def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:

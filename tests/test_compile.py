@@ -1,0 +1,183 @@
+"""Kernels: written code, machine code, and what there is without a compiler."""
+
+import dataclasses
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torchrg import _compile, _parallel, load_config, segment_planes
+from torchrg._compile import Kernel, compiled, kernel
+from torchrg.metrics import score_labels
+from torchrg.normals.consensus import constants, hypotheses, noise
+from torchrg.scenes import make_room
+from torchrg.tiles import TileStore
+
+needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHRG_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(_compile, "_prepared", {})
+    return tmp_path
+
+
+def few(rows, rng, count=8):
+    return [torch.randn(rows, count, generator=rng) for _ in range(3)] + [torch.ones(rows, count)]
+
+
+def fresh(one):
+    """Return a kernel that has loaded nothing."""
+    return Kernel(one.function, [" ".join(axes) for axes in one.axes])
+
+
+def test_the_digest_knows_constants_and_what_is_called(monkeypatch):
+    before = _compile._digest(hypotheses._refitted.function)
+    assert before == _compile._digest(hypotheses._refitted.function)
+    monkeypatch.setattr(hypotheses, "_within", lambda rests, reach: rests)
+    assert _compile._digest(hypotheses._refitted.function) != before
+    deviations = _compile._digest(noise._deviations.function)
+    monkeypatch.setattr(constants, "MAX_LAYERED_KURTOSIS", 2.3)
+    assert _compile._digest(noise._deviations.function) != deviations
+
+
+def test_the_switch_reaches_the_threads():
+    torch.set_num_threads(2)
+    try:
+        with compiled():
+            found = _parallel.map_tasks(
+                lambda task: (_compile._is_active.get(), _parallel.allowed_threads()),
+                [0, 1],
+                torch.device("cpu"),
+            )
+    finally:
+        torch.set_num_threads(1)
+    assert found == [(True, 1), (True, 1)]
+
+
+def test_without_a_compiler_all_runs_as_written(folder, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setenv("PATH", "")
+    one, columns = fresh(noise._of_few), few(9, torch.Generator().manual_seed(0))
+    with compiled(), pytest.warns(UserWarning, match="kernels are not compiled") as caught:
+        found = one(*columns)
+    assert len(caught) == 1
+    assert "\n" not in str(caught[0].message)
+    assert torch.equal(found[0], one.function(*columns)[0])
+
+
+def test_without_a_folder_all_runs_as_written(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TORCHRG_CACHE_DIR", str(tmp_path / "file" / "below"))
+    one, columns = fresh(noise._of_few), few(9, torch.Generator().manual_seed(0))
+    with compiled(), pytest.warns(UserWarning, match="set TORCHRG_CACHE_DIR"):
+        found = one(*columns)
+    assert torch.equal(found[0], one.function(*columns)[0])
+
+
+def test_the_settings_say_whether_kernels_are_compiled(folder, monkeypatch):
+    monkeypatch.setattr(_compile, "compile_kernels", lambda wanted, announce=None: False)
+    from torchrg.pipeline import prepare_kernels
+
+    config = dataclasses.replace(load_config("classic"), compile=True)
+    assert prepare_kernels(config).compile is False
+    assert prepare_kernels(load_config("classic")).compile is False
+
+
+def test_a_rehearsal_finds_the_kernels_of_a_preset(folder, monkeypatch):
+    names = {}
+
+    def note(wanted, announce=None):
+        names.update((one.function.__name__, one) for one, _ in wanted)
+        return False
+
+    monkeypatch.setattr(_compile, "compile_kernels", note)
+    seg = segment_planes(make_room(800, 0.003).points, load_config("consensus"), compile=True)
+    assert len(seg.labels) == 800
+    assert {"_smoothed", "_wedge", "_corner", "_refitted", "_deviations", "_pass"} <= names.keys()
+
+
+def test_a_row_alone_is_done_twice(monkeypatch):
+    """The code is for two rows and more."""
+    asked = []
+
+    def code(tensors):
+        asked.append([tuple(tensor.shape) for tensor in tensors])
+        return (tensors[0] * tensors[1][:, None],)
+
+    scaled = Kernel(lambda values, factors, table: (values * factors[:, None],), ["n K", "n", "T"])
+    monkeypatch.setattr(Kernel, "_load", lambda self, signature: code)
+    values, table = torch.arange(4.0).view(1, 4), torch.zeros(5)
+    with compiled():
+        found = scaled(values, torch.tensor([2.0]), table)
+        assert torch.equal(found[0], 2 * values)
+        assert scaled(values[:0], torch.ones(0), table)[0].shape == (0, 4)
+        assert scaled(values[:, :2], torch.ones(1), table)[0].shape == (1, 2)
+    assert asked == [[(2, 4), (2,), (5,)]]
+
+
+def test_gradients_need_the_written_code():
+    @kernel("n K")
+    def doubled(values):
+        return (2 * values,)
+
+    values = torch.ones(3, 4, requires_grad=True)
+    with compiled():
+        doubled(values)[0].sum().backward()
+    assert torch.equal(values.grad, torch.full((3, 4), 2.0))
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_code_gives_the_same_bits_for_any_rows_and_is_made_anew_if_torn(folder):
+    rng = torch.Generator().manual_seed(0)
+    columns = few(1000, rng)
+    one = fresh(noise._of_few)
+    with compiled():
+        found = one(*columns)[0]
+        for rows in (1, 2, 3, 7, 15, 16, 17, 31, 33, 500, 999):
+            part = one(*(column[-rows:] for column in columns))[0]
+            assert torch.equal(part, found[-rows:]), rows
+        # Sixteen points need no other code.
+        one(*few(5, rng, 16))
+    assert torch.allclose(found, one.function(*columns)[0], rtol=1e-5, atol=1e-7)
+    (path,) = (path for path in folder.iterdir() if path.name.startswith("_of_few"))
+    written = path.stat().st_mtime_ns
+    with compiled():
+        fresh(one)(*columns)
+    assert path.stat().st_mtime_ns == written
+    path.write_bytes(path.read_bytes()[:-100])
+    with compiled():
+        assert torch.equal(fresh(one)(*columns)[0], found)
+    assert _compile._is_whole(path)
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_compiled_results_do_not_depend_on_order_chunks_threads_or_tiles(tmp_path):
+    """And they are those of the written code, to rounding; the code stays in the user's folder."""
+    points = make_room(20_000, 0.003, seed=5).points
+    config = dataclasses.replace(load_config("consensus"), compile=True)
+    expected = segment_planes(points, config)
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))
+    shuffled = segment_planes(points[order], dataclasses.replace(config, chunk_size=777))
+    assert torch.equal(shuffled.labels, expected.labels[order])
+    assert torch.equal(shuffled.normals, expected.normals[order])
+    torch.set_num_threads(2)
+    try:
+        again = segment_planes(points, config)
+    finally:
+        torch.set_num_threads(1)
+    assert torch.equal(again.labels, expected.labels)
+    assert torch.equal(again.normals, expected.normals)
+    in_tiles = segment_planes(points, config, store=TileStore(tmp_path, tile_size=6000))
+    assert torch.equal(torch.as_tensor(in_tiles.labels), expected.labels)
+    assert torch.equal(torch.as_tensor(in_tiles.normals), expected.normals)
+    written = segment_planes(points, load_config("consensus"))
+    assert score_labels(written.labels, expected.labels).ari > 0.9999
+    script = "from torchrg import _compile; print('torch._dynamo' in __import__('sys').modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
+    assert done.stdout.strip() == b"False"
