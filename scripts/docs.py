@@ -22,6 +22,7 @@ import torchrg
 ROLE = re.compile(r":(?:func|class|mod|data|meth|attr|exc|obj):`~?\.?([^`<]+)`")
 OUTPUT = Path("build/docs")
 _LINK = re.compile(r'<(?:a|img)\b[^>]*?\b(?:href|src)="([^"]+)"')
+_PRIVATE = re.compile(r'<a href="[^"]*#_[^"]*">(.*?)</a>')
 _ANCHOR = re.compile(r'\bid="([^"]+)"')
 
 
@@ -112,6 +113,10 @@ def write_reference(folder: Path, found: dict[str, ModuleType]) -> None:
         # pdoc walks packages by itself, but for those that name what is public.
         warnings.filterwarnings("ignore", "The module specification", UserWarning)
         pdoc.pdoc(*found, output_directory=folder)
+    for page in (folder / "torchrg").rglob("*.html"):
+        # pdoc links private bases, which have no place on any page.
+        text = page.read_text(encoding="utf-8")
+        page.write_text(_PRIVATE.sub(r"\1", text), encoding="utf-8")
     rows = [
         f"| [{name}]({guide_pages.place_of(name, set(found))}) | {_first_line(module)} |"
         for name, module in found.items()

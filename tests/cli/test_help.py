@@ -101,6 +101,26 @@ def test_what_is_needed_has_names(capsys):
     )
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--normals.k", "two"], "expected a whole number for --normals.k, got 'two'. See"),
+        (["--voxel", "wide"], "expected a number for --voxel, got 'wide'. See"),
+        (["--growing.min-sise", "3"], "Did you mean --growing.min-size? See torchrg segment"),
+        (["--quite-another", "3"], "Unrecognized options: --quite-another, 3. See"),
+    ],
+)
+def test_a_wrong_flag_is_told_in_plain_words(arguments, message, capsys):
+    assert main(["segment", "a.ply", "--out", "b.npz", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_errors_are_read_from_boxes_of_lines_and_of_none():
+    boxed = "╭─ Value error ─╮\n│ No such      │\n│ thing: a-b.  │\n│ ──────── │\n│ More │\n╰────╯"
+    plain = " Value error   \n --------------- \n  No such\n  thing: a-b.\n  --------\n  More"
+    assert console._one_line(boxed) == console._one_line(plain) == "No such thing: a-b."
+
+
 def test_settings_of_the_preset_are_shown(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["segment", "--preset", "classic", "--help"])

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import difflib
 import io
 import os
 import re
@@ -21,7 +22,7 @@ from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
 from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
 from torchrg.cli.ending import fail as fail
 from torchrg.cli.ending import warn as warn
-from torchrg.cli.help import format_help
+from torchrg.cli.help import format_help, list_flags
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
@@ -67,7 +68,8 @@ def parse(
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        raise ConfigError(f"{_one_line(stderr.getvalue())} See {prog} --help.") from None
+        message = _one_line(stderr.getvalue())
+        raise ConfigError(f"{message}{_nearest(message, kind)} See {prog} --help.") from None
     except ConfigError as error:
         # The one setting that stands in no section.
         text = str(error).replace("PipelineConfig: expected chunk_size", "expected --chunk-size")
@@ -75,17 +77,44 @@ def parse(
     return parsed
 
 
+def _nearest(message: str, kind: type) -> str:
+    """Return a question where a message is on a flag that is none, and one is much like it."""
+    wrong = re.search(r"^Unrecognized options: (--[\w.-]+)", message)
+    names = [flag.name for flag in list_flags(kind)]
+    found = difflib.get_close_matches(wrong[1], names, n=1) if wrong else []
+    return f" Did you mean {found[0]}?" if found else ""
+
+
 def _one_line(boxed: str) -> str:
-    """Return the first message of a boxed error as one line."""
-    lines = [re.sub(r"^[│╭╰]\s?|\s*[│╮╯]$", "", line).rstrip() for line in boxed.splitlines()]
-    message: list[str] = []
-    for line in lines[1:]:
-        if re.match(r"^[─╰]{3,}", line) and message:
-            break
-        message.append(line.strip())
-    text = " ".join(part for part in message if part)
+    """Return the first message of an error as one line.
+
+    It stands in a box, or below its title and a rule where the terminal has no characters for one.
+    """
+    parts: list[list[str]] = [[]]
+    for line in boxed.splitlines():
+        words = re.sub(r"^[│╭╰]\s?|\s*[│╮╯]$", "", line).strip()
+        if re.match(r"^[─-]+( .* [─-]+|$)", words):
+            parts.append([])
+        elif words:
+            parts[-1].append(words)
+    text = " ".join(parts[1] if len(parts) > 1 else parts[0])
     text = re.sub(r"^Error parsing [\w.-]+: (?=\w+Config: )", "", text)
+    for pattern, expected in _NO_NUMBERS.items():
+        text = re.sub(rf"^Error parsing (\S+): {pattern}.*", f"expected {expected}", text)
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+_NO_NUMBERS = {
+    r"invalid literal for int\(\).*: ('.*')": r"a whole number for \1, got \2",
+    r"could not convert string to float: ('.*')": r"a number for \1, got \2",
+    r"no type matching \S*INT could be instantiated from \['(.*?)'\]": (
+        r"a whole number for \1, got '\2'"
+    ),
+    r"no type matching \S*FLOAT could be instantiated from \['(.*?)'\]": (
+        r"a number for \1, got '\2'"
+    ),
+}
+"""What is said of text that is no number, and how it is said here."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrg.datasets.folder import SceneDataset, SceneFiles, listed
+from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
 from torchrg.datasets.rooms import (
     ANNOTATIONS,
     Repair,
@@ -114,9 +114,10 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
         known = ", ".join(map(str, ROOMS_PER_AREA))
         raise ConfigError(f"S3DIS: expected areas among {known}, got {area!r}.")
     folder = root / f"Area_{area}"
+    check_folder(root)
     if not folder.is_dir():
-        inside = [path.parent for path in root.glob("*/Area_[1-6]")] if root.is_dir() else []
-        repair = f"pass {inside[0]}" if inside else "choose areas=..., or fetch it again"
+        inside = [path.parent for path in root.glob("*/Area_[1-6]")]
+        repair = f"pass {inside[0]}" if inside else "choose areas that are there, or fetch it again"
         raise FormatError(f"{root}: expected a folder {folder.name}, got none; {repair}.")
     entries = [path for path in listed(folder) if path.is_dir() and not path.name.startswith(".")]
     rooms = [path for path in entries if (path / ANNOTATIONS).is_dir()]
