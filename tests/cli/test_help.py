@@ -116,11 +116,7 @@ def test_a_wrong_flag_is_told_in_plain_words(arguments, message, capsys):
 
 
 def test_errors_are_read_from_boxes_of_lines_and_of_none():
-<<<<<<< HEAD
-    boxed = "╭─ Value error ─╮\n│ No such      │\n│ thing: a-b.  │\n│ ──────────── │\n│ More │\n╰───╯"
-=======
     boxed = "╭─ Value error ─╮\n│ No such      │\n│ thing: a-b.  │\n│ ──────── │\n│ More │\n╰────╯"
->>>>>>> hour
     plain = " Value error   \n --------------- \n  No such\n  thing: a-b.\n  --------\n  More"
     assert console._one_line(boxed) == console._one_line(plain) == "No such thing: a-b."
 
