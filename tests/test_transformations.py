@@ -260,6 +260,7 @@ def test_functions_of_clouds_break_a_graph_and_the_rest_is_compiled(name):
         Model(MIDDLES[name]),
         torch.rand(40, 3, generator=torch.Generator().manual_seed(0)),
     )
+    torch._dynamo.reset()
     counter = CompileCounter()
     found = torch.compile(model, backend=counter)(points)
     assert torch.equal(found, model(points))

@@ -1,36 +1,5 @@
 """Robust normals, curvature and plane labels for indoor point clouds.
 
-function            autograd  vmap     func     compile  export   autocast  cuda
-==================  ========  =======  =======  =======  =======  ========  =======
-covariance          yes       yes      yes      yes      yes      yes       not run
-eigh3               yes       yes      yes      yes      yes      yes       not run
-fit_normals_pca     yes       yes      yes      yes      yes      yes       not run
-fit_normals_jet     yes       yes      yes      yes      yes      yes       not run
-fit_normals_irls    yes       yes      yes      yes      yes      yes       not run
-fit_normals_robust  yes       yes      yes      yes      yes      yes       not run
-median              yes       yes      yes      yes      yes      yes       not run
-mad                 yes       yes      yes      yes      yes      yes       not run
-qn                  yes       yes      yes      yes      yes      yes       not run
-tau                 yes       yes      yes      yes      yes      yes       not run
-fit_detmcd          yes       yes      yes      yes      yes      yes       not run
-fit_fastmcd         yes       yes      yes      yes      yes      yes       not run
-fit_mve             yes       yes      yes      yes      yes      yes       not run
-fit_dets            yes       yes      yes      yes      yes      yes       not run
-fit_detmm           yes       yes      yes      yes      yes      yes       not run
-estimate_normals    yes       refused  refused  break    no       yes       not run
-orient_normals      yes       refused  refused  break    no       yes       not run
-segment_planes      none      refused  refused  break    no       yes       not run
-grow_regions        none      refused  refused  break    no       yes       not run
-make_superpoints    none      refused  refused  break    no       yes       not run
-search_knn          none      refused  refused  break    no       yes       not run
-segment_depth       none      refused  refused  break    no       yes       not run
-==================  ========  =======  =======  =======  =======  ========  =======
-
-The robust fits, scales and ``fit_normals_irls`` are one operation of their own to ``vmap`` (from
-torch 2.5), ``torch.func`` and compilers, and have no second derivatives there; the method
-``consensus`` has no gradients, and refuses points that require them. The modules of
-:mod:`torchrg.nn` are like their functions.
-=======
 From a file to planes and back: :func:`read_cloud`, :func:`segment_planes` with settings of
 :func:`load_config`, :func:`write_cloud`, :func:`read_result`. Single stages: :func:`search_knn`,
 :func:`estimate_normals`, :func:`grow_regions`, :func:`make_superpoints`, :func:`align_axes`. The

@@ -174,7 +174,7 @@ def _run_peer(program: Path, folder: Path) -> Figures:
     return _figures(seconds, whole, peak)
 
 
-def prepare(work: str, file: str, compiled: bool) -> Callable[[], Figures]:
+def prepare(work: str, file: str, compiled: bool = False) -> Callable[[], Figures]:
     """Return what times a library on a file of points, run once already on few of them."""
     import numpy as np
 

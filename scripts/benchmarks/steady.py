@@ -119,7 +119,7 @@ def _busy(number: int) -> Iterator[None]:
             other.wait()
 
 
-def prepare(name: str, size: int, compiled: bool) -> Callable[[], None]:
+def prepare(name: str, size: int, compiled: bool = False) -> Callable[[], None]:
     """Return the work of a process, done once already on little."""
     if name in FRAMES:
         height, sensor = FRAMES[name]

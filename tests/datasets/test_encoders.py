@@ -34,7 +34,7 @@ def test_the_recipe_makes_normals_that_look_into_the_room(room, tmp_path, monkey
     color = np.random.default_rng(0).integers(0, 256, (20_000, 3)).astype(np.uint8)
     torchrg.write_cloud("scan.ply", torchrg.Cloud(room.points.float().numpy(), {"color": color}))
     (recipe,) = re.findall(
-        r"file::\n\n((?:    .*\n)+)", torchrg.datasets.__doc__.split("Sonata, Concerto")[1]
+        r"file:\n\n((?:    .*\n)+)", torchrg.datasets.__doc__.split("Sonata, Concerto")[1]
     )
     lines = re.sub("^    ", "", recipe, flags=re.MULTILINE)
     shared = {"torchrg": torchrg, "np": np}

@@ -133,7 +133,7 @@ def test_modules_can_be_pickled(frames):
         again = pickle.loads(pickle.dumps(module))
         for key, value in module(sample).items():
             assert torch.equal(again(sample)[key], value)
-    assert "DepthConfig" in repr(SegmentDepth())
+    assert "min_size=100" in repr(SegmentDepth())
 
 
 def test_wrong_samples_are_refused(frames):

@@ -213,9 +213,10 @@ def find_jitter(windows: WindowPlanes) -> float:
     """
     # Windows stand a cell apart and overlap.
     some = WindowPlanes(*(part[::REACH, ::REACH] for part in windows))
-    used = some.deviation.isfinite()
-    slope, order = torch.hypot(some.u_slope[used], some.v_slope[used]).sort()
-    ratio = some.deviation[used][order] / slope.clamp(min=torch.finfo(slope.dtype).tiny)
+    slope = torch.hypot(some.u_slope, some.v_slope)
+    used = some.deviation.isfinite() & (slope > 0)
+    slope, order = slope[used].sort()
+    ratio = some.deviation[used][order] / slope
     steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
     return min([_MOST_JITTER, *(float(_low_quantile(part)) for part in steep if len(part))])
 
