@@ -58,6 +58,7 @@ def test_the_switch_reaches_the_threads():
     assert found == [(True, 1), (True, 1)]
 
 
+@pytest.mark.slow
 def test_without_a_compiler_all_runs_as_written(folder, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setenv("PATH", "")

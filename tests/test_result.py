@@ -223,6 +223,7 @@ def test_the_page_shows_the_table_of_the_result():
     assert pairs_of_page(few) == pairs_of_page(shown)
 
 
+@pytest.mark.slow
 def test_the_page_makes_no_table_of_its_own(cloud, seg):
     """A table that nobody would find in the points is shown as it is, in the notebook too."""
     pytest.importorskip("pydeck", reason="needs the extra view")

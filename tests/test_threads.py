@@ -38,6 +38,7 @@ assert count_threads() > before, "this would not have been seen"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
 def test_no_operation_is_shared_between_threads_of_openmp():
     run = subprocess.run([sys.executable, "-c", ALL_WORK], capture_output=True, text=True)

@@ -154,6 +154,7 @@ def test_functional_gradients_are_those_of_autograd(name, patches):
     assert_close([rows.flatten(0, -3).sum(dim=0)], [whole])
 
 
+@pytest.mark.slow
 @of_torch
 @quick_functions
 def test_compiled_without_graph_breaks(name, patches):
@@ -173,6 +174,7 @@ class Exported(nn.Module):
         return self.function(patches)
 
 
+@pytest.mark.slow
 @of_torch
 @quick_functions
 def test_exported_for_any_number_of_patches(name, patches):

@@ -76,6 +76,7 @@ def call_script(monkeypatch, *arguments):
     reproduce_paper.main()
 
 
+@pytest.mark.slow
 def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch, capsys):
     from reproduction import readme
 
