@@ -52,4 +52,4 @@ def test_the_recipe_makes_normals_that_look_into_the_room(room, tmp_path, monkey
     right = (features[:, 6:] * truth).sum(axis=1) > 0
     assert shell.sum() > 10_000
     assert right[shell].mean() >= 0.99
-    assert right.mean() > 0.94
+    assert right.mean() > 0.97

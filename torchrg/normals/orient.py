@@ -25,8 +25,17 @@ _NUM_LINKS = 12
 """Nearest neighbours over which signs spread. So many reach from one face of a thin plate to the
 other."""
 
-_FACE_BEND = 0.05
-"""Largest bend within a face, that between normals 18 degrees apart."""
+_PATCH_BEND = 0.05
+"""Largest bend within a smooth patch, that between normals 18 degrees apart."""
+
+_FACE_BEND = 0.01
+_USUAL_BENDS = 4.0
+"""Largest bend within a face: that between normals 8 degrees apart, or this multiple of the median
+of all, which noise makes larger where points are dense. The two sides of a sparse thin plate are
+one patch, and two faces."""
+
+_LEAST_FACE = 10
+"""Points of a face that decides for itself; smaller ones, as along edges, follow their patch."""
 
 _CLEARLY_OUTWARDS = 1e-3
 """Share of its largest value beyond which a volume or a mean normal cannot be rounding."""
@@ -41,6 +50,11 @@ _CELLS_PER_POINT = 16
 
 _STEEP = 0.87
 """Cosine, of 30 degrees, above which a neighbour lies straight ahead."""
+
+_PARALLEL, _ABOVE = 0.99, 0.5
+"""Cosine, of 8 degrees, between normals that are parallel, and sine, of 30 degrees, of the angle at
+which a neighbour with such a normal lies on another face. On one smooth surface it rises by no more
+than half of the angle between the normals."""
 
 _OPEN_WEIGHT = 0.5
 """Weight of a free path that leaves the box around the cloud."""
@@ -72,7 +86,7 @@ def orient_normals(
       is oriented on its own.
     - ``"interior"``: into the free space of rooms: floors up, ceilings down, walls into their own
       room, furniture away from its inside. Each point votes by the free paths in front of it and
-      behind, and smooth faces decide by majority. Several rooms, storeys and missing ceilings are
+      behind, and faces decide by majority. Several rooms, storeys and missing ceilings are
       no obstacle; a wall between two rooms is right if it is thicker than about two point spacings,
       a plate seen from both sides if normals of its faces can be told apart. A lone object seen
       from outside is turned inwards, as a room would be: use ``"consistent"`` for it.
@@ -159,7 +173,7 @@ def _face(normals: Tensor, direction: Tensor) -> Tensor:
 
 def _turn_outwards(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Tensor:
     """Return consistent signs, by which each component encloses a positive volume."""
-    signs, parts = propagate_signs(points, normals, neighbors)
+    signs, parts, _ = propagate_signs(points, normals, neighbors)
     count = torch.bincount(parts).double()
     agreed = (normals * signs[:, None]).double()
     local = points.double() - points[:1].double()
@@ -175,10 +189,12 @@ def _turn_outwards(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Ten
 
 
 def _turn_inside(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return signs for the freer side, by the votes of smooth faces."""
-    signs, faces = propagate_signs(points, normals, neighbors, max_bend=_FACE_BEND)
+    """Return signs for the freer side, by the votes of faces."""
+    signs, patches, faces = propagate_signs(points, normals, neighbors, within_patches=True)
     votes = vote_free_side(points, normals, neighbors) * signs
-    return torch.where(_sum_by(faces, votes)[faces] < 0, -signs, signs)
+    is_large = torch.bincount(faces)[faces] >= _LEAST_FACE
+    decided = torch.where(is_large, _sum_by(faces, votes)[faces], _sum_by(patches, votes)[patches])
+    return torch.where(decided < 0, -signs, signs)
 
 
 def _sum_by(groups: Tensor, values: Tensor) -> Tensor:
@@ -188,8 +204,8 @@ def _sum_by(groups: Tensor, values: Tensor) -> Tensor:
 
 
 def propagate_signs(
-    points: Tensor, normals: Tensor, neighbors: Neighbors, *, max_bend: float = 4.0
-) -> tuple[Tensor, Tensor]:
+    points: Tensor, normals: Tensor, neighbors: Neighbors, *, within_patches: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find signs by which neighbouring normals agree, along a minimum spanning tree [1].
 
     Two normals agree if one and the mirror image of the other in the plane halfway between the two
@@ -197,12 +213,13 @@ def propagate_signs(
     and on the two faces of a thin plate, each pointing away from the other. How far a link can be
     trusted is its bend ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle
     and ``u`` the direction of the link: 0 on a plane, 1 over a right-angled edge, 2 through a
-    plate. The tree takes the links of least bend, those of more than ``max_bend`` not at all;
-    memory and time are those of a sparse graph. Points are in canonical order if ties are to be
-    independent of it.
+    plate. The tree takes the links of least bend; within smooth patches those of more than 0.05 not
+    at all. Memory and time are those of a sparse graph. Points are in canonical order if ties are
+    to be independent of it.
 
-    Returns signs ``(N,)``, 1 or -1, and the connected patch that each point belongs to, 0 to M-1,
-    whose first point has sign 1.
+    Returns signs ``(N,)``, 1 or -1; the connected patch that each point belongs to, 0 to M-1, whose
+    first point has sign 1; and its face within the patch, where no link of the tree bends by more
+    than four times the median of all, or 0.01.
 
     References:
         [1] H. Hoppe et al. Surface reconstruction from unorganized points. SIGGRAPH, 1992.
@@ -215,16 +232,21 @@ def propagate_signs(
 
     num_points = len(points)
     if num_points == 0:
-        return normals.new_ones(0), torch.zeros(0, dtype=torch.int64, device=points.device)
+        none = torch.zeros(0, dtype=torch.int64, device=points.device)
+        return normals.new_ones(0), none, none
     starts, ends, bends = _links(points, normals, neighbors)
-    kept = bends <= max_bend
+    face_bend = max(_FACE_BEND, _USUAL_BENDS * float(np.median(bends))) if len(bends) else 0.0
+    kept = bends <= _PATCH_BEND if within_patches else slice(None)
     # A weight of zero would be no link, so every link weighs one more than its bend.
     weights, pairs = 1 + bends[kept], (starts[kept], ends[kept])
     tree = spanning_tree(csr_array((weights, pairs), shape=(num_points, num_points)))
     num_patches, patches = connected_components(tree, directed=False)
+    flat = tree.data <= 1 + face_bend
+    rows, columns = tree.nonzero()
+    inside = csr_array((np.ones(flat.sum()), (rows[flat], columns[flat])), shape=tree.shape)
+    _, faces = connected_components(inside, directed=False)
     _, first = np.unique(patches, return_index=True)
     root = np.full(num_patches, num_points)
-    rows, columns = tree.nonzero()
     joined = csr_array(
         (
             np.ones(len(rows) + num_patches),
@@ -236,7 +258,8 @@ def propagate_signs(
     parents = parents[:num_points].copy()
     parents[first] = first
     signs = _signs_to_root(points, normals, torch.from_numpy(parents).long().to(points.device))
-    return signs, torch.from_numpy(patches).long().to(points.device)
+    patches, faces = (torch.from_numpy(part).long().to(points.device) for part in (patches, faces))
+    return signs, patches, faces
 
 
 def _links(
@@ -295,7 +318,8 @@ def vote_free_side(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Ten
        measured to the next marked cell. A path that leaves the cloud's box without meeting anything
        counts half.
     3. If a neighbour lies straight in front, within 30 degrees of the normal, paths to the front
-       end there, and paths to the back likewise. The faces of thin plates are closer than cells.
+       end there, and paths to the back likewise; so they do at one with a parallel normal that
+       rises by more than 17 degrees. The faces of thin plates are closer than cells.
     4. The vote is the sum of ``sign(n . d) (n . d)^2 f(path)`` over the directions ``d``, where
        ``f`` rises from 0 to 1 and is half at 8 cells.
 
@@ -327,16 +351,19 @@ def vote_free_side(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Ten
 
 
 def _near_obstacles(points: Tensor, normals: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return distances to the nearest neighbour straight ahead and straight behind, or inf."""
+    """Return distances to the nearest faces ahead and behind that neighbours lie on, or inf."""
 
     def measure(chunk: slice) -> tuple[Tensor, Tensor]:
         patches = gather_patches(points, neighbors.indices[chunk])
         height = (patches * normals[chunk, None]).sum(dim=-1)
         sq_distance = (patches * patches).sum(dim=-1)
-        steep = height * height > _STEEP * _STEEP * sq_distance
-        steep &= neighbors.counted(chunk)
-        ahead = torch.where(steep & (height > 0), height, torch.inf).amin(dim=-1)
-        behind = torch.where(steep & (height < 0), -height, torch.inf).amin(dim=-1)
+        around = normals[neighbors.indices[chunk].long()]
+        cosine = (around * normals[chunk, None]).sum(dim=-1).abs()
+        least_sine = torch.where(cosine > _PARALLEL, _ABOVE, _STEEP)
+        beyond = height * height > least_sine * least_sine * sq_distance
+        beyond &= neighbors.counted(chunk)
+        ahead = torch.where(beyond & (height > 0), height, torch.inf).amin(dim=-1)
+        behind = torch.where(beyond & (height < 0), -height, torch.inf).amin(dim=-1)
         return ahead, behind
 
     parts = map_chunks(measure, len(points), CHUNK_SIZE, points.device)
