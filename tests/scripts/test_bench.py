@@ -264,5 +264,5 @@ def test_surroundings_name_the_commit():
 
     found = surroundings.describe(3)
     assert found["threads"] == 3
-    assert found["torch"] == torch.__version__
+    assert torch.__version__.startswith(found["torch"])  # Without the build, as in 2.4.0+cpu.
     assert Path(surroundings.__file__).name == "surroundings.py"
