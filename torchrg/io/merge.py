@@ -224,7 +224,10 @@ def _joined_header(
             joined["las"], las_notes = _joined_las(clouds)
             notes += las_notes
     if times and "las" in joined:
-        joined["las"].global_encoding.gps_time_type = times[0][1]
+        encoding = joined["las"].global_encoding
+        # Before laspy 2.7, to set what it is already would change it.
+        if encoding.gps_time_type != times[0][1]:
+            encoding.gps_time_type = times[0][1]
     viewpoints = {tuple(cloud.header.get("viewpoint", DEFAULT_VIEWPOINT)) for cloud in clouds}
     if len(viewpoints) > 1:
         why["viewpoint"] = "it differs between files"
