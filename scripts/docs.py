@@ -19,6 +19,8 @@ import pdoc
 
 import torchrg
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+
 ROLE = re.compile(r":(?:func|class|mod|data|meth|attr|exc|obj):`~?\.?([^`<]+)`")
 OUTPUT = Path("build/docs")
 _LINK = re.compile(r'<(?:a|img)\b[^>]*?\b(?:href|src)="([^"]+)"')

@@ -22,6 +22,7 @@ from tests.made.patches import OUTLIERS, contaminated
 from tests.made.rays import cast_rays, scan_scene
 from tests.made.samples import (
     CURVED_LAYOUT,
+    drawn_from_triangles,
     in_pieces,
     objects_of,
     on_voxels,
@@ -48,6 +49,7 @@ __all__ = [
     "cameras_around",
     "cast_rays",
     "contaminated",
+    "drawn_from_triangles",
     "fuse_frames",
     "in_pieces",
     "make_kinect_room",

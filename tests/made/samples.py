@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.made.cameras import cameras_around, fuse_frames, render_depth
-from torchrg.neighbors import sample_voxels
+from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.scenes import RoomLayout, Scene, SceneModel
 from torchrg.structures import UNLABELED
 
@@ -66,6 +66,29 @@ def in_pieces(scene: Scene, num_points: int, *, num_pieces: int = 40, seed: int 
     share = num_points // num_pieces
     kept = np.concatenate([rng.permutation(rows)[:share] for rows in pieces])
     return take_rows(scene, torch.from_numpy(kept))
+
+
+def drawn_from_triangles(scene: Scene, num_points: int, *, seed: int = 0) -> Scene:
+    """Return points drawn from triangles between near points, as S3DIS is drawn from meshes.
+
+    A triangle is a point and two of its six neighbours; a point of it belongs to the face of the
+    nearest corner.
+
+    Example:
+        >>> from torchrg.scenes import make_room
+        >>> drawn_from_triangles(make_room(1000), 3000).points.shape
+        torch.Size([3000, 3])
+    """
+    rng, num_neighbors = np.random.default_rng(seed), 6
+    near = search_knn(scene.points, 1 + num_neighbors).indices.numpy()
+    starts = rng.integers(0, len(near), num_points)
+    others = rng.permuted(np.tile(np.arange(1, 1 + num_neighbors), (num_points, 1)), axis=1)[:, :2]
+    corners = np.column_stack([starts, np.take_along_axis(near[starts], others, axis=1)])
+    shares = rng.dirichlet((1, 1, 1), num_points)
+    places = np.einsum("nc,ncx->nx", shares, scene.points.numpy()[corners].astype(np.float64))
+    nearest = corners[np.arange(num_points), shares.argmax(axis=1)]
+    drawn = take_rows(scene, torch.from_numpy(nearest))
+    return drawn._replace(points=torch.from_numpy(places.astype(np.float32)))
 
 
 def quantised_frame(

@@ -8,7 +8,9 @@ import pytest
 import torch
 from scipy.stats import chisquare, kstest
 
+from tests.made import drawn_from_triangles
 from torchrg.errors import ConfigError
+from torchrg.neighbors import search_knn
 from torchrg.scenes import RoomLayout, build_room, make_room, sample_scene
 from torchrg.scenes.scene import is_occupied
 
@@ -295,3 +297,20 @@ def test_impossible_layouts_are_refused(layout, message):
 def test_rooms_that_cannot_be_furnished_are_refused(layout, message):
     with pytest.raises(ConfigError, match=message):
         build_room(layout=RoomLayout(**layout))
+
+
+def test_points_drawn_from_triangles_lie_on_them():
+    room = make_room(2000, 0.0, seed=3)
+    drawn = drawn_from_triangles(room, 6000)
+    # Where all points around are of one plane, so is what is drawn between them.
+    around = search_knn(room.points, 20).indices.long()
+    inside = (room.labels[around] == room.labels[:, None]).all(dim=1) & room.planar[room.labels]
+    corner = torch.cdist(drawn.points, room.points).argmin(dim=1)
+    flat = inside[corner] & (drawn.labels == room.labels[corner])
+    assert flat.sum() > 1000
+    offset = (drawn.points.double() * room.face_normals[drawn.labels]).sum(dim=1)
+    apart = (offset - room.face_offsets[drawn.labels])[flat].abs()
+    assert (apart < 1e-5).float().mean() > 0.98
+    # No corner is drawn twice as it is, and all parts of the room are drawn from.
+    assert torch.cdist(drawn.points, room.points).min(dim=1).values.median() > 0.02
+    assert len(corner.unique()) > 1500
