@@ -82,8 +82,9 @@ def _of_chunk(rows: Tensor) -> Tensor:
             _fill_up(state.flatten()[left]).view(-1, _LANES)
             for state in (low, num_low, next_low, high, num_high)
         )
-        share = 0.5 if is_middle else (rank - 0.5 - num_low) / (num_high - num_low)
-        pivot = torch.maximum(_inside(low + (high - low) * share, low, high), next_low)
+        guess = low + (high - low) * (rank - 0.5 - num_low) / (num_high - num_low)
+        # In turns with the middle, which is also taken for a guess that is no better than a bound.
+        pivot = torch.maximum(_inside(low if is_middle else guess, low, high), next_low)
         is_middle = not is_middle
 
 
