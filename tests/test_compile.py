@@ -120,6 +120,23 @@ def test_a_row_alone_is_done_twice(monkeypatch):
     assert asked == [[(2, 4), (2,), (5,)]]
 
 
+def test_a_last_row_alone_and_axes_that_follow_from_others(monkeypatch):
+    asked = []
+
+    def code(tensors):
+        asked.append([tuple(tensor.shape) for tensor in tensors])
+        return (tensors[0] + tensors[1],)
+
+    added = Kernel(lambda a, b: (a + b,), ["2L+1 n", "n"])
+    monkeypatch.setattr(Kernel, "_load", lambda self, signature: code)
+    with compiled():
+        assert torch.equal(added(torch.ones(9, 1), torch.ones(1))[0], torch.full((9, 1), 2.0))
+        assert added(torch.ones(6, 4), torch.ones(4))[0].shape == (6, 4)
+    assert asked == [[(9, 2), (2,)]]
+    lengths = dict(zip(["16", "n", "3L+1", "2L"], [16, 5, 16, 10], strict=True))
+    assert {axis: _compile._length(axis, 5) for axis in lengths} == lengths
+
+
 def test_gradients_need_the_written_code():
     @kernel("n K")
     def doubled(values):
@@ -158,10 +175,11 @@ def test_code_gives_the_same_bits_for_any_rows_and_is_made_anew_if_torn(folder):
 
 @needs_compiler
 @pytest.mark.slow
-def test_compiled_results_do_not_depend_on_order_chunks_threads_or_tiles(tmp_path):
+@pytest.mark.parametrize("preset", ["consensus", "paper"])
+def test_compiled_results_do_not_depend_on_order_chunks_threads_or_tiles(preset, tmp_path):
     """And they are those of the written code, to rounding; the code stays in the user's folder."""
     points = make_room(20_000, 0.003, seed=5).points
-    config = dataclasses.replace(load_config("consensus"), compile=True)
+    config = dataclasses.replace(load_config(preset), compile=True)
     expected = segment_planes(points, config)
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))
     shuffled = segment_planes(points[order], dataclasses.replace(config, chunk_size=777))
@@ -177,7 +195,7 @@ def test_compiled_results_do_not_depend_on_order_chunks_threads_or_tiles(tmp_pat
     in_tiles = segment_planes(points, config, store=TileStore(tmp_path, tile_size=6000))
     assert torch.equal(torch.as_tensor(in_tiles.labels), expected.labels)
     assert torch.equal(torch.as_tensor(in_tiles.normals), expected.normals)
-    written = segment_planes(points, load_config("consensus"))
+    written = segment_planes(points, load_config(preset))
     assert score_labels(written.labels, expected.labels).ari > 0.9999
     script = "from torchrg import _compile; print('torch._dynamo' in __import__('sys').modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)

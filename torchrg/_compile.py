@@ -97,14 +97,17 @@ class Kernel:
         # The code is for two rows and more.
         axes = [a for a, value in zip(self.axes, arguments, strict=True) if _is_tensor(value)]
         twice = [
-            torch.cat([tensor] * (1 + (own[0] == ROWS)))
+            torch.cat([tensor] * 2, dim=own.index(ROWS)) if ROWS in own else tensor
             for tensor, own in zip(tensors, axes, strict=True)
         ]
-        return tuple(found[:1] for found in run(twice))
+        is_last = any(own[-1] == ROWS for own in axes if len(own) > 1)
+        return tuple(found[..., :1] if is_last else found[:1] for found in run(twice))
 
     def _num_rows(self, arguments: Sequence[object]) -> int:
         """Return the number of rows, 0 where the code is not for tensors like these."""
         num_rows = 0
+        if len(arguments) != len(self.axes):
+            return 0
         for axes, value in zip(self.axes, arguments, strict=True):
             if not isinstance(value, Tensor):
                 continue
@@ -113,7 +116,9 @@ class Kernel:
             for letter, length in zip(axes, value.shape, strict=True):
                 if letter == ROWS:
                     num_rows = length
-                elif length < _LEAST_LENGTH and not letter.isdigit():
+                    continue
+                least = _length(letter, _LEAST_LENGTH)
+                if length < least or (length > least and not _letter(letter)):
                     return 0
         return num_rows
 
@@ -145,15 +150,21 @@ class Kernel:
         tensors, sizes = [], []
         for kind, axes in zip(signature, self.axes, strict=True):
             if isinstance(kind, str):
-                letters = [letter for letter in axes if not letter.isdigit()]
-                for letter in letters:
-                    lengths.setdefault(letter, _EXAMPLE_LENGTH + 2 * len(lengths))
-                shape = [lengths.get(letter) or int(letter) for letter in axes]
+                for axis in axes:
+                    lengths.setdefault(_letter(axis), _EXAMPLE_LENGTH + 2 * len(lengths))
+                shape = [_length(axis, lengths[_letter(axis)]) for axis in axes]
                 tensors.append(torch.zeros(shape, dtype=getattr(torch, kind)))
-                sizes.append({axes.index(letter): letter for letter in letters})
-        least = {letter: 2 if letter == ROWS else _LEAST_LENGTH for letter in lengths}
-        dims = {letter: torch.export.Dim(letter, min=least[letter]) for letter in lengths}
-        shapes = tuple({axis: dims[letter] for axis, letter in own.items()} for own in sizes)
+                sizes.append(axes)
+        least = {letter: 2 if letter == ROWS else _LEAST_LENGTH for letter in lengths if letter}
+        dims = {letter: torch.export.Dim(letter, min=least[letter]) for letter in least}
+        shapes = tuple(
+            {
+                place: _length(axis, dims[_letter(axis)])
+                for place, axis in enumerate(axes)
+                if _letter(axis)
+            }
+            for axes in sizes
+        )
         run = partial(self._run_eagerly, signature)
 
         class Program(torch.nn.Module):
@@ -171,7 +182,9 @@ def kernel(*axes: str) -> Callable[[Callable[..., Outputs]], Kernel]:
 
     Args:
         axes: For each argument the letters of its axes, equal letters for equal lengths, ``n`` for
-            rows, any other for a length of three and more; a number for an axis of that length.
+            rows, which are the first or the last axis, also of what is returned; any other for a
+            length of three and more; a number for an axis of that length, and such as ``3L+1`` for
+            one that follows from another.
 
     Example:
         >>> @kernel("n K", "n")
@@ -181,6 +194,11 @@ def kernel(*axes: str) -> Callable[[Callable[..., Outputs]], Kernel]:
         tensor(9.)
     """
     return lambda function: Kernel(function, axes)
+
+
+def is_compiled() -> bool:
+    """Return whether kernels run compiled, for work that is done in another way then."""
+    return _is_active.get() and not torch.compiler.is_compiling()
 
 
 @contextlib.contextmanager
@@ -394,6 +412,21 @@ def _kind(value: object) -> Kind:
         return str(value.dtype).removeprefix("torch.")
     assert value is None or isinstance(value, int | float)  # noqa: S101
     return value
+
+
+def _letter(axis: str) -> str:
+    """Return the letter of an axis, nothing for one of a fixed length."""
+    return "".join(filter(str.isalpha, axis))
+
+
+def _length(axis: str, of_letter: Any) -> Any:  # noqa: ANN401 - a number, or torch's symbol for one
+    """Return the length of an axis, such as ``n``, ``3`` or ``3L+1``, from that of its letter."""
+    letter = _letter(axis)
+    if not letter:
+        return int(axis)
+    factor, offset = axis.split(letter)
+    length = int(factor) * of_letter if factor else of_letter
+    return length + int(offset) if offset else length
 
 
 def _is_tensor(value: object) -> bool:

@@ -137,7 +137,7 @@ def fit_ellipsoid(
     return Ellipsoid(means, residuals, squares, singular)
 
 
-def determinant(ellipsoid: Ellipsoid, denominator: float) -> Tensor:
+def determinant(ellipsoid: Ellipsoid, denominator: Tensor | float) -> Tensor:
     """Determinant of the scatter over ``denominator``, shape ``(M,)``, float64."""
     product = torch.ones_like(ellipsoid.squares[0], dtype=torch.float64)
     for square in ellipsoid.squares:

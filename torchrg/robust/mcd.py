@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
+from torchrg._compile import kernel
 from torchrg._parallel import chunks_of
 from torchrg.errors import ConfigError
 from torchrg.robust.lanes import (
@@ -343,15 +344,14 @@ def _concentrate(
     distinct = _first_of_equal(members, places, shape)
     places, members = places[distinct], members.index_select(1, distinct)
     points, floors = take_lanes(columns, places % num_lanes), floor[places % num_lanes]
-    ellipsoid = fit_ellipsoid(points, members, initial_size, floors)
-    members = smallest_points(sq_distances(ellipsoid, initial_size - 1), size)
+    distances, _ = _to_sets(members, floor.new_tensor(initial_size), floors, *points)
+    members, full_size = smallest_points(distances, size), floor.new_tensor(size)
     moving, previous = _first_of_equal(members, places, shape), best[places]
     for step in range(max_steps + 1):
         points, members = take_lanes(points, moving), members.index_select(1, moving)
         floors, places, previous = floors[moving], places[moving], previous[moving]
-        ellipsoid = fit_ellipsoid(points, members, size, floors)
-        value = determinant(ellipsoid, size - 1)
-        candidate = smallest_points(sq_distances(ellipsoid, size - 1), size)
+        distances, value = _to_sets(members, full_size, floors, *points)
+        candidate = smallest_points(distances, size)
         # Rounding may let the determinant grow, or two sets of tied points follow each other.
         converged = (sum_points(candidate * members) >= size) | ~(value < previous)
         converged |= step == max_steps
@@ -362,6 +362,15 @@ def _concentrate(
             break
         members, previous = candidate, value
     return _Concentrated(final.reshape(num_points, *shape), best.reshape(shape))
+
+
+@kernel("K n", "", "n", "K n", "K n", "K n")
+def _to_sets(
+    members: Tensor, size: Tensor, floor: Tensor, *columns: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return squared distances ``(K, M)`` to the scatters of sets, and their determinants."""
+    ellipsoid = fit_ellipsoid(list(columns), members, size, floor)
+    return sq_distances(ellipsoid, size - 1), determinant(ellipsoid, size - 1)
 
 
 def _first_of_equal(members: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
