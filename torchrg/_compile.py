@@ -57,7 +57,7 @@ _MAX_CALLS = 64
 _DIGEST_BYTES = 32
 """Length of the digest behind the code in a file."""
 
-_is_active: ContextVar[bool] = ContextVar("is_active", default=False)
+is_active: ContextVar[bool] = ContextVar("is_active", default=False)
 """Whether kernels run compiled."""
 
 _needed: ContextVar[dict[tuple["Kernel", Signature], None] | None] = ContextVar("needed")
@@ -77,7 +77,7 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Outputs:  # noqa: ANN401
         """Return what the function returns."""
-        if torch.compiler.is_compiling() or not _is_active.get():
+        if torch.compiler.is_compiling() or not is_active.get():
             return self.function(*arguments)
         signature = tuple(map(_kind, arguments))
         needed = _needed.get(None)
@@ -85,11 +85,11 @@ class Kernel:
         if needed is not None and num_rows:
             needed[self, signature] = None
         if needed is not None or num_rows == 0:
-            token = _is_active.set(False)  # kernels within kernels are a part of them
+            token = is_active.set(False)  # kernels within kernels are a part of them
             try:
                 return self.function(*arguments)
             finally:
-                _is_active.reset(token)
+                is_active.reset(token)
         run = self._code.get(signature) or self._load(signature)
         tensors = [value.contiguous() for value in arguments if isinstance(value, Tensor)]
         if num_rows > 1:
@@ -196,11 +196,6 @@ def kernel(*axes: str) -> Callable[[Callable[..., Outputs]], Kernel]:
     return lambda function: Kernel(function, axes)
 
 
-def is_compiled() -> bool:
-    """Return whether kernels run compiled, for work that is done in another way then."""
-    return _is_active.get() and not torch.compiler.is_compiling()
-
-
 @contextlib.contextmanager
 def compiled(active: bool = True) -> Iterator[None]:
     """Let kernels run compiled, or leave all as it is.
@@ -209,11 +204,11 @@ def compiled(active: bool = True) -> Iterator[None]:
         >>> with compiled(False):
         ...     pass
     """
-    token = _is_active.set(active or _is_active.get())
+    token = is_active.set(active or is_active.get())
     try:
         yield
     finally:
-        _is_active.reset(token)
+        is_active.reset(token)
 
 
 def prepare(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._compile import is_compiled
+from torchrg._compile import is_active
 from torchrg._opaque import opaque
 from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks
 from torchrg.errors import ShapeError
@@ -349,9 +349,10 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
-    ends = sorted_rows[:, :: max(sorted_rows.shape[1] - 1, 1)]
-    if is_compiled() and sorted_rows.device.type == "cpu" and bool(ends.isfinite().all()):
-        return majority_difference(sorted_rows)
+    if is_active.get() and sorted_rows.device.type == "cpu":
+        ends = sorted_rows[:, :: max(sorted_rows.shape[1] - 1, 1)]
+        if bool(ends.isfinite().all()):
+            return majority_difference(sorted_rows)
     rank = comb(half_size(sorted_rows.shape[1]), 2)
     out = sorted_rows.new_empty(len(sorted_rows))
     _with_lags(sorted_rows, out, lambda lagged, rows: lagged.select(rows, rank), sorts=True)
