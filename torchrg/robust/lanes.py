@@ -150,7 +150,7 @@ def sq_distances(ellipsoid: Ellipsoid, denominator: Tensor | float) -> Tensor:
     distances = torch.zeros_like(ellipsoid.residuals[0])
     for residual, square in zip(ellipsoid.residuals, ellipsoid.squares, strict=True):
         term = residual * residual
-        distances += term.mul_(denominator / square)
+        distances += term.mul_(square.reciprocal() * denominator)
     return distances
 
 
