@@ -10,7 +10,7 @@ from torchrg.errors import ConfigError
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.adjacency import NearestPoints
+from torchrg.regions.adjacency import LEAST_CONTACTS, NearestPoints
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
 from torchrg.regions.growth import label_regions
@@ -181,6 +181,28 @@ def test_pieces_across_a_gap_are_not_merged():
     assert len(NearestPoints(cloud.neighbors).contacts(labels)[0]) == 0
     refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
     assert torch.equal(refined, labels)
+
+
+@pytest.mark.parametrize(
+    ("gap", "step", "merged"), [(0.03, 0.0, True), (0.2, 0.0, False), (0.03, 0.01, False)]
+)
+def test_halves_of_a_rim_are_merged_though_other_faces_are_nearer(gap, step, merged):
+    """The rim of a plate of 4 cm, two or three rows of points, broken in the middle."""
+    rng = np.random.default_rng(12)
+    top, bottom = (sheet(rng, 3000, 0.001) * (1.2, 0.4, 1) for _ in range(2))
+    rim = (sheet(rng, 300, 0.001) * (1.2, -0.04, 1))[:, [0, 2, 1]]
+    rim[:, 1] -= step * (rim[:, 0] > 0.6)
+    bottom[:, 2] -= 0.04
+    parts = np.where(abs(rim[:, 0] - 0.6) < gap / 2, UNLABELED, rim[:, 0] > 0.6)
+    faces = np.concatenate([np.full(3000, 2), np.full(3000, 3), parts])
+    normals = np.repeat(np.eye(3)[[2, 2, 1]], [3000, 3000, 300], axis=0)
+    cloud, order = flat_cloud(np.concatenate([top, bottom, rim]), k=50, normals=normals)
+    labels = torch.from_numpy(faces)[order]
+    pairs, counts = NearestPoints(cloud.neighbors).contacts(labels)
+    assert counts[(pairs == torch.tensor([0, 1])).all(dim=1)].sum() < LEAST_CONTACTS
+    refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
+    assert bool((refined == torch.where(labels == 1, 0, labels)).all()) == merged
+    assert merged or torch.equal(refined, labels)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])

@@ -301,6 +301,7 @@ def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
         floor=noise,
         reach=torch.full_like(noise, torch.inf),
         bent=torch.zeros_like(noise, dtype=torch.bool),
+        radius=torch.zeros_like(noise),
     )
 
 

@@ -121,11 +121,19 @@ class NearestPoints:
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of regions that touch, and the number of contacts of each pair.
 
-        Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending,
-        and counts ``(E,)``.
+        As :func:`find_contacts` gives them.
         """
-        border = _Border(labels, self.neighbors)
-        return border.pairs, border.counts
+        return find_contacts(labels, self.neighbors)
+
+
+def find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
+    """Return the pairs of regions with neighbours of each other, and how often they are.
+
+    Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending, and
+    counts ``(E,)``.
+    """
+    border = _Border(labels, neighbors)
+    return border.pairs, border.counts
 
 
 class _Contacts(NamedTuple):

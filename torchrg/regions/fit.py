@@ -54,6 +54,10 @@ _LEAST_HEIGHT = 0.2
 of a sphere 0.41. Scattered normals in a thin region are noise."""
 
 
+_SQ_WIDTH = 12.0
+"""Variances. Square of the width of a strip that points cover evenly."""
+
+
 class RegionPlanes(NamedTuple):
     """Planes of M regions, and what is known of their noise, in float64.
 
@@ -70,6 +74,8 @@ class RegionPlanes(NamedTuple):
         reach: Median distance within which the points take others for coplanar, shape ``(M,)``,
             infinite where that is not known.
         bent: Whether noise does not explain the thickness, shape ``(M,)``, bool.
+        radius: Median distance of the points to the last of their neighbours, shape ``(M,)``, 0
+            where there are none.
     """
 
     normal: Tensor
@@ -82,6 +88,13 @@ class RegionPlanes(NamedTuple):
     floor: Tensor
     reach: Tensor
     bent: Tensor
+    radius: Tensor
+
+    @property
+    def strips(self) -> Tensor:
+        """Whether a flat region is narrower than its neighbourhoods reach, shape ``(M,)``, bool."""
+        width = (_SQ_WIDTH * eigh3_of_few(self.covariance)[0][:, 1].clamp(min=0)).sqrt()
+        return ~self.curved & (width <= self.radius)
 
     @property
     def noise(self) -> Tensor:
@@ -166,6 +179,7 @@ def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> Region
         floor=torch.zeros_like(thickness),
         reach=torch.full_like(thickness, torch.inf),
         bent=torch.zeros_like(crosses),
+        radius=torch.zeros_like(thickness),
     )
 
 
@@ -185,12 +199,14 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
         neighborhood_radii(cloud.points, cloud.neighbors.at(rows))
         for rows in torch.split(segments.rows, ROWS_AT_ONCE)
     ]
-    floor = config.coplanarity_floor * segments.median(torch.cat(radii)).double()
+    radius = segments.median(torch.cat(radii)).double()
+    floor = config.coplanarity_floor * radius
     facets = _FACET_THICKNESS * (config.facet_tolerance or 0.0)
     planes = planes._replace(
         thickness=torch.maximum(planes.thickness, floor).clamp(min=facets),
         num_points=torch.bincount(labels + 1, minlength=1)[1:],
         floor=floor,
+        radius=radius,
     )
     if cloud.reach is None:
         return planes

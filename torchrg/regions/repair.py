@@ -10,7 +10,12 @@ from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_chunks
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments
-from torchrg.regions.adjacency import LEAST_CONTACTS, PARALLEL_DEG, NearestPoints
+from torchrg.regions.adjacency import (
+    LEAST_CONTACTS,
+    PARALLEL_DEG,
+    NearestPoints,
+    find_contacts,
+)
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
@@ -80,8 +85,9 @@ def refine_regions(
         )
         labels = _drop_small(labels, config.min_size)
     if config.merge_coplanar:
-        contacts, tolerance = beside.contacts(labels), config.merge_tolerance
-        labels = merge_coplanar(labels, contacts, fits.of(labels), tolerance=tolerance)
+        planes = fits.of(labels)
+        contacts = _contacts_to_merge(labels, beside, planes, cloud.neighbors)
+        labels = merge_coplanar(labels, contacts, planes, tolerance=config.merge_tolerance)
     if config.refine_borders:
         labels = _drop_small(labels, 1)
         planes = fits.of(labels)
@@ -166,6 +172,23 @@ def _least(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
     least = cost.amin(dim=1, keepdim=True)
     ranked = torch.where(cost == least, options, torch.iinfo(options.dtype).max)
     return ranked.amin(dim=1), least.squeeze(1)
+
+
+def _contacts_to_merge(
+    labels: Tensor, beside: NearestPoints, planes: RegionPlanes, neighbors: Neighbors
+) -> tuple[Tensor, Tensor]:
+    """Return pairs of regions that touch, and their contacts; of two strips all neighbours count.
+
+    Around the end of a strip that is narrower than a neighbourhood, such as the rim of a table top,
+    the nearest points are those of the faces beside it. A pair may be there twice.
+    """
+    strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
+    parts = (
+        beside.contacts(labels),
+        find_contacts(torch.where(strips, labels, UNLABELED), neighbors),
+    )
+    pairs, counts = (torch.cat(values) for values in zip(*parts, strict=True))
+    return pairs, counts
 
 
 def merge_coplanar(
