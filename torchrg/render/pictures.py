@@ -20,6 +20,7 @@ from torchrg.render.cutaway import View, choose_viewpoint
 from torchrg.render.grid import CloudGrid, build_grid, local_spacing, surface_cells
 from torchrg.render.raster import (
     DepthBuffer,
+    Discs,
     close_gaps,
     depth_and_colors,
     light_colors,
@@ -83,21 +84,23 @@ def draw_picture(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
     cells = surface_cells(grid) if normals is None else None
-    for some in torch.split(places, _POINTS_AT_ONCE):
+
+    def discs_of(some: Tensor) -> Discs:
         rows = grid.rows[some]
         if cells is not None:
             slant = cells.normals[cells.cell_of[some]]
         elif normals is not None:
             slant = normals[rows].float()
-        _draw_points(
-            buffer,
-            project,
-            grid.points[some],
-            colors[rows],
-            slant,
-            lengths[some],
-            least=supersampling / 2,
+        return _discs(
+            project, grid.points[some], colors[rows], slant, lengths[some], least=supersampling / 2
         )
+
+    parts = torch.split(places, _POINTS_AT_ONCE)
+    for some in parts:
+        buffer.draw(discs_of(some))
+    buffer.end_drawing()
+    for some in parts:
+        buffer.paint(discs_of(some))
     reach = max(1, round(_GAP * min(radius, widest)))
     depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
     brightness = shade_hollows(
@@ -123,8 +126,7 @@ def _usual_radius(
     )
 
 
-def _draw_points(
-    buffer: DepthBuffer,
+def _discs(
     project: Projection,
     points: Tensor,
     colors: Tensor,
@@ -132,8 +134,8 @@ def _draw_points(
     lengths: Tensor,
     *,
     least: float,
-) -> None:
-    """Draw points as lit discs of radii ``lengths`` in the unit of the cloud, ``least`` in pixels.
+) -> Discs:
+    """Return lit discs of radii ``lengths`` in the unit of the cloud, at least ``least`` in pixels.
 
     Points behind the camera do not show.
     """
@@ -148,7 +150,7 @@ def _draw_points(
     along = torch.where(
         along.abs() < _STEEPEST, torch.where(along < 0, -_STEEPEST, _STEEPEST), along
     )
-    buffer.draw_discs(
+    return Discs(
         pixels,
         inverse,
         light_colors(colors, normals, positions),

@@ -1,18 +1,34 @@
-"""A depth buffer into which points are drawn as small tilted discs.
+"""A picture of points that are drawn as small tilted discs, in two passes.
 
-A pixel is one 64-bit key: the bits of the inverse depth (a positive float, which as an integer has
-the same order) above three bytes of colour. The nearest disc is the largest key, so equal depths
-are decided by colour and never by the order of the points.
+The first pass finds the nearest disc of each pixel. Discs reach past the edge of their face, where
+they hide the face beyond it. The second pass therefore gives a pixel the colour of the disc whose
+middle is nearest to it in the picture, among those that the nearest disc may hide in this way: it
+overhangs them by no more than discs are wide, and the middle of the nearest one is not in front of
+their plane, as it is if it belongs to a surface that truly hides them. Equal distances are decided
+by colour, never by the order of the points.
 """
 
 import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-_NOTHING = 0xFFFFFF
-"""Key of a pixel in which nothing is drawn: white, and infinitely far away."""
+_WHITE = 0xFFFFFF
+"""Three bytes of colour where nothing is drawn."""
+_DEPTH_BITS = 32
+"""Bits of a key below those of the depth."""
+_OVERHANG = 2.0
+"""Radii of a disc, in depth. So much nearer than another can a disc be where both reach past an
+edge, from either side: a radius each."""
+_DOME = 0.1
+"""Radii of a disc, in depth. Discs are curved by so much, so that of those in one plane the nearest
+is that with the nearest middle."""
+_FLAT = 0.1
+"""Radii of a disc, in depth. Noise puts middles of one face off the planes of its discs. With 0
+twice as many pixels of noisy boxes have the colour of another face."""
 _LIGHT = (-0.45, -0.7, -0.55)
 """Direction toward the light in the axes of the camera: from the left, above, and behind it."""
 _DARKEST = 0.62
@@ -26,6 +42,45 @@ _NOISE = 0.35
 """Tangent of a bend over the radius of one disc. A smaller bend is noise and is not shown."""
 
 
+class Discs(NamedTuple):
+    """Discs of surface, as a picture shows them.
+
+    The inverse depth of a plane is linear over its picture, so a disc is given by the value at its
+    middle and two slopes.
+
+    Attributes:
+        pixels: Column and row of the middles, shape ``(N, 2)``; whole numbers are the centres of
+            pixels. Discs with their middle outside the picture are left out.
+        inverse_depth: One over the depth, positive, shape ``(N,)``, float32.
+        colors: Shape ``(N, 3)``, uint8.
+        radii: In pixels, shape ``(N,)``; every disc covers at least one pixel.
+        slopes: Change of the inverse depth per pixel to the right and down, shape ``(N, 2)``.
+        max_change: A disc ends where its inverse depth differs by more than this from that of its
+            middle, and is about as near as another that differs by no more, shape ``(N,)``.
+    """
+
+    pixels: Tensor
+    inverse_depth: Tensor
+    colors: Tensor
+    radii: Tensor
+    slopes: Tensor
+    max_change: Tensor
+
+    def off_pixels(self) -> Tensor:
+        """Return how far the middles are from the centres of their pixels, shape ``(N, 2)``."""
+        return self.pixels - self.pixels.round()
+
+    def depth_of_pixels(self) -> Tensor:
+        """Return the inverse depth of the planes at the centres of the middles' pixels."""
+        return self.inverse_depth - (self.slopes * self.off_pixels()).sum(dim=1)
+
+    def at(self, rows: Tensor) -> "Discs":
+        """Return some of the discs."""
+        some = Discs(*(values.index_select(0, rows) for values in self))
+        # Columns in one piece are read faster.
+        return some._replace(slopes=some.slopes.T.contiguous().T)
+
+
 class DepthBuffer:
     """What is nearest in each pixel of a picture.
 
@@ -36,12 +91,15 @@ class DepthBuffer:
         device: Where to draw.
 
     Example:
-        >>> buffer = DepthBuffer(2, 1, max_radius=0)
-        >>> middle = torch.tensor([[1.0, 0.0], [1.0, 0.0]])
+        >>> buffer = DepthBuffer(3, 1, max_radius=1)
         >>> colors = torch.tensor([[9, 9, 9], [7, 7, 7]], dtype=torch.uint8)
-        >>> buffer.draw_discs(middle, torch.tensor([0.5, 0.2]), colors, torch.zeros(2))
+        >>> ends, flat = torch.tensor([[0.0, 0.0], [2.0, 0.0]]), torch.zeros(2, 2)
+        >>> discs = Discs(ends, torch.ones(2), colors, torch.ones(2), flat, torch.zeros(2))
+        >>> buffer.draw(discs)
+        >>> buffer.end_drawing()
+        >>> buffer.paint(discs)
         >>> depth_and_colors(buffer.keys())[1].tolist()
-        [[[255, 255, 255], [9, 9, 9]]]
+        [[[9, 9, 9], [9, 9, 9], [7, 7, 7]]]
     """
 
     def __init__(
@@ -52,88 +110,123 @@ class DepthBuffer:
         self._margin = math.ceil(max_radius)
         self._stride = width + 2 * self._margin
         size = self._stride * (height + 2 * self._margin)
-        self._keys = torch.full((size,), _NOTHING, dtype=torch.int64, device=device)
+        # The bits of an inverse depth, which have its order, above the number of a disc.
+        self._front = torch.zeros(size, dtype=torch.int64, device=device)
+        # The bits of what tells how near a middle is, above three bytes of colour.
+        self._colors = torch.full((size,), _WHITE, dtype=torch.int64, device=device)
+        # Column, row and inverse depth of the middles of all discs, after that of none; the same of
+        # the nearest disc of each pixel, and its inverse depth there.
+        self._middles, self._nearest = (torch.zeros(1, n, device=device) for n in (3, 4))
 
     def keys(self) -> Tensor:
-        """Return the keys, shape ``(height, width)``, int64; see :func:`depth_and_colors`."""
+        """Return a key of each pixel ``(height, width)``, int64; see :func:`depth_and_colors`."""
         shown = slice(self._margin, self._margin + self.height)
         columns = slice(self._margin, self._margin + self.width)
-        return self._keys.view(-1, self._stride)[shown, columns].contiguous()
+        front, colors = (
+            values.view(-1, self._stride)[shown, columns] for values in (self._front, self._colors)
+        )
+        return (front >> _DEPTH_BITS << _DEPTH_BITS) | (colors & _WHITE)
 
-    def draw_discs(
-        self,
-        pixels: Tensor,
-        inverse_depth: Tensor,
-        colors: Tensor,
-        radii: Tensor,
-        *,
-        slopes: Tensor | None = None,
-        max_change: Tensor | None = None,
-    ) -> None:
-        """Draw discs of surface.
+    def draw(self, discs: Discs) -> None:
+        """Find the nearest disc of each pixel, the first pass."""
+        number = torch.arange(len(discs.pixels), device=self._front.device) + len(self._middles)
+        middles = torch.cat([discs.pixels, discs.inverse_depth[:, None]], dim=1)
+        self._middles = torch.cat([self._middles, middles])
+        order, sizes, places = self._by_size(discs)
+        shown, number = discs.at(order), number.index_select(0, order)
+        start = shown.depth_of_pixels()
+        dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
+        for dx, dy, count in _pixels_of(sizes):
+            depth = _depth_beside(shown, start, dx, dy, count)
+            depth.sub_(dome[:count], alpha=dx * dx + dy * dy)
+            keys = depth.view(torch.int32).long() << _DEPTH_BITS
+            place = places[:count] + self._step(dx, dy)
+            self._front.scatter_reduce_(0, place, keys.bitwise_or_(number[:count]), "amax")
 
-        The inverse depth of a plane is linear over its picture, so a disc is given by the value at
-        its middle and two slopes. Middles are rounded to whole pixels.
+    def end_drawing(self) -> None:
+        """Look up the nearest discs, between the passes."""
+        number = self._front & (2**_DEPTH_BITS - 1)
+        depth = (self._front >> _DEPTH_BITS).int().view(torch.float32)[:, None]
+        self._nearest = torch.cat([self._middles.index_select(0, number), depth], dim=1)
 
-        Args:
-            pixels: Column and row of the middles, shape ``(N, 2)``; whole numbers are the centres
-                of pixels. Discs with their middle outside the picture are left out.
-            inverse_depth: One over the depth, positive, shape ``(N,)``, float32.
-            colors: Shape ``(N, 3)``, uint8.
-            radii: In pixels, shape ``(N,)``; every disc covers at least one pixel.
-            slopes: Change of the inverse depth per pixel to the right and down, shape ``(N, 2)``.
-                Default: discs face the camera.
-            max_change: A disc ends where its inverse depth differs by more than this from that of
-                its middle, shape ``(N,)``. Given together with ``slopes``.
-        """
-        middle = pixels.round()
+    def paint(self, discs: Discs) -> None:
+        """Colour what discs cover, the second pass."""
+        order, sizes, places = self._by_size(discs)
+        shown = discs.at(order)
+        away_x, away_y = shown.off_pixels().T.contiguous()
+        start = shown.depth_of_pixels()
+        slope_x, slope_y = shown.slopes.T
+        # The inverse depth of a disc's plane in the corner of the picture, and what noise adds.
+        corner = shown.inverse_depth - (shown.slopes * shown.pixels).sum(dim=1)
+        corner += _FLAT * shown.max_change
+        keys = torch.zeros(len(sizes), 8, dtype=torch.uint8, device=discs.colors.device)
+        keys[:, :3] = shown.colors
+        nearness, keys = keys.view(torch.float32)[:, 1], keys.view(torch.int64).squeeze(-1)
+        for dx, dy, count in _pixels_of(sizes):
+            place = places[:count] + self._step(dx, dy)
+            x, y, at_middle, front = self._nearest.index_select(0, place).unbind(dim=1)
+            own = _depth_beside(shown, start, dx, dy, count)
+            seen = own.add_(shown.max_change[:count], alpha=_OVERHANG) >= front
+            seen &= x.mul_(slope_x[:count]) + y.mul_(slope_y[:count]) + corner[:count] >= at_middle
+            sq_distance = (away_x[:count] - dx).square_()
+            sq_distance += (away_y[:count] - dy).square_()
+            nearness[:count] = sq_distance.add_(1).reciprocal_().mul_(seen)
+            self._colors.scatter_reduce_(0, place, keys[:count], "amax")
+
+    def _step(self, dx: int, dy: int) -> int:
+        """Return how many places a pixel is from another."""
+        return dy * self._stride + dx
+
+    def _by_size(self, discs: Discs) -> tuple[Tensor, Tensor, Tensor]:
+        """Return which discs show, the largest first, their radii, and places of the middles."""
+        middle = discs.pixels.round()
         inside = (middle >= 0) & (middle < middle.new_tensor([self.width, self.height]))
         # Few sizes and a stable sort keep discs that are close in space close in memory.
-        sizes = (2 * radii.clamp(max=self.max_radius)).round() / 2
+        sizes = (2 * discs.radii.clamp(max=self.max_radius)).round() / 2
         sizes, order = torch.where(inside.all(dim=-1), sizes, -1.0).sort(
             descending=True, stable=True
         )
         order = order[: int((sizes >= 0).sum())]
         column, row = (middle[order] + self._margin).long().unbind(dim=-1)
-        keys = torch.zeros(len(order), 8, dtype=torch.uint8, device=colors.device)
-        keys[:, :3] = colors[order]
-        keys.view(torch.float32)[:, 1] = inverse_depth[order]
-        tilt = None
-        if slopes is not None and max_change is not None:
-            slope_x, slope_y = slopes[order].T.contiguous()
-            tilt = (inverse_depth[order], slope_x, slope_y, max_change[order])
-        self._draw(row * self._stride + column, sizes[: len(order)], keys.view(torch.int64), tilt)
+        return order, sizes[: len(order)], row * self._stride + column
 
-    def _draw(
-        self,
-        places: Tensor,
-        sizes: Tensor,
-        keys: Tensor,
-        tilt: tuple[Tensor, Tensor, Tensor, Tensor] | None,
-    ) -> None:
-        """Draw discs of descending size, all of them at once for each pixel of a disc."""
-        keys = keys.squeeze(-1)
-        depth = keys.view(torch.float32).view(-1, 2)[:, 1]
-        reach = int(sizes[0]) if len(sizes) else 0
-        steps = range(-reach, reach + 1)
-        offsets = [(dx, dy) for dy in steps for dx in steps]
-        distances = torch.tensor([math.hypot(dx, dy) for dx, dy in offsets], device=sizes.device)
-        counts = torch.searchsorted(-sizes, -distances.to(sizes.dtype), right=True).tolist()
-        for (dx, dy), count in zip(offsets, counts, strict=True):
-            count = len(places) if dx == dy == 0 else count
-            if count == 0:
-                continue
-            if tilt is not None:
-                middle, slope_x, slope_y, max_change = (part[:count] for part in tilt)
-                change = (slope_y * dy).add_(slope_x, alpha=dx)
-                ends = change.abs() > max_change
-                depth[:count] = change.add_(middle).masked_fill_(ends, 0.0)
-            offset = dy * self._stride + dx
-            self._keys.scatter_reduce_(0, places[:count] + offset, keys[:count], "amax")
+
+def _pixels_of(sizes: Tensor) -> Iterator[tuple[int, int, int]]:
+    """Yield the pixels of discs of descending sizes, and how many of the discs have each.
+
+    Pixels are columns and rows from the middle, which every disc has.
+    """
+    reach = int(sizes[0]) if len(sizes) else -1
+    steps = range(-reach, reach + 1)
+    offsets = [(dx, dy) for dy in steps for dx in steps]
+    distances = torch.tensor([math.hypot(dx, dy) for dx, dy in offsets], device=sizes.device)
+    counts = torch.searchsorted(-sizes, -distances.to(sizes.dtype), right=True).tolist()
+    for (dx, dy), count in zip(offsets, counts, strict=True):
+        count = len(sizes) if dx == dy == 0 else count
+        if count > 0:
+            yield dx, dy, count
+
+
+def _depth_beside(discs: Discs, start: Tensor, dx: int, dy: int, count: int) -> Tensor:
+    """Return the inverse depth of the first discs at a pixel of them, negative beyond their ends.
+
+    ``start`` is that of their planes at the pixel of the middle, which all discs cover.
+    """
+    slope_x, slope_y = discs.slopes[:count].unbind(dim=-1)
+    middle, limit = discs.inverse_depth[:count], discs.max_change[:count]
+    change = (slope_y * dy).add_(slope_x, alpha=dx).add_(start[:count]).sub_(middle)
+    if dx == dy == 0:
+        return change.clamp_(-limit, limit).add_(middle)
+    ends = change.abs() > limit
+    return change.add_(middle).masked_fill_(ends, -torch.inf)
 
 
 def depth_and_colors(keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Return views of the inverse depth ``(*)``, 0 for nothing, and of the colours ``(*, 3)``."""
+    """Return views of the inverse depth ``(*)``, 0 for nothing, and of the colours ``(*, 3)``.
+
+    A key has the bits of the inverse depth, a positive float, which as an integer has the same
+    order, above three bytes of colour: the nearest is the largest key.
+    """
     halves = keys.view(torch.float32).view(*keys.shape, 2)
     return halves[..., 1], keys.view(torch.uint8).view(*keys.shape, 8)[..., :3]
 
