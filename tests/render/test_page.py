@@ -14,6 +14,7 @@ pytest.importorskip("pydeck", reason="needs the extra view")
 
 from torchrg.cli import main
 from torchrg.errors import ConfigError, MissingDependencyError
+from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.channels import decode_directions, encode_directions
 from torchrg.render.content import NUM_STRATA
 from torchrg.render.page import make_page, write_page
@@ -163,6 +164,26 @@ def test_what_the_same_planes_have_beside_each_other_is_one_colour():
     page = make_page(Result(cloud), beside=Result(other))
     first, second = (unpacked(page, place)["plane colors"] for place in (0, 1))
     assert (first[:-1] == second[:-1][::-1]).all()
+
+
+@pytest.mark.parametrize("mode", ["plane", "superpoint", "normal", "curvature", "sharp"])
+def test_colours_are_those_of_pictures(mode):
+    """Of a sample of the points, with another axis up, as far as the page's numbers are as fine."""
+    cloud = room()
+    fields = {name: torch.from_numpy(values) for name, values in cloud.fields.items()}
+    colors = {
+        "plane": color_planes(fields["labels"], cloud.points),
+        "superpoint": color_planes(fields["superpoints"], cloud.points),
+        "normal": color_normals(fields["normals"], up=(0.0, 1.0, 0.0)),
+        "curvature": color_curvature(fields["curvature"]),
+        "sharp": color_sharp(fields["sharp"]),
+    }[mode]
+    page = make_page(Result(cloud), max_points=700, up=(0.0, 1.0, 0.0))
+    arrays, found = unpacked(page), places(page)
+    rows = [np.abs(cloud.coordinates - place).max(axis=1).argmin() for place in found]
+    shown = arrays[f"{mode} colors"][arrays[mode][:, 0]]
+    differences = np.abs(shown.astype(int) - colors[rows].numpy())
+    assert differences.max() <= (12 if mode in ("normal", "curvature") else 0)
 
 
 def test_errors_are_shown_against_a_truth():

@@ -135,19 +135,24 @@ def test_points_are_drawn_in_both_halves(tab):
         assert (side == 255).all(axis=2).mean() > 0.1
 
 
-def project(tab, points):
-    """Return pixels and distance of points: a pinhole camera by its definition."""
+def camera_of(tab):
+    """Return the axes, the focal length and the place of the viewer."""
     camera = tab.run("torchrg.state.camera")
-    height = tab.run("view.clientHeight")
     turn, tilt = np.radians([camera["rotationOrbit"], camera["rotationX"]])
     toward = np.array([-np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt), np.sin(tilt)])
     right = np.array([np.cos(turn), -np.sin(turn), 0])
     up = np.cross(toward, right)
-    focal = height / 2 / np.tan(np.radians(25))
+    focal = tab.run("view.clientHeight") / 2 / np.tan(np.radians(25))
     eye = np.array(camera["target"]) + toward * focal / 2 ** camera["zoom"]
+    return toward, right, up, focal, eye
+
+
+def project(tab, points):
+    """Return pixels and distance of points: a pinhole camera by its definition."""
+    toward, right, up, focal, eye = camera_of(tab)
     local = points - eye
     depth = -local @ toward
-    middle = np.array([tab.run("view.clientWidth") / 4, height / 2])
+    middle = np.array([tab.run("view.clientWidth") / 4, tab.run("view.clientHeight") / 2])
     pixels = middle + focal * np.stack([local @ right, -local @ up], axis=1) / depth[:, None]
     return pixels, depth
 
@@ -273,6 +278,43 @@ def test_colours_switch_and_outlines_and_normals_appear(tab):
         with_lines = tab.picture()
         assert (with_lines != normals).any(axis=2).mean() > 0.002
         normals = with_lines
+
+
+def test_the_outline_of_a_hidden_plane_hides_with_it(tab):
+    def num_black():
+        return (tab.picture() == 0).all(axis=2).sum()
+
+    before = num_black()
+    tab.run("torchrg.choose({ cloud: 0, plane: torchrg.page.clouds[0].order[0] })")
+    assert num_black() > before + 200
+    tab.run("torchrg.setHidden(0, [torchrg.state.picked.plane], true)")
+    assert num_black() <= before
+
+
+def test_discs_do_not_hide_the_face_beyond_an_edge(browser, tmp_path):
+    """Of a cube, pixels with the colour of a face that is not theirs, by rays. Flat discs: 7 %."""
+    rng = np.random.default_rng(0)
+    faces = np.arange(3000) % 6
+    points = rng.random((3000, 3))
+    points[np.arange(3000), faces // 2] = faces % 2
+    fields = {"labels": faces, "normals": np.eye(3, dtype=np.float32)[faces // 2]}
+    cube = Cloud(points.astype(np.float32), fields)
+    write_page(tmp_path / "cube.html", make_page(Result(cube), view="outside"))
+    tab = Tab(browser, tmp_path / "cube.html")
+    picture = tab.picture()
+    toward, right, up, focal, eye = camera_of(tab)
+    rows, columns = np.mgrid[: picture.shape[0], : picture.shape[1]] + 0.5
+    across = (columns - picture.shape[1] / 2)[..., None] / focal * right
+    rays = across - (rows - picture.shape[0] / 2)[..., None] / focal * up - toward
+    low, high = (-5 - eye) / rays, (5 - eye) / rays
+    axis = np.minimum(low, high).argmax(axis=2)
+    is_far = np.take_along_axis(high < low, axis[..., None], axis=2)[..., 0]
+    hit = np.minimum(low, high).max(axis=2) < np.maximum(low, high).min(axis=2)
+    colors = np.array(tab.run("[...torchrg.page.clouds[0].values['plane colors']]")).reshape(-1, 3)
+    hue, shades = (each / each.max(axis=-1, keepdims=True) for each in (picture + 1, colors[:6]))
+    seen = np.square(hue[:, :, None] - shades).sum(axis=3).argmin(axis=2)
+    assert (seen != 2 * axis + is_far)[hit].mean() < 0.05
+    tab.page.close()
 
 
 @pytest.mark.slow

@@ -112,7 +112,7 @@ def _write_picture(arguments: Arguments, result: Result, up: Direction | None) -
     cloud, normals = result.cloud, result.cloud.fields.get("normals")
     picture = render_cloud(
         cloud.points,
-        _colors(result, arguments.color),
+        _colors(result, arguments.color, up or (0.0, 0.0, 1.0)),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
         view=arguments.view,
         up=up or (0.0, 0.0, 1.0),
@@ -140,7 +140,7 @@ def _write_page(arguments: Arguments, result: Result, up: Direction | None) -> s
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
 
-def _colors(result: Result, color: PageColorBy | None) -> Tensor:
+def _colors(result: Result, color: PageColorBy | None, up: Direction) -> Tensor:
     """Return the colour of each point.
 
     Raises:
@@ -162,7 +162,7 @@ def _colors(result: Result, color: PageColorBy | None) -> Tensor:
     if color in ("plane", "superpoint"):
         return color_planes(values, cloud.points)
     if color == "normal":
-        return color_normals(values)
+        return color_normals(values, up=up)
     if color == "curvature":
         return color_curvature(values)
     return color_sharp(values) if color == "sharp" else values[:, :3]

@@ -17,7 +17,6 @@ from torchrg.render.colors import (
     color_curvature,
     color_normals,
     color_sharp,
-    palette_of_planes,
 )
 from torchrg.structures import UNLABELED
 
@@ -74,25 +73,23 @@ class Channel(NamedTuple):
 
 
 def channels_of(
-    points: Tensor,
     fields: Mapping[str, Tensor],
     truth: Mapping[str, Tensor],
-    *,
-    reference: Tensor | None = None,
+    palettes: Mapping[str, tuple[Tensor, Tensor]],
 ) -> Iterator[Channel]:
     """Yield all that the fields of points can be coloured by, in the order of :data:`MODES`.
 
     Args:
-        points: Shape ``(n, 3)``, finite; they tell which planes need unlike colours.
-        fields: Fields of those points; see :class:`torchrg.structures.Cloud`. Labels and
-            superpoints are numbered without gaps.
+        fields: Fields of n points; see :class:`torchrg.structures.Cloud`. Labels and superpoints
+            are numbered without gaps.
         truth: ``labels`` or ``normals`` of the same points.
-        reference: Labels whose planes shall have the same colours, shape ``(n,)``.
+        palettes: Of the modes ``plane`` and ``superpoint``, where there are such fields: what
+            :func:`torchrg.render.colors.palette_of_planes` returns, its first part for the points.
     """
     if "labels" in fields:
-        yield _of_regions("plane", fields["labels"], points, reference)
+        yield _of_regions("plane", fields["labels"], *palettes["plane"])
     if "superpoints" in fields:
-        yield _of_regions("superpoint", fields["superpoints"], points, None)
+        yield _of_regions("superpoint", fields["superpoints"], *palettes["superpoint"])
     if "color" in fields:
         yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:
@@ -112,9 +109,8 @@ def channels_of(
         yield _of_angles(unsigned_angle_deg(fields["normals"], truth["normals"]))
 
 
-def _of_regions(mode: str, labels: Tensor, points: Tensor, reference: Tensor | None) -> Channel:
+def _of_regions(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
     """Return the colours of regions by their number; the last colour is that of points in none."""
-    rows, palette = palette_of_planes(labels, points, reference=reference, for_all_eyes=True)
     none = int(labels.max()) + 1 if len(labels) else 0
     values = torch.where(labels < 0, none, labels)
     colors = palette[-1:].repeat(none + 1, 1)

@@ -59,6 +59,9 @@ _LARGE = 0.03
 """Share of all points from which on a plane is large."""
 _ALIKE = 58.0
 """Squared distance in CIE Lab of two colours that look about the same."""
+_WITHOUT_CONE = 0.25
+"""Weight of what the colour-blind see. With less, planes side by side look alike to them; with
+more, to all others."""
 _ELSEWHERE = 0.005
 """Least weight of a plane that is not beside the one that gets a colour; a neighbour has 1."""
 _GRAY_WEIGHT = 0.05
@@ -125,16 +128,16 @@ def without_cone(colors: Tensor, matrix: tuple[tuple[float, ...], ...]) -> Tenso
     return changed.reshape(colors.shape)
 
 
-def _sq_differences(colors: Tensor, *, for_all_eyes: bool) -> Tensor:
-    """Return squared Lab distances of all pairs of colours ``(C, C)``.
+def _likeness(colors: Tensor) -> Tensor:
+    """Return how alike all pairs of colours look ``(C, C)``.
 
-    For all eyes: the smallest of what those with three kinds of cones see, and those with two.
+    That is to eyes with three kinds of cones, and with a weight to those of the worst dichromacy.
     """
-    seen = [colors]
-    if for_all_eyes:
-        seen += [without_cone(colors, matrix) for matrix in DICHROMACIES.values()]
+    seen = [colors, *(without_cone(colors, matrix) for matrix in DICHROMACIES.values())]
     labs = torch.stack([rgb_to_lab(each) for each in seen])
-    return (labs[:, :, None] - labs[:, None]).square().sum(dim=-1).amin(dim=0)
+    likeness = 1 / ((labs[:, :, None] - labs[:, None]).square().sum(dim=-1) + _ALIKE)
+    usual, worst = likeness[0], likeness.amax(dim=0)
+    return usual + _WITHOUT_CONE * worst
 
 
 def choose_colors(
@@ -143,13 +146,12 @@ def choose_colors(
     weights: Tensor,
     *,
     fixed: Tensor | None = None,
-    for_all_eyes: bool = False,
 ) -> Tensor:
     """Choose a row of the palette for each plane, the largest first, far from those before.
 
     Each chosen colour repels with the inverse square of its distance in Lab: that of a neighbour,
-    in ``pairs`` ``(E, 2)``, with its weight, any other with a little. Where ``fixed`` is not
-    negative it is the choice. ``for_all_eyes``: what the colour-blind see counts as well.
+    in ``pairs`` ``(E, 2)``, with its weight, any other with a little. What the colour-blind see
+    counts as well. Where ``fixed`` is not negative it is the choice.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
@@ -159,8 +161,7 @@ def choose_colors(
     palette, num_calm = make_palette()
     gray = palette.new_full((1, 3), UNLABELED_GRAY)
     shown = torch.cat([palette, gray]).double() / 255
-    distances = _sq_differences(shown, for_all_eyes=for_all_eyes)
-    repulsion = (1 / (distances + _ALIKE)).numpy()[:, :-1]
+    repulsion = _likeness(shown).numpy()[:, :-1]
     share = (sizes / sizes.sum()).numpy()
     strength = np.clip(8 * share, _ELSEWHERE, 1)
     choices = torch.full_like(sizes, -1).numpy() if fixed is None else fixed.numpy().copy()
@@ -354,7 +355,6 @@ def palette_of_planes(
     points: Tensor | None,
     *,
     reference: Tensor | None = None,
-    for_all_eyes: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return each point's row in a palette ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
 
@@ -366,9 +366,9 @@ def palette_of_planes(
         table = contingency_table(labels, reference)
         pairs = match_regions(table)
         fixed = torch.full_like(table.region_sizes, -1)
-        chosen = _choose(reference, points, for_all_eyes=for_all_eyes)[1]
+        chosen = _choose(reference, points)[1]
         fixed[table.regions[pairs]] = chosen[table.faces[pairs]]
-    rows, choices = _choose(labels, points, fixed, for_all_eyes=for_all_eyes)
+    rows, choices = _choose(labels, points, fixed)
     gray = torch.full((1, 3), UNLABELED_GRAY, dtype=torch.uint8, device=labels.device)
     return rows, torch.cat([make_palette()[0].to(labels.device)[choices], gray])
 
@@ -377,8 +377,6 @@ def _choose(
     labels: Tensor,
     points: Tensor | None,
     fixed: Tensor | None = None,
-    *,
-    for_all_eyes: bool,
 ) -> tuple[Tensor, Tensor]:
     """Return each point's row among the labels that occur, and the palette's row of each label."""
     rows = number_labels(labels)[1]
@@ -394,7 +392,6 @@ def _choose(
         torch.cat(pairs).cpu(),
         torch.cat(weights),
         fixed=None if fixed is None else fixed.cpu(),
-        for_all_eyes=for_all_eyes,
     )
     return rows, choices.to(labels.device)
 

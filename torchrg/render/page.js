@@ -9,6 +9,9 @@ const FIELD_OF_VIEW = 50; // Degrees over the height, as deck.gl's view has it.
 const MOST_NORMALS = 15000; // Lines that still tell a surface from a fur coat.
 const MOST_ROWS = 300; // Of the table of planes.
 const SLOW_MS = 45, FAST_MS = 22; // Frames between these times keep the number of points.
+// Radii by which the rim of a disc is farther than its middle: of discs that reach past an edge from
+// either side, that with the nearer middle is in front. With more, one sees through thin plates.
+const DOME = "2.0";
 const STILL_MS = 250; // After so long without a turn all points are drawn again.
 
 // ---- What the file holds ---------------------------------------------------------------------
@@ -219,6 +222,7 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
     in float covers;
     in float radii;
     out vec4 vColor;
+    out vec3 vDepth;
     void main(void) {
       geometry.worldPosition = places;
       int number = gl_VertexID + 1; // As deck.gl counts what is picked: 0 is nothing.
@@ -231,6 +235,10 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
       float space = cut.size.x * exp2((radii * 255.0 - 128.0) / 16.0);
       float radius = clamp(space * cut.size.y / length(sight), cut.size.z, cut.size.w);
       gl_PointSize = 2.0 * radius * project.devicePixelRatio;
+      // Depth on the screen is linear in the inverse distance: that infinitely far, and from it here.
+      mat4 rows = transpose(project.viewProjectionMatrix);
+      float farthest = dot(rows[2].xyz, rows[3].xyz) / dot(rows[3].xyz, rows[3].xyz);
+      vDepth = vec3(farthest, gl_Position.z / gl_Position.w - farthest, radius / cut.size.y);
       float facing = dot(normals, sight) < 0.0 ? -1.0 : 1.0;
       float lit = dot(normals, normals) < 0.25 ? 0.6 : 0.5 + 0.5 * facing * dot(normals, cut.light.xyz);
       vColor = vec4(colors.rgb * (0.62 + 0.38 * lit), 1.0);
@@ -239,10 +247,13 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
   const fs = `#version 300 es
     precision highp float;
     in vec4 vColor;
+    in vec3 vDepth;
     out vec4 fragColor;
     void main(void) {
       vec2 offset = 2.0 * gl_PointCoord - 1.0;
-      if (dot(offset, offset) > 1.0) discard;
+      float sqDistance = dot(offset, offset);
+      if (sqDistance > 1.0) discard;
+      gl_FragDepth = 0.5 + 0.5 * (vDepth.x + vDepth.y * (1.0 - ${DOME} * sqDistance * vDepth.z));
       fragColor = vColor;
       DECKGL_FILTER_COLOR(fragColor, geometry);
     }`;
@@ -292,7 +303,8 @@ function layersOf({ PathLayer, LineLayer }) {
     const isCut = cutOf(cloud);
     const inView = ({ sides, rings }, plane) => !cloud.hidden.has(plane) && !(sides & bits)
       && rings[0].every((p) => p[2] <= top && dot(p, ahead) <= near);
-    const picked = state.picked?.cloud === c ? state.picked.plane : -1;
+    // What is hidden has no outline; what is cut away has one, which tells where it is.
+    const picked = state.picked?.cloud === c && !cloud.hidden.has(state.picked.plane) ? state.picked.plane : -1;
     const rings = (chosen) => cloud.planes.flatMap((plane, number) =>
       chosen(plane, number) ? plane.rings.map((ring) => ({ ring: [...ring, ring[0]] })) : []);
     // deck.gl builds lines anew when their data is another object: only when they may differ.

@@ -30,6 +30,7 @@ from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
 from torchrg.io.stream import Extent
 from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
+from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
     PAGE_EXTENT,
     Frame,
@@ -127,7 +128,7 @@ def make_page(
     if beside is not None:
         same = np.array_equal(cloud.coordinates, beside.cloud.coordinates, equal_nan=True)
         truths.append(true_fields if same else {})
-        references.append(shown[0].fields.get("labels") if same else None)
+        references.append(result.labels if same and "labels" in result.fields else None)
     scenes: list[dict[str, Any]] = []
     blobs: list[str] = []
     for parts in zip(results, shown, truths, references, strict=True):
@@ -223,7 +224,8 @@ def _describe_cloud(
     true_fields = {name: truth[name][shown.rows] for name in ("labels", "normals") if name in truth}
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
-    channels = list(channels_of(shown.points, shown.fields, true_fields, reference=reference))
+    palettes = _palettes(result, shown, reference)
+    channels = list(channels_of(shown.fields, true_fields, palettes))
     surfaces = outer_surfaces(shown.points)
     planes = planes_of_page(result, shown, frame)
     directions, covered = surfaces.directions, surfaces.covered
@@ -262,6 +264,25 @@ def _describe_cloud(
         "arrays": manifest,
     }
     return scene, blob
+
+
+def _palettes(
+    result: Result, shown: Shown, reference: Tensor | None
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return the colours of planes and superpoints, those that pictures of the cloud have too."""
+    regions = {
+        mode: result.labels
+        if mode == "plane"
+        else result.fields[MODES[mode][1]].long().clamp(min=-1)
+        for mode in ("plane", "superpoint")
+        if MODES[mode][1] in result.fields
+    }
+    palettes = {}
+    for mode, labels in regions.items():
+        same = reference if mode == "plane" else None
+        rows, colors = palette_of_planes(labels, result.cloud.points, reference=same)
+        palettes[mode] = rows[shown.rows], colors
+    return palettes
 
 
 def _describe_channel(channel: Channel) -> dict[str, Any]:
