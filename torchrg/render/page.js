@@ -11,7 +11,7 @@ const MOST_ROWS = 300; // Of the table of planes.
 const SLOW_MS = 45, FAST_MS = 22; // Frames between these times keep the number of points.
 // Radii by which the rim of a disc is farther than its middle: of discs that reach past an edge from
 // either side, that with the nearer middle is in front. With more, one sees through thin plates.
-const DOME = "2.0";
+const DOME = "1.0";
 const STILL_MS = 250; // After so long without a turn all points are drawn again.
 
 // ---- What the file holds ---------------------------------------------------------------------
