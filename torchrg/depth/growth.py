@@ -13,7 +13,7 @@ from torchrg.depth.normals import PixelPlanes
 from torchrg.depth.strips import join_strips
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
-from torchrg.regions.fit import BISQUARE_CUT, RegionPlanes
+from torchrg.regions.fit import BISQUARE_CUT, MOST_FITTED, RegionPlanes
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.repair import absorb_points, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
@@ -223,7 +223,7 @@ def _refine(
     """
     beside, seen = PixelGrid(cloud.seen.shape), cloud.seen.flatten()
     for _ in range(_NUM_PASSES):
-        planes = fit_inverse_planes(cloud, labels)
+        planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
         reach = planes.times_thickness(config.absorb_reach)
         labels = absorb_points(cloud.points, labels, beside, planes, reach, valid=seen)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
@@ -233,10 +233,10 @@ def _refine(
             labels, (contacts, counts), planes, tolerance=config.merge_tolerance
         )
         labels = number_by_size(merged, config.min_size)
-    planes = fit_inverse_planes(cloud, labels)
+    planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
     joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
     if not torch.equal(joined, labels):
-        labels, planes = joined, fit_inverse_planes(cloud, joined)
+        labels, planes = joined, fit_inverse_planes(cloud, joined, most=MOST_FITTED)
     reach = planes.times_thickness(config.absorb_reach)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
@@ -257,14 +257,17 @@ def _planes_over_rays(fit: RegionPlanes) -> Tensor:
     return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
 
 
-def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
+def fit_inverse_planes(
+    cloud: InverseCloud, labels: Tensor, *, most: int | None = None
+) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, which alone has noise.
 
     A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.fit.fit_planes` has; the
     thickness, along the normals, is never taken for less than the mean noise of the region. Curved
-    is what is thicker than noise and a slight bend can make it.
+    is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
+    region, in even steps, by default to all.
     """
-    segments = Segments(labels)
+    segments = Segments(labels, most=most)
     noise = segments.mean(segments.take(cloud.noise))
     columns = segments.take_columns(cloud.points)
     x, y, w = columns
@@ -296,7 +299,7 @@ def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
         covariance,
         torch.maximum(thickness / length.squeeze(1), noise),
         rms=segments.mean(residuals * residuals).sqrt() / length.squeeze(1),
-        num_points=segments.counts,
+        num_points=torch.bincount(labels + 1, minlength=1)[1:],
         curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
         floor=noise,
         reach=torch.full_like(noise, torch.inf),
