@@ -60,8 +60,8 @@ def estimate(points, method, chunk_size):
 @pytest.mark.parametrize(
     ("work", "name"),
     [(segment, preset) for preset in ("classic", "paper", "consensus")]
-    + [(estimate, method) for method in ESTIMATORS if method != "irls"]
-    + [pytest.param(estimate, "irls", marks=pytest.mark.slow)],
+    + [(estimate, method) for method in ESTIMATORS if method not in ("irls", "detmm")]
+    + [pytest.param(estimate, name, marks=pytest.mark.slow) for name in ("irls", "detmm")],
 )
 def test_more_chunks_are_no_more_operations_on_the_whole_cloud(work, name):
     points = make_room(NUM_POINTS, 0.003, 0).points

@@ -163,7 +163,9 @@ def test_kills_at_random_moments_change_no_byte(rooms, rooms_of_s3dis, tmp_path,
         check_finishes(root, out, undisturbed, kind=kind)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_an_interrupt_says_how_to_go_on(larger_rooms, tmp_path, number):
     for attempt in range(5):
         out = tmp_path / str(attempt)

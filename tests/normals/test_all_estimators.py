@@ -107,7 +107,7 @@ def test_chunk_size_changes_nothing(corner, fits, method):
     assert_equal(fit, fits[method])
 
 
-@each_method(["consensus", "irls"])
+@each_method(["consensus", "irls", "detmm"])
 def test_batch_is_a_loop_of_singles(corner, method):
     points = corner[0][:24]
     whole = estimate_normals(points, method=method, k=K)
@@ -141,7 +141,7 @@ def test_points_that_are_not_finite_take_no_part(corner, fits, method):
         assert not fit.normals[row].any()
 
 
-@methods_but_slow_irls
+@each_method(["irls", "detmm"])
 def test_neighbors_outside_the_radius_do_not_count(corner, method):
     # The columns beyond the most neighbours of any point hold nothing that counts.
     points = corner[0][:70]

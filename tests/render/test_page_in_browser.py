@@ -12,9 +12,12 @@ from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)"
+    ),
+]
 api = pytest.importorskip("playwright.sync_api", reason="needs playwright to drive Chromium")
 pytest.importorskip("pydeck", reason="needs the extra view")
 image = pytest.importorskip("PIL.Image", reason="needs pillow to read screenshots")
@@ -317,7 +320,6 @@ def test_discs_do_not_hide_the_face_beyond_an_edge(browser, tmp_path):
     tab.page.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cloud", "words"),
     [

@@ -120,7 +120,13 @@ def test_who_says_nothing_gets_the_same_everywhere():
     assert load_config() == PipelineConfig() == PipelineConfig(NormalsConfig(), GrowingConfig())
 
 
-@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize(
+    "preset",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in ("detmm", "rgbd") else [])
+        for name in preset_names()
+    ],
+)
 def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
     points, config = make_room(1500, 0.003, 5).points, load_config(preset)
     seg = segment_planes(points, config)
