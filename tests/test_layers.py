@@ -9,8 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
-    {"errors", "version", "_display"},
-    {"_checks", "_compile", "_optional", "_parallel", "structures"},
+    {"errors", "version", "_display", "_parallel"},
+    {"_checks", "_compile", "_optional", "structures"},
     {"_opaque", "linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

@@ -29,6 +29,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrg._parallel import num_cores
 from torchrg.version import __version__
 
 Outputs = tuple[Tensor, ...]
@@ -39,8 +40,8 @@ Signature = tuple[Kind, ...]
 ROWS = "n"
 """Letter of the axis of rows, of which there may be any number."""
 
-COMPILERS = 2
-"""Kernels that are compiled at a time."""
+_MOST_COMPILERS = 4
+"""Kernels that are compiled at a time, at most, at half a gigabyte each."""
 
 _EXAMPLE_LENGTH = 11
 """Length of the first axis that a kernel is traced with; the others are longer, all different."""
@@ -295,7 +296,8 @@ def serve() -> None:
     jobs = json.load(sys.stdin)
     if "fork" in multiprocessing.get_all_start_methods():
         # What has been imported is there in each of them.
-        with multiprocessing.get_context("fork").Pool(min(COMPILERS, len(jobs))) as pool:
+        processes = min(_MOST_COMPILERS, num_cores(), len(jobs))
+        with multiprocessing.get_context("fork").Pool(processes) as pool:
             errors = pool.map(_build, jobs, chunksize=1)
     else:
         errors = list(map(_build, jobs))

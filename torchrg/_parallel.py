@@ -6,6 +6,7 @@ a core, that takes ten times as long and more.
 """
 
 import ctypes
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -166,6 +167,11 @@ _THREADS: ContextVar[int | None] = ContextVar("threads", default=None)
 def allowed_threads() -> int:
     """Return on how many threads tasks may run."""
     return _THREADS.get() or torch.get_num_threads()
+
+
+def num_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _begin_thread(grad_enabled: bool, context: Context) -> None:

@@ -306,11 +306,6 @@ def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None
         yield advance
 
 
-def num_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return rows of text as aligned columns, numbers to the right.
 

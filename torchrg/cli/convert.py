@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 from tqdm import tqdm
 
+from torchrg._parallel import num_cores
 from torchrg.batch.costs import estimate_costs
 from torchrg.batch.local import run_local
 from torchrg.batch.lock import DirectoryLock
@@ -293,9 +294,7 @@ def _pages_of(arguments: Arguments) -> Path | None:
 def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
     """Find out what is to be done, with a progress bar where files are many."""
     with tqdm(total=len(jobs), desc="looking", unit="scan", leave=False, disable=None) as bar:
-        return make_plan(
-            jobs, force=arguments.force, threads=console.num_cores(), on_scan=bar.update
-        )
+        return make_plan(jobs, force=arguments.force, threads=num_cores(), on_scan=bar.update)
 
 
 def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
@@ -309,7 +308,7 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
                 f"{limit / 1e9:.1f} GB; it runs alone."
             )
     if arguments.engine == "local":
-        workers = min(workers or console.num_cores(), max(len(jobs), 1))
+        workers = min(workers or num_cores(), max(len(jobs), 1))
         reports: Reports = run_local(jobs, workers=workers, memory_limit=limit, lock=lock)
     else:
         from torchrg.batch.ray_tasks import run_ray
@@ -378,7 +377,7 @@ def _say_costs(plan: Plan, out: Path, arguments: Arguments) -> str:
     if not plan.to_convert:
         return "nothing to do"
     workers, limit = _workers_and_memory(arguments)
-    costs = estimate_costs(plan, workers=workers or console.num_cores(), limit=limit)
+    costs = estimate_costs(plan, workers=workers or num_cores(), limit=limit)
     minutes = math.ceil(costs.seconds / 60)
     spent = f"{minutes / 60:,.1f} hours" if minutes > 90 else f"{minutes} min"
     free = free_space(out) / 1e9

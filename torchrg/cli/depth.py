@@ -11,6 +11,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from torchrg._parallel import num_cores
 from torchrg.batch.local import run_here, run_local
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.records import describe_run, write_record
@@ -258,9 +259,9 @@ def _label_sequence(jobs: Sequence[FrameJob], arguments: Arguments) -> int:
     """
     with DirectoryLock(arguments.out) as lock:
         jobs = [dataclasses.replace(job, mark=lock.mark_of(job.target.name)) for job in jobs]
-        plan = make_plan(jobs, threads=console.num_cores())
+        plan = make_plan(jobs, threads=num_cores())
         frames = plan.to_convert
-        worthwhile = min(console.num_cores(), max(len(frames) // _FRAMES_OF_WORKER, 1))
+        worthwhile = min(num_cores(), max(len(frames) // _FRAMES_OF_WORKER, 1))
         workers = min(arguments.workers or worthwhile, max(len(frames), 1))
         started = run_local(frames, workers=workers, lock=lock) if workers > 1 else run_here(frames)
         report = run_with_bar(plan, started, engine="local", workers=workers, unit="frame")
