@@ -12,7 +12,7 @@ from torchrg.io import read_cloud
 from torchrg.metrics import score_labels
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
-from torchrg.structures import PLANE_KINDS, UNLABELED
+from torchrg.structures import PLANE_KINDS, UNLABELED, Cloud
 
 PRESETS = ["classic", "paper", "consensus"]
 
@@ -183,6 +183,12 @@ def test_wrong_shapes_are_refused():
         segment_planes(torch.rand(5, 2))
     with pytest.raises(ShapeError, match="expected points of float32 or float64, got int64"):
         segment_planes(torch.ones(5, 3, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("given", ["scan.ply", [[0.0, 0.0, 1.0]], None, Cloud(np.eye(3))])
+def test_what_is_no_points_is_refused_with_the_repair(given):
+    with pytest.raises(ShapeError, match=r"got (str|list|NoneType|Cloud); read_cloud"):
+        segment_planes(given)
 
 
 def test_tutorial_scan_gives_the_regions_of_pcl(scan):

@@ -1,6 +1,6 @@
 """Argument checks that never read tensor values, so they cost no device synchronisation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import Any, ParamSpec, TypeGuard, TypeVar, get_args
 
@@ -153,6 +153,23 @@ def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, .
         length == ((int(axis),) if axis.isdigit() else bound.setdefault(axis, length))
         for axis, length in [*leading, *lengths]
     )
+
+
+def check_chunks(caller: str, points: object) -> None:
+    """Check that something may be a cloud in chunks; raise ShapeError if it cannot.
+
+    Example:
+        >>> check_chunks("f", "scan.ply")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected points to be a tensor, ..., got str; ...
+    """
+    chunks = points if isinstance(points, str | list | tuple) else []
+    if not isinstance(points, Iterable) or not all(hasattr(part, "coordinates") for part in chunks):
+        raise ShapeError(
+            f"{caller}: expected points to be a tensor, a NumPy array or clouds, got "
+            f"{type(points).__name__}; read_cloud(path).points is the tensor of a file."
+        )
 
 
 def is_tensor(value: object) -> TypeGuard[Tensor]:

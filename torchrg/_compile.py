@@ -49,14 +49,15 @@ _EXAMPLE_LENGTH = 11
 _LEAST_LENGTH = 3
 """Length of an axis other than that of rows, below which kernels run as they are written."""
 
-_SETTINGS: dict[str, Any] = {
-    "cpp.threads": 1,
-    "assert_indirect_indexing": False,
-    "realize_reads_threshold": 1,
-}
-"""Of torch's compiler: one thread inside, as ours are outside; no check of every row number; and
-what is used twice is a step of its own, not written out again in each formula with it, which makes
-the same code in a fifth of the time."""
+_SETTINGS: dict[str, Any] = {"cpp.threads": 1, "assert_indirect_indexing": False}
+"""Of torch's compiler: one thread inside, as ours are outside; and no check of every row number."""
+
+_LONG = 300
+"""Operations of a kernel, above which compiling takes half a minute as torch does it by default."""
+
+_SETTINGS_OF_LONG: dict[str, Any] = {"realize_reads_threshold": 1}
+"""What is used twice is a step of its own, not written out again in each formula with it: the same
+results, compiled in a fifth of the time. Short kernels run up to a third faster without."""
 
 _VARIABLES = {
     "TORCHINDUCTOR_COMPILE_THREADS": "1",
@@ -155,7 +156,8 @@ class Kernel:
     def path(self, signature: Signature) -> Path | None:
         """Return where the code for such arguments is kept; None without a folder."""
         folder = cache_folder()
-        key = [_machine(), self.axes, signature, _SETTINGS, _digest(self.function)]
+        key = [_machine(), self.axes, signature, _SETTINGS, _LONG, _SETTINGS_OF_LONG]
+        key.append(_digest(self.function))
         name = f"{self.function.__name__}-{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}"
         return None if folder is None else folder / name
 
@@ -321,7 +323,9 @@ def _build(job: tuple[str, str, Sequence[Kind], str]) -> str:
     try:
         program = one.export(tuple(signature))
         model, inputs = program.module(), program.example_inputs[0]
-        made = torch._inductor.aot_compile(model, inputs, options=_SETTINGS)  # noqa: SLF001
+        settings = _SETTINGS_OF_LONG if len(program.graph.nodes) > _LONG else {}
+        options = _SETTINGS | settings
+        made = torch._inductor.aot_compile(model, inputs, options=options)  # noqa: SLF001
     except Exception as error:  # noqa: BLE001
         return f"{name}: {type(error).__name__}: {str(error).strip().splitlines()[0]}"
     code = Path(str(made)).read_bytes()

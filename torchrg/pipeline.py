@@ -16,7 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, of_clouds
+from torchrg._checks import (
+    as_tensor,
+    check_chunks,
+    check_floating,
+    check_points,
+    check_shapes,
+    of_clouds,
+)
 from torchrg._compile import compiled, prepare
 from torchrg._parallel import sequential_operations
 from torchrg.config import (
@@ -237,6 +244,8 @@ def segment_planes(
     if isinstance(points, Tensor | np.ndarray):
         points = as_tensor("segment_planes", "points", points).detach()
         check_points("segment_planes", points)
+    else:
+        check_chunks("segment_planes", points)
     if not isinstance(config, PipelineConfig):
         config = settings_of("segment_planes", PipelineConfig, config)
     if compile is not None:
@@ -253,7 +262,8 @@ def prepare_kernels(
 ) -> PipelineConfig:
     """Compile the kernels that clouds of a dtype need, if the settings ask for it.
 
-    That takes a minute or two, and 2 GB of memory, the first time on a machine. They are kept in
+    That takes three minutes on two cores, and half a gigabyte of memory for each of up to four
+    compilers, the first time on a machine. They are kept in
     the folder ``$TORCHRG_CACHE_DIR``, by default ``~/.cache/torchrg``, which machines of one kind
     may share. Results differ from those without them by rounding, and are the same for any order of
     the points, chunk size, number of threads and size of tiles.

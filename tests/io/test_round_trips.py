@@ -404,3 +404,8 @@ def test_clouds_that_were_read_can_be_changed_and_written(tmp_path, make_cloud):
     changed = replace(cloud, fields={"labels": np.arange(60)})
     write_cloud(tmp_path / "b.pcd", changed)
     assert read_cloud(tmp_path / "b.pcd").fields["labels"].tolist() == list(range(60))
+
+
+def test_points_alone_are_refused_with_the_repair(tmp_path):
+    with pytest.raises(FormatError, match=r"got ndarray; Cloud\(coordinates\) makes one"):
+        write_cloud(tmp_path / "points.ply", np.eye(3))

@@ -251,6 +251,11 @@ def write_cloud(
     """
     target = Path(path)
     found = _format_of(target)
+    if not isinstance(cloud, Cloud | CloudStream):
+        raise FormatError(
+            f"{target}: expected a Cloud, or a stream of one, got {type(cloud).__name__}; "
+            "Cloud(coordinates) makes one of a NumPy array."
+        )
     check_output(target, cloud)
     if isinstance(cloud, Cloud):
         for name, values in cloud.fields.items():

@@ -70,12 +70,13 @@ def vote_planes(
     for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(pairs)), 1)):
         own = [part[some] for part in (*columns, weights, start, reach)]
         (normals[some],) = _most_supported(*own, ranks)
+    no, yes = torch.tensor([False, True], device=noise.device)
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, False)
+        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, no)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
     reach = constants.FIT_REACH * noise
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, True)
+        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, yes)
     return normals, offsets
 
 
@@ -116,11 +117,11 @@ def _refitted(
     normals: Tensor,
     offsets: Tensor,
     reach: Tensor,
-    bisquare: bool,
+    bisquare: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return planes fitted to the points near planes; those where these points span none."""
     near = _within(residuals((x, y, z), normals, offsets), reach)
-    near = near.square_() if bisquare else near
+    near *= torch.where(bisquare, near, 1.0)
     fitted, moved, values = fit_weighted_planes((x, y, z), weights * near)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
     return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
