@@ -1,5 +1,6 @@
 """Options, devices and dtypes shared by all tests."""
 
+import gc
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,12 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="slow; run with --run-slow"))
+
+
+def pytest_collection_finish():
+    """Leave what lives as long as the tests out of each search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_generate_tests(metafunc):

@@ -57,11 +57,17 @@ def estimate(points, method, chunk_size):
     estimate_normals(points, config=config, chunk_size=chunk_size)
 
 
+LONG = ("fastmcd", "mve", "detmm", "irls")
+"""Methods that take long on the same code as a shorter one."""
+
+
 @pytest.mark.parametrize(
     ("work", "name"),
     [(segment, preset) for preset in ("classic", "paper", "consensus")]
-    + [(estimate, method) for method in ESTIMATORS if method not in ("irls", "detmm")]
-    + [pytest.param(estimate, name, marks=pytest.mark.slow) for name in ("irls", "detmm")],
+    + [
+        pytest.param(estimate, method, marks=[pytest.mark.slow] if method in LONG else [])
+        for method in ESTIMATORS
+    ],
 )
 def test_more_chunks_are_no_more_operations_on_the_whole_cloud(work, name):
     points = make_room(NUM_POINTS, 0.003, 0).points

@@ -39,7 +39,7 @@ def two_threads():
 # The parent has threads on purpose: that is what a fork must survive.
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*rooms, got:UserWarning")
-@pytest.mark.parametrize("start", ["fork", "spawn"])
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers_give_what_the_main_process_gives(two_threads, root, tmp_path, start):
     pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
     steps = NoteProcess(nn.Sequential(SampleVoxels(0.2), CenterCloud(), SegmentPlanes("paper")))

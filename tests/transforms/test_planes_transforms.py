@@ -128,7 +128,7 @@ def test_who_says_nothing_gets_the_same_everywhere():
     ],
 )
 def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
-    points, config = make_room(1500, 0.003, 5).points, load_config(preset)
+    points, config = make_room(800, 0.003, 5).points, load_config(preset)
     seg = segment_planes(points, config)
     assert torch.equal(segment_planes(points, preset).labels, seg.labels)
     assert torch.equal(SegmentPlanes(preset)({"coord": points})["plane"], seg.labels)
