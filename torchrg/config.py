@@ -375,9 +375,10 @@ def settings_of(
         parts = (config, config.normals, config.growing, config.planes)
         config = next(part for part in parts if isinstance(part, kind))
     if not isinstance(config, kind):
+        kinds = " or a ".join(dict.fromkeys((kind.__name__, PipelineConfig.__name__)))
         raise ConfigError(
-            f"{caller}: expected config to be a {kind.__name__}, a PipelineConfig or a preset, one "
-            f"of {', '.join(preset_names())}, got {type(config).__name__}."
+            f"{caller}: expected config to be a {kinds}, or a preset, one of "
+            f"{', '.join(preset_names())}, got {type(config).__name__}."
         )
     hints = typing.get_type_hints(kind)
     given = {}

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import _display
+from torchrg.errors import ShapeError
 
 UNLABELED = -1
 """Label of a point that belongs to no region."""
@@ -40,6 +41,9 @@ class Cloud:
         notes: What reading took for granted or left out, a line each without a full stop, for
             people.
 
+    Raises:
+        ShapeError: If ``coordinates`` is no NumPy array.
+
     Example:
         >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
         >>> cloud.points.tolist()
@@ -52,6 +56,15 @@ class Cloud:
     source: str = ""
     header: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        given: object = self.coordinates
+        if not isinstance(given, np.ndarray):
+            repair = "its numpy() is one" if isinstance(given, Tensor) else "numpy.array makes one"
+            raise ShapeError(
+                "Cloud: expected coordinates to be a NumPy array, got "
+                f"{type(given).__name__}; {repair}."
+            )
 
     def __len__(self) -> int:
         return len(self.coordinates)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchrg.io
-from torchrg.errors import FormatError
+from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.fields import notes_on_results
 from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes, Superpoints
@@ -409,3 +409,9 @@ def test_clouds_that_were_read_can_be_changed_and_written(tmp_path, make_cloud):
 def test_points_alone_are_refused_with_the_repair(tmp_path):
     with pytest.raises(FormatError, match=r"got ndarray; Cloud\(coordinates\) makes one"):
         write_cloud(tmp_path / "points.ply", np.eye(3))
+
+
+@pytest.mark.parametrize("given", [torch.eye(3), [[0.0, 0.0, 1.0]]])
+def test_coordinates_that_are_no_array_are_refused_with_the_repair(given):
+    with pytest.raises(ShapeError, match=r"got (Tensor; its numpy\(\)|list; numpy\.array makes)"):
+        Cloud(given)
