@@ -3,8 +3,8 @@
 Halves and doubles every number of ``torchrg/normals/consensus/constants.py``, one at a time, on
 made rooms, shapes with sharp edges and smooth shapes, all with exact truth, and on scanned parts
 where their file is given (a cloud with ``labels``, 0 for points of no part). Where a score changes
-too much, less is tried. About half an hour on one core with ``--quick``. ``sensitivity.json`` beside
-this file is what the last run with ``--quick`` and parts found:
+too much, less is tried. About half an hour on one core with ``--quick``. ``sensitivity.json``
+beside this file is what the last run with ``--quick`` and parts found:
 
     python scripts/sensitivity.py --quick --parts office_parts.pcd --out scripts/sensitivity.json
     python scripts/sensitivity.py --only FLAT_LIMIT CURVED_LIMIT
