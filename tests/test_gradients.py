@@ -46,7 +46,7 @@ def projectors(points, method):
     return normals[:, :, None] * normals[:, None, :]
 
 
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 20), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 20), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", FITS)
 def test_normals_of_a_cloud_have_the_gradient_of_finite_differences(method, seeds):
     for seed in seeds:

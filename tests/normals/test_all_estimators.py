@@ -94,7 +94,7 @@ def test_far_origin_changes_nothing_in_float64(corner, fits, method):
     assert_same(fit, fits[method])
 
 
-@methods
+@methods_but_slow_irls
 def test_order_changes_nothing(corner, fits, method):
     order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
     fit = estimate_normals(corner[0][order], method=method, k=K)

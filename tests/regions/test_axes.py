@@ -31,7 +31,7 @@ def degrees_off(rotation):
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 1, *[pytest.param(n, marks=pytest.mark.slow) for n in range(2, 100)]]
+    "seed", [0, *[pytest.param(n, marks=pytest.mark.slow) for n in range(1, 100)]]
 )
 def test_made_rooms_are_set_upright_along_their_walls(seed):
     rng = np.random.default_rng(seed)

@@ -120,10 +120,14 @@ def test_who_says_nothing_gets_the_same_everywhere():
     assert load_config() == PipelineConfig() == PipelineConfig(NormalsConfig(), GrowingConfig())
 
 
+QUICK_PRESETS = ("consensus", "paper", "s3dis")
+"""One of each kind of settings; the others are ``slow``."""
+
+
 @pytest.mark.parametrize(
     "preset",
     [
-        pytest.param(name, marks=[pytest.mark.slow] if name in ("detmm", "rgbd") else [])
+        pytest.param(name, marks=[] if name in QUICK_PRESETS else [pytest.mark.slow])
         for name in preset_names()
     ],
 )
