@@ -156,8 +156,8 @@ class Kernel:
     def path(self, signature: Signature) -> Path | None:
         """Return where the code for such arguments is kept; None without a folder."""
         folder = cache_folder()
-        key = [_machine(), self.axes, signature, _SETTINGS, _LONG, _SETTINGS_OF_LONG]
-        key.append(_digest(self.function))
+        code = _digest(self.function)
+        key = [_machine(), self.axes, signature, _SETTINGS, _LONG, _SETTINGS_OF_LONG, code]
         name = f"{self.function.__name__}-{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}"
         return None if folder is None else folder / name
 
@@ -323,8 +323,8 @@ def _build(job: tuple[str, str, Sequence[Kind], str]) -> str:
     try:
         program = one.export(tuple(signature))
         model, inputs = program.module(), program.example_inputs[0]
-        settings = _SETTINGS_OF_LONG if len(program.graph.nodes) > _LONG else {}
-        options = _SETTINGS | settings
+        is_long = len(program.graph.nodes) > _LONG
+        options = _SETTINGS | _SETTINGS_OF_LONG if is_long else _SETTINGS
         made = torch._inductor.aot_compile(model, inputs, options=options)  # noqa: SLF001
     except Exception as error:  # noqa: BLE001
         return f"{name}: {type(error).__name__}: {str(error).strip().splitlines()[0]}"

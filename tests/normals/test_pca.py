@@ -133,7 +133,7 @@ def test_vmap_of_the_gradient_is_the_gradient(rng):
 
 @pytest.mark.slow
 # torch's tracer makes one itself.
-@pytest.mark.filterwarnings("ignore:.*Function'> should not be instantiated:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 def test_compiled_fit_is_the_fit(rng):
     patches = torch.cat([random_patches(rng), strips(rng, 0.0, torch.float64, k=15)]).float()
     # The backend that needs no C++ compiler; it takes the same graph, without a break.
