@@ -8,12 +8,17 @@ import sys
 import pytest
 import torch
 
+from tests.made import cameras_around, render_depth
 from torchrg import _compile, _parallel, load_config, segment_planes
 from torchrg._compile import Kernel, compiled, kernel
+from torchrg.depth import growth, make_intrinsics, segment_depth, windows
+from torchrg.depth import normals as depth_normals
+from torchrg.depth import segment as depth_segment
 from torchrg.metrics import score_labels
 from torchrg.normals.consensus import constants, hypotheses, noise
-from torchrg.scenes import make_room
+from torchrg.scenes import build_room, make_room
 from torchrg.tiles import TileStore
+from torchrg.transforms import SegmentDepth
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 
@@ -88,17 +93,37 @@ def test_the_settings_say_whether_kernels_are_compiled(folder, monkeypatch):
     assert prepare_kernels(load_config("classic")).compile is False
 
 
-def test_a_rehearsal_finds_the_kernels_of_a_preset(folder, monkeypatch):
-    names = {}
+@pytest.fixture
+def noted(folder, monkeypatch):
+    """Names of the kernels that are to be compiled, where there is no compiler."""
+    names = set()
 
     def note(wanted, announce=None):
-        names.update((one.function.__name__, one) for one, _ in wanted)
+        names.update(one.function.__name__ for one, _ in wanted)
         return False
 
     monkeypatch.setattr(_compile, "compile_kernels", note)
+    return names
+
+
+def test_a_rehearsal_finds_the_kernels_of_a_preset(noted):
     seg = segment_planes(make_room(800, 0.003).points, load_config("consensus"), compile=True)
     assert len(seg.labels) == 800
-    assert {"_smoothed", "_wedge", "_corner", "_refitted", "_deviations", "_pass"} <= names.keys()
+    assert {"_smoothed", "_wedge", "_corner", "_refitted", "_deviations", "_pass"} <= noted
+
+
+def test_a_rehearsal_finds_all_kernels_of_depth_images(noted):
+    sample = {"depth": torch.full((30, 40), 2.0), "intrinsics": make_intrinsics(50, 50, 20, 15)}
+    assert SegmentDepth(compile=True)(sample)["plane"].unique().tolist() == [0]
+    modules = windows, depth_normals, growth, depth_segment
+    kernels = {
+        name
+        for module in modules
+        for name, value in vars(module).items()
+        if isinstance(value, Kernel)
+    }
+    assert noted == kernels
+    assert len(kernels) == 6
 
 
 def test_a_row_alone_is_done_twice(monkeypatch):
@@ -203,3 +228,24 @@ def test_compiled_results_do_not_depend_on_order_chunks_threads_or_tiles(preset,
     script = "from torchrg import _compile; print('torch._dynamo' in __import__('sys').modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
     assert done.stdout.strip() == b"False"
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["exact", "kinect"])
+def test_compiled_depth_is_that_of_the_written_code_on_any_number_of_threads(sensor):
+    model = build_room(2)
+    camera = cameras_around(model, 4, seed=2, width=320, height=240)[3]
+    depth = render_depth(model, camera, sensor=sensor, seed=2).depth
+    written, first = (segment_depth(depth, camera.intrinsics, compile=on) for on in (False, True))
+    assert score_labels(first.labels.flatten(), written.labels.flatten()).ari > 0.9999
+    same = (first.labels == written.labels) & (first.valid == written.valid)
+    torch.testing.assert_close(first.normals[same], written.normals[same], rtol=0, atol=1e-6)
+    torch.testing.assert_close(first.curvature[same], written.curvature[same], rtol=0, atol=1e-6)
+    torch.set_num_threads(3)
+    try:
+        again = segment_depth(depth, camera.intrinsics, compile=True)
+    finally:
+        torch.set_num_threads(1)
+    for part in ("labels", "normals", "curvature", "sharp", "valid"):
+        assert torch.equal(getattr(again, part), getattr(first, part)), part

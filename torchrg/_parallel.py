@@ -82,6 +82,30 @@ def map_chunks(
     return map_tasks(work, chunks_of(num_rows, size) or [slice(0, 0)], device)
 
 
+def map_rows(
+    work: Callable[..., Sequence[Tensor]], columns: Sequence[Tensor], *others: Tensor
+) -> list[Tensor]:
+    """Call ``work`` on an equal share of rows for each thread, and return what it returns, whole.
+
+    Args:
+        work: Takes rows of each column, then the others as they are; returns tensors of rows.
+        columns: Tensors of one length.
+        others: What ``work`` takes beside them.
+
+    Example:
+        >>> map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3))
+        [tensor([4., 4.])]
+    """
+    first, *rest = map_chunks(
+        lambda rows: work(*(column[rows] for column in columns), *others),
+        len(columns[0]),
+        max(len(columns[0]), 1),
+        columns[0].device,
+    )
+    parts = zip(first, *rest, strict=True)
+    return [torch.cat(same) for same in parts] if rest else list(first)
+
+
 def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
     """Call ``work`` on chunks of the row numbers of the chosen points; see :func:`map_chunks`.
 

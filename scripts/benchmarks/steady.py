@@ -39,7 +39,7 @@ class Case(Benchmark):
     sizes: tuple[int, ...] = (200_000,)
     """Points of the room."""
     compile: bool = False
-    """Whether presets run compiled."""
+    """Whether all runs compiled."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         keys = [(name, size) for name in self.work for size in (self.sizes, (0,))[name in FRAMES]]
@@ -126,8 +126,9 @@ def prepare(name: str, size: int, compiled: bool = False) -> Callable[[], None]:
         model = torchrg.scenes.build_room(SEED)
         camera = cameras_around(model, 1, width=height * 4 // 3, height=height)[0]
         depth = render_depth(model, camera, sensor=sensor).depth
-        torchrg.depth.segment_depth(depth, camera.intrinsics)
-        return lambda: torchrg.depth.segment_depth(depth, camera.intrinsics) and None
+        segment = partial(torchrg.depth.segment_depth, depth, camera.intrinsics, compile=compiled)
+        segment()
+        return lambda: segment() and None
     config = torchrg.load_config(name)
     points: torch.Tensor = torchrg.scenes.make_room(size, noise=NOISE, seed=SEED).points
     torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config, compile=compiled)

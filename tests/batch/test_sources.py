@@ -33,6 +33,8 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
         "intrinsics": camera,
         "depth_scale": 9.0,
     }
+    compiled = RGBDSource(tmp_path, settings, "images", camera, 9.0, compile=True)
+    assert compiled.describe()["compile"] is True
     options = {"kind": "s3dis", "class_order": "spt", "superpoint": True}
     assert S3DISSource(tmp_path, CLASSIC, (5,), "spt", superpoint=True).describe() == options
     options = {"kind": "folder", "superpoint": False}

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchrg.depth.growth import holds
 from torchrg.depth.normals import fit_pixels, least_in_windows
 from torchrg.depth.windows import CELL_SIZES, fit_windows, noise_by_size
 
@@ -115,6 +116,7 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         expected.append(top <= row < bottom and left <= column < right)
         assert bottom - top == found.sides[0].flatten()[pixel]
         assert right - left == found.sides[1].flatten()[pixel]
-    assert found.holds(pixels, others).tolist() == expected
+    windows = torch.cat([found.sides, found.middle]).flatten(1)
+    assert holds(windows[:, pixels], others, width).tolist() == expected
     assert any(expected)
     assert not all(expected)

@@ -327,6 +327,7 @@ class RGBDSource:
         layout: Its shape; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
         intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
         depth_scale: Stored value of one metre. Default: the layout's.
+        compile: Whether to run kernels compiled.
     """
 
     root: Path
@@ -334,6 +335,7 @@ class RGBDSource:
     layout: str
     intrinsics: tuple[float, float, float, float] | None = None
     depth_scale: float | None = None
+    compile: bool = False
     in_place: ClassVar[bool] = False
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
@@ -344,6 +346,7 @@ class RGBDSource:
             "layout": self.layout,
             "intrinsics": self.intrinsics,
             "depth_scale": self.depth_scale,
+            **({"compile": True} if self.compile else {}),
         }
 
     def list_scans(self) -> list[Scan]:
@@ -365,7 +368,9 @@ class RGBDSource:
         if not bool((depth > 0).any()):
             raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
         begin("planes")
-        found = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
+        found = segment_depth(
+            depth, frame.intrinsics, self.settings, pose=frame.pose, compile=self.compile
+        )
         points = points_of_image(depth, frame.intrinsics, frame.pose)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")

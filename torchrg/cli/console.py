@@ -25,6 +25,7 @@ from torchrg.cli.ending import warn as warn
 from torchrg.cli.help import format_help, list_flags
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
 from torchrg.datasets.folder import folded_name
+from torchrg.depth.segment import prepare_depth_kernels
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
 from torchrg.io.fields import COLUMNS_RULE, notes_on_results
@@ -276,6 +277,12 @@ def prepared(settings: PlaneSettings) -> PlaneSettings:
     with warnings_as_lines():
         found = prepare_kernels(settings.resolved, announce=lambda text: print(text, flush=True))
     return dataclasses.replace(settings, resolved=found)
+
+
+def prepared_for_depth(wanted: bool) -> bool:
+    """Compile the kernels of depth images if that is wanted, and tell whether it was done."""
+    with warnings_as_lines():
+        return wanted and prepare_depth_kernels(lambda text: print(text, flush=True))
 
 
 def use_threads(threads: int | None) -> None:

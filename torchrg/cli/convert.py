@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import tyro
 from tqdm import tqdm
@@ -79,6 +79,10 @@ class Arguments:
         """Return the data set, both paths absolute."""
         raise NotImplementedError
 
+    def prepared(self) -> Self:
+        """Compile the kernels that are needed, if they are asked for."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class CloudArguments(Arguments):
@@ -107,6 +111,10 @@ class CloudArguments(Arguments):
         """What is written of each cloud, as sources take it."""
         names = ("superpoint", "layout", "partition", "level")
         return {name: getattr(self, name) for name in names}
+
+    def prepared(self) -> Self:
+        """Compile the kernels of clouds if the settings ask for them."""
+        return dataclasses.replace(self, settings=console.prepared(self.settings))
 
 
 @dataclass(frozen=True)
@@ -203,12 +211,19 @@ class RGBDArguments(Arguments):
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
+    compile: bool = False
+    """Whether a C++ compiler makes kernels, once for all runs on this machine. They are faster, and
+    equal to rounding."""
     unit: ClassVar[str] = "frame"
+
+    def prepared(self) -> Self:
+        """Compile the kernels of depth images if they are asked for."""
+        return dataclasses.replace(self, compile=console.prepared_for_depth(self.compile))
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
         intrinsics = None if self.intrinsics is None else console.parse_intrinsics(self.intrinsics)
-        return RGBDSource(root, self.depth, self.layout, intrinsics, self.depth_scale)
+        return RGBDSource(root, self.depth, self.layout, intrinsics, self.depth_scale, self.compile)
 
 
 KINDS: dict[str, type[Arguments]] = {
@@ -247,9 +262,7 @@ def run(argv: list[str]) -> int:
         start = dataclasses.replace(start, settings=settings)
     arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
-    if isinstance(arguments, CloudArguments) and not arguments.dry_run:
-        settings = console.prepared(arguments.settings)
-        arguments = dataclasses.replace(arguments, settings=settings)
+    arguments = arguments if arguments.dry_run else arguments.prepared()
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with console.warnings_as_lines():
         jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)

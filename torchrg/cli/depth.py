@@ -1,9 +1,8 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -75,8 +74,11 @@ class Arguments:
     picture: Path | None = None
     """Place of the coloured picture, a .png file; for several inputs a directory. Default: beside
     labels that are written as .png, with _planes in its name."""
-    depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
+    compile: bool = False
+    """Whether a C++ compiler makes kernels, once for all runs on this machine. They are faster, and
+    equal to rounding."""
     workers: int | None = None
     """Number of processes of one thread each that label frames side by side. Default: one for each
     core, as far as there are eight frames for each."""
@@ -135,7 +137,8 @@ class FrameJob(Job):
         # Results are about the cloud's origin.
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = -torch.from_numpy(cloud.origin)
-        seg = segment_depth(depth, intrinsics, self.source.settings, pose=pose)
+        source = self.source
+        seg = segment_depth(depth, intrinsics, source.settings, pose=pose, compile=source.compile)
         notes, num_planes = [*cloud.notes], len(seg.planes.count)
         if not is_labels and target.suffix.lower() != ".npz":
             notes += notes_on_results(cloud.fields, RESULT_FIELDS)
@@ -169,6 +172,8 @@ def run(argv: list[str]) -> int:
     console.use_threads(arguments.threads)
     sources = list_images(arguments.inputs)
     jobs = _list_jobs(sources, arguments)
+    compiles = console.prepared_for_depth(arguments.compile)
+    jobs = [replace(job, source=replace(job.source, compile=compiles)) for job in jobs]
     return _label_one(jobs[0]) if len(jobs) == 1 else _label_sequence(jobs, arguments)
 
 
@@ -258,7 +263,7 @@ def _label_sequence(jobs: Sequence[FrameJob], arguments: Arguments) -> int:
     Says which failed, and how many a second there were.
     """
     with DirectoryLock(arguments.out) as lock:
-        jobs = [dataclasses.replace(job, mark=lock.mark_of(job.target.name)) for job in jobs]
+        jobs = [replace(job, mark=lock.mark_of(job.target.name)) for job in jobs]
         plan = make_plan(jobs, threads=num_cores())
         frames = plan.to_convert
         worthwhile = min(num_cores(), max(len(frames) // _FRAMES_OF_WORKER, 1))
@@ -285,9 +290,10 @@ def _write_cloud(job: FrameJob, cloud: Cloud, seg: Segmentation) -> None:
     source = job.source
     camera = source.intrinsics and ",".join(f"{value:.15g}" for value in source.intrinsics)
     provenance = describe_run(job.inputs[0], source.settings) | {
-        "config": {"depth": dataclasses.asdict(source.settings)},
+        "config": {"depth": asdict(source.settings)},
         "intrinsics": camera,
         "depth_scale": source.depth_scale,
+        "compile": source.compile,
     }
     images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
     rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})

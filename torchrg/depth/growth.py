@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_tasks, places_of
+from torchrg._compile import kernel
+from torchrg._parallel import map_rows, map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.hidden import hidden_contacts
 from torchrg.depth.normals import PixelPlanes
@@ -122,22 +123,78 @@ def _joins(
     rows, columns = (joins & ~one_window).nonzero().unbind(dim=1)
     here = rows * width + columns
     there = here + (width if axis == 0 else 1)
-    first, second = pixels.planes.take(here), pixels.planes.take(there)
-    u_slope, v_slope = first.u_slope - second.u_slope, first.v_slope - second.v_slope
-    step = u_slope * u[columns] + v_slope * v.flatten()[rows] + first.origin - second.origin
-    next_step = step + (v_slope if axis == 0 else u_slope)
-    tolerance = pixels.tolerance.flatten()
-    limit = config.max_step * torch.maximum(tolerance[here], tolerance[there])
-    own, theirs = (normals.view(-1, 3)[at][:, :, None].unbind(dim=1) for at in (here, there))
-    turned = sq_chords(own, theirs).squeeze(1)
-    accepted = turned <= deg_to_sq_chord(config.max_angle_deg)
-    wider = deg_to_sq_chord(min(_ALIKE * config.max_angle_deg, 90.0))
-    sq_noise = pixels.sq_slope_noise(here) + pixels.sq_slope_noise(there)
-    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
-    alike |= turned <= wider
-    accepted |= alike & pixels.holds(here, there) & pixels.holds(there, here)
-    joins[rows, columns] = accepted & (step.abs() <= limit) & (next_step.abs() <= limit)
+    wider = min(_ALIKE * config.max_angle_deg, 90.0)
+    limits = (config.max_step, *map(deg_to_sq_chord, (config.max_angle_deg, wider)))
+    tables = [*pixels.planes[:3], pixels.tolerance]
+    (joins[rows, columns],) = map_rows(
+        _are_on_one_surface,
+        [here, there],
+        *(table.flatten() for table in tables),
+        normals.view(-1, 3),
+        torch.cat([pixels.sides, pixels.middle]).flatten(1),
+        u,
+        v.flatten(),
+        u.new_tensor(limits),
+    )
     return joins
+
+
+@kernel("n", "n", "P", "P", "P", "P", "P 3", "4 P", "W", "H", "3")
+def _are_on_one_surface(
+    here: Tensor,
+    there: Tensor,
+    u_slopes: Tensor,
+    v_slopes: Tensor,
+    origins: Tensor,
+    tolerances: Tensor,
+    normals: Tensor,
+    windows: Tensor,
+    u: Tensor,
+    v: Tensor,
+    limits: Tensor,
+) -> tuple[Tensor]:
+    """Tell which pixels are on one surface with the next ones along an axis, all by place.
+
+    Windows are sides and middles; limits are those of the step and of the squared chords between
+    normals, the usual one and the wider one.
+    """
+    max_step, max_sq_chord, wider_sq_chord = limits.unbind()
+    width = u.shape[0]
+    row, column = here // width, here % width
+    u_slope, v_slope = u_slopes[here] - u_slopes[there], v_slopes[here] - v_slopes[there]
+    step = u_slope * u[column] + v_slope * v[row] + origins[here] - origins[there]
+    next_step = step + torch.where(there // width > row, v_slope, u_slope)
+    limit = max_step * torch.maximum(tolerances[here], tolerances[there])
+    own, theirs = (normals[at][:, :, None].unbind(dim=1) for at in (here, there))
+    turned = sq_chords(own, theirs).squeeze(1)
+    first, second = windows[:, here], windows[:, there]
+    sq_noise = _sq_slope_noise(first, tolerances[here])
+    sq_noise = sq_noise + _sq_slope_noise(second, tolerances[there])
+    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
+    both_hold = holds(first, there, width) & holds(second, here, width)
+    accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
+    return (accepted & (step.abs() <= limit) & (next_step.abs() <= limit),)
+
+
+def _sq_slope_noise(windows: Tensor, tolerance: Tensor) -> Tensor:
+    """Return the variance of the slopes of windows, by rows and columns as in :func:`holds`.
+
+    That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean of both
+    axes.
+    """
+    rows, columns, *_ = windows.unbind()
+    count = rows * columns
+    return 6 * tolerance.square() * (1 / (rows * rows) + 1 / (columns * columns)) / count
+
+
+def holds(windows: Tensor, pixels: Tensor, width: int) -> Tensor:
+    """Tell whether windows hold pixels, by row-major place in an image of so many columns.
+
+    Windows ``(4, n)`` are their rows and columns, and row and column of their middles.
+    """
+    rows, columns, row, column = windows.unbind()
+    down, right = (pixels // width - row).abs(), (pixels % width - column).abs()
+    return (down <= rows / 2) & (right <= columns / 2)
 
 
 def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
@@ -322,36 +379,62 @@ def move_to_creases(
     ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
     """
     planes = _planes_over_rays(fit)
-    middles = torch.cat([fit.center[:, :2], torch.ones_like(planes[:, :1])], dim=1)
+    tables = *cloud.points.unbind(dim=1), planes, fit.center[:, :2], reach
     labels = labels.clone()
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))
     for _ in range(_MOST_MOVES):
         around = grid.around(rows)
         near = labels[around]
-        other = (near >= 0) & (near != labels[rows][:, None])
-        at_border = other.any(dim=1)
-        rows, around, other = rows[at_border], around[at_border], other[at_border]
-        near, own = near[at_border].clamp(min=0), labels[rows][:, None]
-        ray, around_rays = _rays(cloud, rows[:, None]), _rays(cloud, around)
-        apart = planes[own] - planes[near]
-        here, there = (apart * ray).sum(dim=2), (apart * around_rays).sum(dim=2)
-        mine, theirs = (apart * middles[own]).sum(dim=2), (apart * middles[near]).sum(dim=2)
-        slope, step = apart[..., :2].norm(dim=2), (around_rays - ray)[..., :2].norm(dim=2)
-        straight = there.abs() - here.abs() >= _STRAIGHT * slope * step
-        away = (cloud.points[rows, 2:] - (planes[near] * ray).sum(dim=2)).abs()
-        goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
-        goes &= (mine.abs() > reach[near]) & (theirs.abs() > reach[own])
-        away = torch.where(goes, away, torch.inf)
-        least = away.amin(dim=1, keepdim=True)
-        moved = goes.any(dim=1)
+        at_border = ((near >= 0) & (near != labels[rows][:, None])).any(dim=1)
+        rows, around, near = rows[at_border], around[at_border], near[at_border]
+        columns = [rows, around, labels[rows], near]
+        (found,) = map_rows(_regions_across, columns, *tables)
+        moved = found != labels[rows]
         if not bool(moved.any()):
             break
-        choice = torch.where(away == least, near, len(planes)).amin(dim=1)
-        labels[rows[moved]] = choice[moved]
+        labels[rows[moved]] = found[moved]
         rows = torch.unique(torch.cat([rows[moved], around[moved].flatten()]))
         rows = rows[labels[rows] >= 0]
     return labels
+
+
+@kernel("n", "n 8", "n", "n 8", "P", "P", "P", "M 3", "M 2", "M")
+def _regions_across(
+    rows: Tensor,
+    around: Tensor,
+    own: Tensor,
+    near: Tensor,
+    x: Tensor,
+    y: Tensor,
+    inverse: Tensor,
+    planes: Tensor,
+    middles: Tensor,
+    reach: Tensor,
+) -> tuple[Tensor]:
+    """Return the region ``(n,)`` that pixels at borders belong to by the creases there."""
+    other = (near >= 0) & (near != own[:, None])
+    own, near = own[:, None], near.clamp(min=0)
+    ray, around_rays = (x[rows][:, None], y[rows][:, None]), (x[around], y[around])
+    apart = planes[own] - planes[near]
+    a, b, _ = apart.unbind(dim=2)
+    here, there = _over_rays(apart, *ray), _over_rays(apart, *around_rays)
+    mine, theirs = (_over_rays(apart, *middles[which].unbind(dim=2)) for which in (own, near))
+    slope = (a.square() + b.square()).sqrt()
+    step = ((around_rays[0] - ray[0]).square() + (around_rays[1] - ray[1]).square()).sqrt()
+    straight = there.abs() - here.abs() >= _STRAIGHT * slope * step
+    away = (inverse[rows][:, None] - _over_rays(planes[near], *ray)).abs()
+    goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
+    goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[own])
+    away = torch.where(goes, away, torch.inf)
+    nearest = torch.where(away == away.amin(dim=1, keepdim=True), near, planes.shape[0]).amin(dim=1)
+    return (torch.where(goes.any(dim=1), nearest, own.squeeze(1)),)
+
+
+def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return the last coordinates ``(*)`` of planes ``(*, 3)`` at rays ``(x, y, 1)``."""
+    a, b, c = planes.unbind(dim=-1)
+    return a * x + b * y + c
 
 
 def _rays(cloud: InverseCloud, pixels: Tensor) -> Tensor:

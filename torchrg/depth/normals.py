@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._compile import kernel
+from torchrg._parallel import map_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
     NARROW,
@@ -17,6 +19,7 @@ from torchrg.depth.windows import (
     find_jitter,
     fit_narrow_windows,
     fit_windows,
+    noise_at,
     noise_by_size,
 )
 
@@ -63,26 +66,6 @@ class PixelPlanes(NamedTuple):
     edge: Tensor
     noise: Tensor
     tolerance: Tensor
-
-    def sq_slope_noise(self, pixels: Tensor) -> Tensor:
-        """Return the variance of the slopes of the windows of some pixels, by row-major place.
-
-        That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean
-        of both axes.
-        """
-        rows, columns = (side.flatten()[pixels] for side in self.sides)
-        sq_tolerance, count = self.tolerance.flatten()[pixels].square(), rows * columns
-        variance: Tensor = 6 * sq_tolerance * (1 / (rows * rows) + 1 / (columns * columns)) / count
-        return variance
-
-    def holds(self, pixels: Tensor, others: Tensor) -> Tensor:
-        """Return whether the windows of some pixels hold others, all by row-major place."""
-        width = self.window.shape[1]
-        row, column = (part.flatten()[pixels] for part in self.middle)
-        rows, columns = (side.flatten()[pixels] for side in self.sides)
-        down, right = (others // width - row).abs(), (others % width - column).abs()
-        inside: Tensor = (down <= rows / 2) & (right <= columns / 2)
-        return inside
 
 
 class _Tolerances(NamedTuple):
@@ -143,7 +126,8 @@ def fit_pixels(
         _tolerances, noise=noises[1], size=1, focal=focal, jitter=find_jitter(planes[_STEEP_SIZE])
     )
     narrow = _NarrowWindows(first, *_flat_narrow_windows(choice, limits))
-    _offer_narrow_windows(choice, narrow)
+    if len(narrow.pixel):
+        _offer_narrow_windows(choice, narrow)
     every: list[_SquareWindows | _NarrowWindows] = [*windows.values(), narrow]
     return _pixel_planes(choice, seen, every, noises[CELL_SIZES[0]].at(inverse))
 
@@ -245,7 +229,8 @@ def _offer_narrow_windows(choice: "_Choice", narrow: _NarrowWindows) -> None:
     window = torch.arange(len(relative), device=relative.device)
     choice.offer(narrow, _least_by_pixel(choice, narrow.pixel, window, relative), reach)
     held, beside = narrow.held.flatten(), window.repeat_interleave(narrow.held.shape[1])
-    on_plane = (held >= 0) & choice.is_near(narrow.planes, held.clamp(min=0), beside, reach)
+    tables = *_tables(narrow.planes, reach), *choice.image
+    on_plane = (held >= 0) & _are_near(held.clamp(min=0), beside, *tables)
     held, beside = held[on_plane], beside[on_plane]
     places = _least_by_pixel(choice, held, beside, relative[beside])
     choice.offer(narrow, places, reach, beside=True)
@@ -293,14 +278,10 @@ class _Choice:
         """Return the values of the pixels' windows ``(H, W)`` from those of each size."""
         return torch.cat([part.flatten() for part in images])[self.window].view(self.shape)
 
-    def is_near(
-        self, planes: WindowPlanes, pixels: Tensor, windows: Tensor, reach: Tensor
-    ) -> Tensor:
-        """Return whether pixels are within the reach of windows, both by place, of their planes."""
-        plane, width = planes.take(windows), self.shape[1]
-        u, v = self.u[pixels % width], self.v.flatten()[pixels // width]
-        value = plane.u_slope * u + plane.v_slope * v + plane.origin
-        return (self.values.flatten()[pixels] - value).abs() <= reach.flatten()[windows]
+    @property
+    def image(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Inverse depth by row-major place, columns and rows."""
+        return self.values.flatten(), self.u, self.v.flatten()
 
     def offer(
         self,
@@ -315,17 +296,71 @@ class _Choice:
         A pixel takes it if it is within reach ``(h, w)`` of the window's plane; ``beside`` tells
         that the windows are not around the cells.
         """
-        width, size, waiting = self.shape[1], windows.size, self.waiting
-        cells = (waiting // width // size) * places.shape[1] + waiting % width // size
-        chosen = places.flatten()[cells]
-        has = (chosen >= 0).nonzero().squeeze(1)
-        pixels, chosen = waiting[has], chosen[has]
-        near = self.is_near(windows.planes, pixels, chosen, reach)
-        taken = pixels[near]
-        self.window[taken] = chosen[near] + windows.first
+        waiting, sizes = self.waiting, (windows.size, places.shape[1])
+        (chosen,) = map_rows(
+            _chosen_windows,
+            [waiting],
+            places.flatten(),
+            *_tables(windows.planes, reach),
+            *self.image,
+            waiting.new_tensor(sizes),
+        )
+        is_taken = chosen >= 0
+        taken = waiting[is_taken]
+        self.window[taken] = chosen[is_taken] + windows.first
         self.flat[taken] = True
         self.edge[taken] = beside
-        self.waiting = waiting[~self.flat[waiting]]
+        self.waiting = waiting[~is_taken]
+
+
+def _tables(planes: WindowPlanes, reach: Tensor) -> list[Tensor]:
+    """Return the planes of windows and how far from them a pixel may be, each ``(T,)``."""
+    parts = planes.u_slope, planes.v_slope, planes.origin, reach
+    return [part.flatten() for part in parts]
+
+
+@kernel("n", "C", "T", "T", "T", "T", "P", "W", "H", "2")
+def _chosen_windows(
+    pixels: Tensor,
+    places: Tensor,
+    u_slope: Tensor,
+    v_slope: Tensor,
+    origin: Tensor,
+    reach: Tensor,
+    values: Tensor,
+    u: Tensor,
+    v: Tensor,
+    sizes: Tensor,
+) -> tuple[Tensor]:
+    """Return the window that pixels are offered if they are within its reach, else -1.
+
+    ``places`` has the window that each cell offers or -1; ``sizes`` are the width of a cell, and
+    how many are in a row.
+    """
+    size, num_columns = sizes.unbind()
+    width = u.shape[0]
+    row, column = pixels // width, pixels % width
+    offered = places[row // size * num_columns + column // size]
+    tables = u_slope, v_slope, origin, reach, values, u, v
+    return (torch.where(_are_near(pixels, offered.clamp(min=0), *tables), offered, -1),)
+
+
+def _are_near(
+    pixels: Tensor,
+    windows: Tensor,
+    u_slope: Tensor,
+    v_slope: Tensor,
+    origin: Tensor,
+    reach: Tensor,
+    values: Tensor,
+    u: Tensor,
+    v: Tensor,
+) -> Tensor:
+    """Tell which pixels are within the reach of the planes of windows, both by place."""
+    width = u.shape[0]
+    on_plane = u_slope[windows] * u[pixels % width] + v_slope[windows] * v[pixels // width]
+    away = values[pixels] - (on_plane + origin[windows])
+    return away.abs() <= reach[windows]
 
 
 def _pixel_planes(
@@ -372,16 +407,30 @@ def _tolerances(
     camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
     depth is one of ``d z e`` from the plane.
     """
-    (fx, fy), slope = focal, torch.hypot(planes.u_slope, planes.v_slope)
-    by_noise = torch.hypot(noise.at(planes.mean), jitter * slope)
-    sq_nearness = (
-        (planes.u_slope * fx).square() + (planes.v_slope * fy).square() + planes.origin.square()
+    half = SIDE * size / 2 / max(map(abs, focal))
+    columns = [planes.u_slope, planes.v_slope, planes.origin, planes.mean]
+    found = map_rows(
+        _tolerances_of_planes,
+        [part.flatten() for part in columns],
+        planes.mean.new_tensor(noise),
+        planes.mean.new_tensor([*focal, half, jitter]),
     )
-    is_steep = sq_nearness > (_STEEPEST * planes.mean).square()
-    half = SIDE * size / 2 / max(abs(fx), abs(fy))
-    bend = half * torch.where(is_steep, 0.0, sq_nearness) / planes.mean
-    bend = torch.where(planes.mean > 0, bend, 0.0)
-    return _Tolerances(by_noise, torch.maximum(by_noise, _BEND * bend), _MOST_BEND * bend)
+    return _Tolerances(*(part.view(planes.mean.shape) for part in found))
+
+
+@kernel("n", "n", "n", "n", "4", "4")
+def _tolerances_of_planes(
+    u_slope: Tensor, v_slope: Tensor, origin: Tensor, mean: Tensor, noise: Tensor, view: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return :class:`_Tolerances`; ``view`` is focal lengths, half a window's side, and jitter."""
+    fx, fy, half, jitter = view.unbind()
+    sq_blur = jitter.square() * (u_slope.square() + v_slope.square())
+    by_noise = (noise_at(mean, *noise.unbind()).square() + sq_blur).sqrt()
+    sq_nearness = (u_slope * fx).square() + (v_slope * fy).square() + origin.square()
+    is_steep = sq_nearness > (_STEEPEST * mean).square()
+    bend = half * torch.where(is_steep, 0.0, sq_nearness) / mean
+    bend = torch.where(mean > 0, bend, 0.0)
+    return by_noise, torch.maximum(by_noise, _BEND * bend), _MOST_BEND * bend
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:

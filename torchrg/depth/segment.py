@@ -1,15 +1,17 @@
 """From one depth image to planes."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._parallel import sequential_operations
+from torchrg._compile import compiled, kernel, prepare
+from torchrg._parallel import map_rows, sequential_operations
 from torchrg.config import DepthConfig
-from torchrg.depth.camera import has_depth, points_of_image, read_intrinsics
+from torchrg.depth.camera import has_depth, make_intrinsics, points_of_image, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import PixelPlanes, fit_pixels
-from torchrg.depth.windows import WindowPlanes
 from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 
@@ -23,6 +25,7 @@ def segment_depth(
     config: DepthConfig | None = None,
     *,
     pose: Tensor | None = None,
+    compile: bool = False,  # noqa: A002 - torch's word
 ) -> Segmentation:
     """Segment a depth image into planes.
 
@@ -42,6 +45,7 @@ def segment_depth(
         config: Settings. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
             the world. Default: they are in camera coordinates.
+        compile: Whether to run kernels compiled; see :func:`prepare_depth_kernels`.
 
     Returns:
         A segmentation whose ``labels``, ``normals``, ``curvature``, ``sharp`` and ``valid`` are
@@ -69,7 +73,36 @@ def segment_depth(
         pose=(pose, "4 4"),
     )
     check_floating("segment_depth", depth=depth)
-    config = config or DepthConfig()
+    with compiled(compile and prepare_depth_kernels()):
+        return _segment(depth, intrinsics, config or DepthConfig(), pose)
+
+
+def prepare_depth_kernels(announce: Callable[[str], None] = lambda text: None) -> bool:
+    """Compile the kernels of :func:`segment_depth`, and tell whether that can be done.
+
+    That takes a minute on two cores the first time on a machine; see
+    :func:`torchrg.pipeline.prepare_kernels`.
+
+    Args:
+        announce: Called with a line of text where there is something to compile.
+
+    Returns:
+        False, after a warning that says why, if there is no compiler.
+    """
+
+    def rehearse() -> None:
+        u, v = torch.linspace(-1, 1, 96), torch.linspace(-0.7, 0.7, 72)[:, None]
+        corner_of_a_room = torch.maximum(0.4 + 0.3 * u.abs(), 0.3 + 0.6 * v)
+        ripples = 0.001 * torch.sin(1000 * u) * torch.cos(700 * v)
+        segment_depth(1 / (corner_of_a_room + ripples), make_intrinsics(48, 48, 48, 36))
+
+    return prepare("depth", rehearse, announce)
+
+
+def _segment(
+    depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None
+) -> Segmentation:
+    """Do what :func:`segment_depth` says."""
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = has_depth(depth)
@@ -80,11 +113,10 @@ def segment_depth(
     v = torch.arange(depth.shape[0], device=depth.device).double()[:, None] - cy
     x, y = (u / fx).expand_as(inverse), (v / fy).expand_as(inverse)
     pixels = fit_pixels(inverse, seen, u, v, focal=focal, noise=config.noise, dtype=depth.dtype)
-    normals, distance = _normals(pixels.planes, focal)
+    normals, curvature = _normals_and_curvature(pixels, inverse, x, y, focal)
     valid = pixels.valid
     cloud = _inverse_cloud(inverse, seen, pixels, x, y)
     labels, plane_normals, curved = grow_pixels(cloud, pixels, normals, u, v, config)
-    curvature = torch.where(valid, _curvature(pixels, inverse, distance, x, y, focal), 0.0)
     normals = torch.where(valid[..., None], normals, 0.0).view(-1, 3)
     # A window at a border that is not flat has no normal of its own; the region has.
     borders = (~pixels.flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
@@ -108,15 +140,6 @@ def segment_depth(
     )
 
 
-def _normals(planes: WindowPlanes, focal: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Return unit normals towards the camera ``(H, W, 3)``, and the planes' distance from it."""
-    fx, fy = focal
-    away = torch.stack([planes.u_slope * fx, planes.v_slope * fy, planes.origin], dim=-1)
-    length = away.norm(dim=-1)
-    length = torch.where(length > 0, length, 1.0)
-    return -away / length[..., None], 1 / length
-
-
 def _inverse_cloud(
     inverse: Tensor, seen: Tensor, pixels: PixelPlanes, x: Tensor, y: Tensor
 ) -> InverseCloud:
@@ -126,31 +149,51 @@ def _inverse_cloud(
     return InverseCloud(columns.T, (pixels.noise / unit).flatten(), seen)
 
 
-def _curvature(
-    pixels: PixelPlanes,
+def _normals_and_curvature(
+    pixels: PixelPlanes, inverse: Tensor, x: Tensor, y: Tensor, focal: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """Return unit normals towards the camera ``(H, W, 3)``, and curvature ``(H, W)``."""
+    planes = pixels.planes
+    columns = [planes.u_slope, planes.v_slope, planes.origin, planes.deviation, *pixels.sides]
+    columns += [pixels.valid, inverse, x, y]
+    columns = [part.flatten() for part in columns]
+    *normals, curvature = map_rows(_shape_of_planes, columns, inverse.new_tensor(focal))
+    shape = inverse.shape
+    return torch.stack(normals, dim=1).view(*shape, 3), curvature.view(shape)
+
+
+@kernel(*["n"] * 10, "2")
+def _shape_of_planes(
+    u_slope: Tensor,
+    v_slope: Tensor,
+    origin: Tensor,
+    deviation: Tensor,
+    rows: Tensor,
+    columns: Tensor,
+    valid: Tensor,
     inverse: Tensor,
-    distance: Tensor,
     x: Tensor,
     y: Tensor,
-    focal: tuple[float, float],
-) -> Tensor:
-    """Return the surface variation of the windows: their variance across the plane, of all.
+    focal: Tensor,
+) -> tuple[Tensor, ...]:
+    """Return the columns of the normals of windows, and their surface variation.
 
-    A deviation e of inverse depth is one of ``distance * z * e`` from the plane; a step of a column
-    is one of ``(x_step - x_slope * z * ray) z`` along it.
+    That is their variance across the plane, of all. A deviation e of inverse depth is one of
+    ``distance * z * e`` from the plane; a step of a column is one of
+    ``(x_step - x_slope * z * ray) z`` along it.
     """
-    z, planes = 1 / torch.where(inverse > 0, inverse, 1.0), pixels.planes
-    across = distance * z * torch.where(pixels.valid, planes.deviation, 0.0)
-    rows, columns = pixels.sides
+    fx, fy = focal.unbind()
+    away = u_slope * fx, v_slope * fy, origin
+    length = (away[0].square() + away[1].square() + away[2].square()).sqrt()
+    length = torch.where(length > 0, length, 1.0)
+    z = 1 / torch.where(inverse > 0, inverse, 1.0)
+    across = (z * torch.where(valid, deviation, 0.0) / length).square()
     ray = x * x + y * y + 1
     along = torch.zeros_like(z)
-    for side, slope, length, place in (
-        (columns, planes.u_slope, focal[0], x),
-        (rows, planes.v_slope, focal[1], y),
-    ):
+    for side, slope, f, place in ((columns, u_slope, fx, x), (rows, v_slope, fy, y)):
         step, spread = slope * z, (side * side - 1) / 12
-        along += spread * (step * step * ray - 2 / length * step * place + 1 / length**2)
-    along *= z * z
-    across *= across
-    total = across + along
-    return (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
+        along = along + spread * (step * step * ray - 2 / f * step * place + 1 / (f * f))
+    total = across + along * z * z
+    variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
+    curvature = torch.where(valid, variation, 0.0)
+    return *(-part / length for part in away), curvature

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_tasks
+from torchrg._compile import kernel
+from torchrg._parallel import map_rows, map_tasks
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
 
@@ -135,25 +136,40 @@ def _sums_around(cells: Tensor) -> Tensor:
 
 def _fit_planes(sums: Sequence[Tensor], sides: tuple[int, int]) -> WindowPlanes:
     """Return the planes of windows with so many pixels along their sides, from sums of moments."""
-    count, *moments = sums
-    share = 1 / count.clamp(min=1)
-    mean_u, mean_v, mean_w, uu, uv, vv, uw, vw, ww = (part * share for part in moments)
-    uu, uv, vv = uu - mean_u * mean_u, uv - mean_u * mean_v, vv - mean_v * mean_v
-    uw, vw, ww = uw - mean_u * mean_w, vw - mean_v * mean_w, ww - mean_w * mean_w
-    spread = uu * vv - uv * uv
     one, other = sides
     full = (one * one - 1) * (other * other - 1) / 144
-    found = (count >= _LEAST_SHARE * one * other) & (spread > _LEAST_SPREAD * full)
+    least = sums[0].new_tensor([_LEAST_SHARE * one * other, _LEAST_SPREAD * full])
+    found = map_rows(_planes_of_sums, [part.flatten() for part in sums], least)
+    return WindowPlanes(*(part.view(sums[0].shape) for part in found))
+
+
+@kernel(*["n"] * 10, "2")
+def _planes_of_sums(
+    count: Tensor,
+    u: Tensor,
+    v: Tensor,
+    w: Tensor,
+    uu: Tensor,
+    uv: Tensor,
+    vv: Tensor,
+    uw: Tensor,
+    vw: Tensor,
+    ww: Tensor,
+    least: Tensor,
+) -> tuple[Tensor, ...]:
+    """Return the planes of windows; ``least`` is the count and the spread of one that has any."""
+    share = 1 / count.clamp(min=1)
+    u, v, w, uu, uv, vv, uw, vw, ww = (sums * share for sums in (u, v, w, uu, uv, vv, uw, vw, ww))
+    uu, uv, vv = uu - u * u, uv - u * v, vv - v * v
+    uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
+    spread = uu * vv - uv * uv
+    least_count, least_spread = least.unbind()
+    found = (count >= least_count) & (spread > least_spread)
     spread = torch.where(found, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
     variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
-    return WindowPlanes(
-        u_slope,
-        v_slope,
-        mean_w - u_slope * mean_u - v_slope * mean_v,
-        torch.where(found, variance.sqrt(), torch.inf),
-        mean_w,
-    )
+    deviation = torch.where(found, variance.sqrt(), torch.inf)
+    return u_slope, v_slope, w - u_slope * u - v_slope * v, deviation, w
 
 
 class WindowNoise(NamedTuple):
@@ -169,9 +185,20 @@ class WindowNoise(NamedTuple):
 
     def at(self, inverse: Tensor) -> Tensor:
         """Return the noise at inverse depths."""
-        least = self.rounding * inverse
-        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
-        return torch.maximum(self.factor * usual, least)
+        return noise_at(inverse, *self)
+
+
+def noise_at(
+    inverse: Tensor,
+    factor: float | Tensor,
+    constant: float | Tensor,
+    growth: float | Tensor,
+    rounding: float | Tensor,
+) -> Tensor:
+    """Return the noise at inverse depths, from the parts of :class:`WindowNoise`."""
+    least = rounding * inverse
+    usual = torch.maximum(growth + constant * (inverse * inverse), least)
+    return torch.maximum(factor * usual, least)
 
 
 def noise_by_size(

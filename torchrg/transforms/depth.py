@@ -1,6 +1,7 @@
 """Depth images: as modules to clouds and to planes, and several of them as one cloud."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -136,6 +137,7 @@ class SegmentDepth(DepthTransform):
     Args:
         config: Settings.
         planes: Whether to add the table.
+        compile: Whether to run kernels compiled; see :func:`segment_depth`.
         keys: Other names for the keys.
 
     Example:
@@ -151,18 +153,20 @@ class SegmentDepth(DepthTransform):
         config: DepthConfig | None = None,
         *,
         planes: bool = False,
+        compile: bool = False,  # noqa: A002 - torch's word
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keys=keys)
         self.config = config or DepthConfig()
-        self.planes = planes
+        self.planes, self.is_compiled = planes, compile
 
     @of_clouds
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
+        segment = partial(segment_depth, config=self.config, compile=self.is_compiled)
         found = [
-            segment_depth(image, camera, self.config, pose=None if poses is None else poses[i])
+            segment(image, camera, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
         batch, added = self.is_batch(sample), dict[str, Any](sample)
