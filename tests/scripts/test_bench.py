@@ -17,6 +17,7 @@ from benchmarks import (
     breakdown,
     convert,
     harness,
+    kernels,
     loader,
     page,
     peers,
@@ -127,6 +128,15 @@ def test_breakdown_is_that_of_contaminated_neighborhoods():
     assert results["cluster 30%"]["PCA"][0]["median"] > 10
     assert results["cluster 30%"]["planes"][0]["p90"] < 3
     assert text.splitlines()[2] == "| outliers | PCA | planes |"
+
+
+def test_kernels_are_timed_beside_what_memory_allows():
+    results, text = run(kernels.Case(work=("classic",), num_points=2000, only=("written",)))
+    (found,) = results["classic"]["written"]
+    assert {"_frames", "_pass", "in no kernel"} <= found["ms"].keys()
+    assert all(milliseconds >= 0 for milliseconds in found["ms"].values())
+    assert 0 < found["limit"]["_pass"] < found["ms"]["_pass"]
+    assert text.splitlines()[0] == "| work | kernel | written, ms | calls | limit, ms |"
 
 
 def test_crops_are_loaded_by_any_worker():
