@@ -257,6 +257,7 @@ def test_output_that_cannot_be_written_is_one_line(room):
 def test_unknown_command_lists_the_known_ones(capsys):
     assert main(["segmnet"]) == 2
     line = error_line(capsys)
+    assert "got 'segmnet'. Did you mean segment?" in line
     assert all(name in line for name in COMMANDS)
 
 

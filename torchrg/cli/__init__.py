@@ -1,5 +1,6 @@
 """Command line: ``torchrg COMMAND ...``; each command parses, calls, and prints."""
 
+import difflib
 import importlib
 import os
 import sys
@@ -83,7 +84,9 @@ def _run(arguments: list[str]) -> int:
         print(f"torchrg {__version__}")
         return 0
     if name not in COMMANDS:
-        raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.")
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.{hint}")
     command = importlib.import_module(f"torchrg.cli.{name}")
     with raising_interrupts():
         code: int = command.run(rest)
