@@ -116,7 +116,7 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         expected.append(top <= row < bottom and left <= column < right)
         assert bottom - top == found.sides[0].flatten()[pixel]
         assert right - left == found.sides[1].flatten()[pixel]
-    windows = torch.cat([found.sides, found.middle]).flatten(1)
-    assert holds(windows[:, pixels], others, width).tolist() == expected
+    sides, middles = (part.flatten(1)[:, pixels] for part in (found.sides, found.middle))
+    assert holds(sides, middles, others, width).tolist() == expected
     assert any(expected)
     assert not all(expected)

@@ -181,6 +181,16 @@ ColumnsFlag = Annotated[
 """Type of the argument --columns."""
 
 
+CompileFlag = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Whether a C++ compiler makes kernels, once for all runs on this machine. They are "
+        "faster, and equal to rounding."
+    ),
+]
+"""Type of the argument --compile."""
+
+
 Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "npy"]
 """Type of the argument --layout."""
 

@@ -211,9 +211,7 @@ class RGBDArguments(Arguments):
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
-    compile: bool = False
-    """Whether a C++ compiler makes kernels, once for all runs on this machine. They are faster, and
-    equal to rounding."""
+    compile: console.CompileFlag = False
     unit: ClassVar[str] = "frame"
 
     def prepared(self) -> Self:

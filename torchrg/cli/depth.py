@@ -76,9 +76,7 @@ class Arguments:
     labels that are written as .png, with _planes in its name."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
-    compile: bool = False
-    """Whether a C++ compiler makes kernels, once for all runs on this machine. They are faster, and
-    equal to rounding."""
+    compile: console.CompileFlag = False
     workers: int | None = None
     """Number of processes of one thread each that label frames side by side. Default: one for each
     core, as far as there are eight frames for each."""

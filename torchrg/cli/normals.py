@@ -51,9 +51,7 @@ class Arguments:
     chunk_size: int = PipelineConfig.chunk_size
     """Number of points that are handled at a time. It bounds the memory and never changes a
     result."""
-    compile: bool = False
-    """Whether a C++ compiler makes kernels, once for all runs on this machine. They are faster, and
-    equal to rounding."""
+    compile: console.CompileFlag = False
     threads: int | None = None
     """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None

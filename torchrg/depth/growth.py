@@ -131,7 +131,8 @@ def _joins(
         [here, there],
         *(table.flatten() for table in tables),
         normals.view(-1, 3),
-        torch.cat([pixels.sides, pixels.middle]).flatten(1),
+        pixels.sides.flatten(1),
+        pixels.middle.flatten(1),
         u,
         v.flatten(),
         u.new_tensor(limits),
@@ -139,7 +140,7 @@ def _joins(
     return joins
 
 
-@kernel("n", "n", "P", "P", "P", "P", "P 3", "4 P", "W", "H", "3")
+@kernel("n", "n", "P", "P", "P", "P", "P 3", "2 P", "2 P", "W", "H", "3")
 def _are_on_one_surface(
     here: Tensor,
     there: Tensor,
@@ -148,15 +149,16 @@ def _are_on_one_surface(
     origins: Tensor,
     tolerances: Tensor,
     normals: Tensor,
-    windows: Tensor,
+    sides: Tensor,
+    middles: Tensor,
     u: Tensor,
     v: Tensor,
     limits: Tensor,
 ) -> tuple[Tensor]:
     """Tell which pixels are on one surface with the next ones along an axis, all by place.
 
-    Windows are sides and middles; limits are those of the step and of the squared chords between
-    normals, the usual one and the wider one.
+    Limits are those of the step and of the squared chords between normals, the usual one and the
+    wider one.
     """
     max_step, max_sq_chord, wider_sq_chord = limits.unbind()
     width = u.shape[0]
@@ -167,32 +169,33 @@ def _are_on_one_surface(
     limit = max_step * torch.maximum(tolerances[here], tolerances[there])
     own, theirs = (normals[at][:, :, None].unbind(dim=1) for at in (here, there))
     turned = sq_chords(own, theirs).squeeze(1)
-    first, second = windows[:, here], windows[:, there]
-    sq_noise = _sq_slope_noise(first, tolerances[here])
-    sq_noise = sq_noise + _sq_slope_noise(second, tolerances[there])
+    own_sides, their_sides = sides[:, here], sides[:, there]
+    sq_noise = _sq_slope_noise(own_sides, tolerances[here])
+    sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerances[there])
     alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
-    both_hold = holds(first, there, width) & holds(second, here, width)
+    both_hold = holds(own_sides, middles[:, here], there, width)
+    both_hold = both_hold & holds(their_sides, middles[:, there], here, width)
     accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
     return (accepted & (step.abs() <= limit) & (next_step.abs() <= limit),)
 
 
-def _sq_slope_noise(windows: Tensor, tolerance: Tensor) -> Tensor:
-    """Return the variance of the slopes of windows, by rows and columns as in :func:`holds`.
+def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
+    """Return the variance of the slopes of windows of so many rows and columns, ``(2, n)``.
 
     That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean of both
     axes.
     """
-    rows, columns, *_ = windows.unbind()
+    rows, columns = sides.unbind()
     count = rows * columns
     return 6 * tolerance.square() * (1 / (rows * rows) + 1 / (columns * columns)) / count
 
 
-def holds(windows: Tensor, pixels: Tensor, width: int) -> Tensor:
+def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     """Tell whether windows hold pixels, by row-major place in an image of so many columns.
 
-    Windows ``(4, n)`` are their rows and columns, and row and column of their middles.
+    Of the windows: their rows and columns ``(2, n)``, and row and column of their middles.
     """
-    rows, columns, row, column = windows.unbind()
+    (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()
     return (down <= rows / 2) & (right <= columns / 2)
 

@@ -229,8 +229,8 @@ def _offer_narrow_windows(choice: "_Choice", narrow: _NarrowWindows) -> None:
     window = torch.arange(len(relative), device=relative.device)
     choice.offer(narrow, _least_by_pixel(choice, narrow.pixel, window, relative), reach)
     held, beside = narrow.held.flatten(), window.repeat_interleave(narrow.held.shape[1])
-    tables = *_tables(narrow.planes, reach), *choice.image
-    on_plane = (held >= 0) & _are_near(held.clamp(min=0), beside, *tables)
+    tables = _tables(narrow.planes, reach)
+    on_plane = (held >= 0) & _are_near(held.clamp(min=0), beside, tables, choice.image)
     held, beside = held[on_plane], beside[on_plane]
     places = _least_by_pixel(choice, held, beside, relative[beside])
     choice.offer(narrow, places, reach, beside=True)
@@ -341,22 +341,20 @@ def _chosen_windows(
     width = u.shape[0]
     row, column = pixels // width, pixels % width
     offered = places[row // size * num_columns + column // size]
-    tables = u_slope, v_slope, origin, reach, values, u, v
-    return (torch.where(_are_near(pixels, offered.clamp(min=0), *tables), offered, -1),)
+    tables, image = (u_slope, v_slope, origin, reach), (values, u, v)
+    is_near = _are_near(pixels, offered.clamp(min=0), tables, image)
+    return (torch.where(is_near, offered, -1),)
 
 
 def _are_near(
     pixels: Tensor,
     windows: Tensor,
-    u_slope: Tensor,
-    v_slope: Tensor,
-    origin: Tensor,
-    reach: Tensor,
-    values: Tensor,
-    u: Tensor,
-    v: Tensor,
+    tables: Sequence[Tensor],
+    image: tuple[Tensor, Tensor, Tensor],
 ) -> Tensor:
-    """Tell which pixels are within the reach of the planes of windows, both by place."""
+    """Tell which pixels are within the reach of windows, both by place; see :func:`_tables`."""
+    u_slope, v_slope, origin, reach = tables
+    values, u, v = image
     width = u.shape[0]
     on_plane = u_slope[windows] * u[pixels % width] + v_slope[windows] * v[pixels // width]
     away = values[pixels] - (on_plane + origin[windows])

@@ -111,7 +111,7 @@ def _segment(
     focal = (fx, fy)
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double()[:, None] - cy
-    x, y = (u / fx).expand_as(inverse), (v / fy).expand_as(inverse)
+    x, y = (rays.expand_as(inverse).contiguous() for rays in (u / fx, v / fy))
     pixels = fit_pixels(inverse, seen, u, v, focal=focal, noise=config.noise, dtype=depth.dtype)
     normals, curvature = _normals_and_curvature(pixels, inverse, x, y, focal)
     valid = pixels.valid
