@@ -1,6 +1,7 @@
 """Kernels: written code, machine code, and what there is without a compiler."""
 
 import dataclasses
+import hashlib
 import shutil
 import subprocess
 import sys
@@ -171,6 +172,17 @@ def test_gradients_need_the_written_code():
     with compiled():
         doubled(values)[0].sum().backward()
     assert torch.equal(values.grad, torch.full((3, 4), 2.0))
+
+
+def test_a_torn_file_and_one_of_another_machine_are_no_code(folder, monkeypatch):
+    one, signature = fresh(noise._of_few), ("float32",) * 4
+    path, code = one.path(signature), b"machine code"
+    path.write_bytes(code + hashlib.sha256(code).digest())
+    assert _compile._is_whole(path)
+    path.write_bytes(code[:-1] + b"X" + hashlib.sha256(code).digest())
+    assert not _compile._is_whole(path)
+    monkeypatch.setattr(_compile, "_machine", lambda: "another processor")
+    assert one.path(signature) != path
 
 
 @needs_compiler

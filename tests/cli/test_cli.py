@@ -216,6 +216,10 @@ def test_no_result_takes_the_place_of_an_input(room, tmp_path, monkeypatch, caps
         several = ["other/room é.npz"] if "--merge" in command else []
         assert main([*command, *several, "room é.npz", "--out", out]) == 2
         assert "expected a place of its own for each result" in error_line(capsys)
+    # A second name of the same file is no other place.
+    Path("linked.npz").hardlink_to("room é.npz")
+    assert main([*command, *several, "room é.npz", "--out", "linked.npz"]) == 2
+    assert "expected a place of its own for each result" in error_line(capsys)
     assert Path("room é.npz").read_bytes() == before
 
 

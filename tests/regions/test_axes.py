@@ -90,8 +90,10 @@ def test_most_area_decides_and_what_leans_does_not_count():
 
 
 def test_the_lowest_floor_is_at_zero_and_the_room_in_the_middle():
-    centers = [[1.0, 2, 5.0], [1, 2, 7.5], [3, 2, 6], [1, 2, 5.7]]
-    planes = table([[0, 0, 1], [0, 0, 1], [1, 0, 0], [0, 0, 1]], [9.0, 9, 5, 1], centers, sides=4.0)
+    # The last is a reflection below the floor.
+    centers = [[1.0, 2, 5.0], [1, 2, 7.5], [3, 2, 6], [1, 2, 5.7], [1, 2, 4]]
+    normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0], [0, 0, 1], [0, 0, 1]]
+    planes = table(normals, [9.0, 9, 5, 1, 0.2], centers, sides=4.0)
     moved = torch.tensor(centers).double() + align_axes(planes)[:3, 3]
     assert moved[0].tolist() == pytest.approx([0, 0, 0])
     assert moved[1, 2] == pytest.approx(2.5)
@@ -105,7 +107,8 @@ def test_up_may_be_any_axis():
 
 
 def test_a_cloud_without_walls_is_told():
-    planes = table([[0, 0.05, 1], [0, 0.05, 1]], [9.0, 3])
+    # What stands askew on the floor is too small for a wall.
+    planes = table([[0, 0.05, 1], [0, 0.05, 1], [1, 1, -0.05]], [9.0, 3, 0.1])
     with pytest.warns(UserWarning, match="turned upright only"):
         rotation = align_axes(planes)[:3, :3]
     assert torch.allclose(rotation @ planes.normal[0], torch.eye(3).double()[2], atol=1e-9)
@@ -122,6 +125,7 @@ def test_what_has_no_axes_is_refused():
     for planes in (
         table([[0.0, 1, 0]], [9.0]),
         table([[0.0, 1, 0]], [9.0])._replace(curved=torch.ones(1, dtype=torch.bool)),
+        table([[0.0, 1, 0], [1, 0, 0]], [9.0, 0.1]),
         segment_planes(torch.rand(30, 3)),
     ):
         with pytest.raises(ConfigError, match="expected a floor, a ceiling, or walls"):

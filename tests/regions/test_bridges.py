@@ -21,10 +21,10 @@ CUT = load_config("consensus")
 WHOLE = dataclasses.replace(CUT, growing=dataclasses.replace(CUT.growing, cut_bridges=False))
 
 
-def crease(angle_deg, noise, joint, num_points=4000):
-    """Two faces of 0.5 by 1 metres that meet in an arc of some radius; 1 on the second."""
+def crease(angle_deg, noise, joint, width=0.5, num_points=4000):
+    """Faces of 0.5 and ``width`` by 1 metres that meet in an arc of some radius; 1 on the second."""
     rng = np.random.default_rng(0)
-    along, across = rng.uniform(-0.5, 0.5, num_points), rng.uniform(0, 1, num_points)
+    along, across = rng.uniform(-0.5, width, num_points), rng.uniform(0, 1, num_points)
     angle = np.radians(angle_deg)
     half = joint * angle / 2
     turn = np.full(num_points, angle) * (along > 0)
@@ -39,10 +39,11 @@ def crease(angle_deg, noise, joint, num_points=4000):
 
 
 @pytest.mark.parametrize(
-    ("angle_deg", "noise", "joint"), [(12, 0.0002, 0.0), (12, 0.003, 0.04), (24, 0.003, 0.0)]
+    ("angle_deg", "noise", "joint", "width"),
+    [(12, 0.0002, 0.0, 0.5), (12, 0.003, 0.04, 0.5), (24, 0.003, 0.0, 0.5), (14, 0.003, 0.0, 0.2)],
 )
-def test_creases_stay_open(angle_deg, noise, joint):
-    points, truth = crease(angle_deg, noise, joint)
+def test_creases_stay_open(angle_deg, noise, joint, width):
+    points, truth = crease(angle_deg, noise, joint, width)
     found = segment_planes(points, CUT).labels
     score = score_labels(found, truth)
     assert (score.regions, score.recall_iou80) == (2, 1.0)

@@ -164,8 +164,7 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
 def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:
     """Return the direction that most area is level or upright to; see :func:`align_axes`."""
     level = (normals @ given).abs() >= math.cos(math.radians(_MOST_TILT_DEG))
-    signed = torch.where(normals @ given < 0, -1.0, 1.0)[:, None] * normals
-    candidates = signed[level & (areas > 0)]
+    candidates = normals[level & (areas > 0)]
     if not len(candidates):
         # Walls alone say where up is, too: across their normals.
         upright = (normals @ given).abs() <= math.sin(math.radians(_MOST_TILT_DEG))
@@ -177,7 +176,7 @@ def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:
                 f"within {_MOST_TILT_DEG:g} degrees of that; segment the cloud first, or say where "
                 "up is."
             )
-        candidates = vectors[:, 0][None] * torch.sign(vectors[:, 0] @ given)
+        candidates = vectors[:, 0][None]
     agreeing = [_agreement(normals, areas, axis) for axis in candidates]
     axis = candidates[int(torch.stack(agreeing).argmax())]
     for _ in range(_NUM_FITS):
