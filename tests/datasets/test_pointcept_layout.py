@@ -84,6 +84,25 @@ def test_a_scene_reads_as_it_was_written(sample, seg, tmp_path):
     assert torch.equal(found["curvature"], seg.curvature)
 
 
+def test_labels_keep_their_values_in_the_least_type_that_holds_them(sample, seg, tmp_path):
+    for largest, dtype in ((2**15 - 1, "<i2"), (2**15, "<i4")):
+        instance = torch.arange(3000) - 2999 + largest
+        write_pointcept_scene(tmp_path, {**sample, "instance": instance}, seg)
+        assert np.load(tmp_path / "instance.npy").dtype.str == dtype
+        assert torch.equal(read_pointcept_scene(tmp_path)["instance"], instance)
+    # Beside the labels of ScanNet objects have its type.
+    scannet = {**sample, "segment20": sample["segment"], "instance": instance}
+    write_pointcept_scene(tmp_path, scannet, seg)
+    assert np.load(tmp_path / "instance.npy").dtype.str == "<i8"
+    assert torch.equal(read_pointcept_scene(tmp_path)["instance"], instance)
+
+
+def test_of_several_labels_the_first_counts(tmp_path):
+    np.save(tmp_path / "coord.npy", np.eye(3, dtype=np.float32))
+    np.save(tmp_path / "segment.npy", np.array([[4, 1, -1], [5, -1, -1], [6, 2, 3]], np.int16))
+    assert read_pointcept_scene(tmp_path)["segment"].tolist() == [4, 5, 6]
+
+
 def test_the_table_describes_the_labels(sample, seg, tmp_path):
     write_pointcept_scene(tmp_path, sample, seg)
     table = json.loads((tmp_path / "planes.json").read_text())

@@ -54,9 +54,9 @@ def tum(tmp_path):
         write_depth(root / "depth" / f"{name}.png", value)
         write_color(root / "rgb" / f"{name}5.png", value // 1000)
     write_text(root / "depth.txt", "# depth\n2.0 depth/2.0.png\n1.0 depth/1.0.png\n")
-    write_text(root / "rgb.txt", "# color\n1.015 rgb/1.05.png\n2.3 rgb/2.05.png\n")
-    far = f"1.5 9 9 9 {QUARTER}\n0.985 9 9 9 {QUARTER}\n"
-    write_text(root / "groundtruth.txt", f"#\n{far}1.01 0.5 0.25 2 {QUARTER}\n")
+    write_text(root / "rgb.txt", "# color\n1.015 rgb/1.05.png\n2.03 rgb/2.05.png\n")
+    far = f"1.5 9 9 9 {QUARTER}\n1.015 9 9 9 {QUARTER}\n"
+    write_text(root / "groundtruth.txt", f"#\n{far}0.99 0.5 0.25 2 {QUARTER}\n")
     return root
 
 
@@ -118,6 +118,7 @@ def test_icl_nuim_frames_are_matched_by_number(tmp_path):
     write_text(root / "livingRoom0.gt.freiburg", f"2 0.5 0.25 2 {QUARTER}\n10 0 0 0 0 0 0 1\n")
     data = RGBDFrames.from_folder(root, "icl-nuim")
     assert [scene.name for scene in data.scenes] == [f"living_room_traj0/{n}" for n in (0, 2, 10)]
+    assert [float(sample["depth"].max()) for sample in data] == pytest.approx([1, 1.0004, 1.002])
     assert data[0]["intrinsics"].diagonal().tolist() == [481.2, -480, 1]
     assert "pose" not in data[0]
     torch.testing.assert_close(data[1]["pose"], expected_pose())
@@ -137,6 +138,8 @@ def test_scannet_frames_have_files_of_their_own(tmp_path):
     assert len(data) == 4
     assert data.scenes[2].name == "scene0000_01/0"
     assert data[0]["depth"].max() == 1.5
+    coarse = RGBDFrames.from_folder(tmp_path, "scannet", depth_scale=500)
+    assert coarse[0]["depth"].max() == 3
     torch.testing.assert_close(data[0]["pose"], expected_pose())
     assert "pose" not in data[1]
     assert data[0]["intrinsics"][0].tolist() == [577, 0, 318]

@@ -61,6 +61,8 @@ def test_the_camera_of_an_organised_cloud_is_found(frames):
     turned = points @ frames[2].camera.pose[:3, :3].float().T
     assert find_intrinsics(turned) is None
     assert find_intrinsics(torch.full((3, 4, 3), torch.nan)) is None
+    behind = points * torch.tensor([1, 1, -1])
+    assert find_intrinsics(behind) is None
     angle = torch.linspace(-1.0, 1.0, 50)
     ring = torch.stack([angle.sin(), torch.zeros(50), angle.cos()], dim=-1)
     assert find_intrinsics(ring.expand(6, 50, 3) * torch.arange(1, 7)[:, None, None]) is None

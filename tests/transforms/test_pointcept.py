@@ -247,6 +247,7 @@ def test_joined_data_sets_and_forked_workers_give_what_one_process_gives(dataset
 def test_mixed_rooms_keep_planes_of_their_own(datasets, root, num_rooms):
     data = build(datasets, root, [PLANES, *TAIL])
     samples = [data[i] for i in range(num_rooms)]
+    samples = [{**sample, "superpoint": sample["plane"].clone()} for sample in samples]
     plain = datasets.point_collate_fn(samples, mix_prob=0)
     mixed = datasets.point_collate_fn(samples, mix_prob=1)
     assert torch.equal(plain["plane"], torch.cat([sample["plane"] for sample in samples]))
@@ -256,6 +257,7 @@ def test_mixed_rooms_keep_planes_of_their_own(datasets, root, num_rooms):
     for first, second in zip(expected[::2], expected[1::2], strict=False):
         second[:] = [label if label < 0 else label + max(first) + 1 for label in second]
     assert mixed["plane"].tolist() == [label for labels in expected for label in labels]
+    assert torch.equal(mixed["superpoint"], mixed["plane"])
 
 
 def test_every_data_set_loads_our_files_and_importing_again_changes_nothing(datasets):

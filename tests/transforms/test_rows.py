@@ -118,6 +118,8 @@ def test_in_a_tiny_cloud_only_names_tell():
     assert KeepFinite()(sample)["pose"].shape == (4, 4)
     with pytest.raises(ConfigError, match="cannot tell whether camera of the sample"):
         KeepFinite()({**sample, "camera": torch.eye(4)})
+    with pytest.raises(ConfigError, match="cannot tell whether camera of the sample"):
+        KeepFinite()({"coord": torch.rand(16, 3), "camera": torch.eye(4).flatten()})
 
 
 @pytest.mark.parametrize(
@@ -138,7 +140,7 @@ def test_images_may_have_the_names_of_entries():
     assert SegmentPlanes("classic")(sample)["plane"].shape == (50,)
 
 
-@pytest.mark.parametrize("key", ["edge_index", "sampled_index"])
+@pytest.mark.parametrize("key", ["edge_index", "sampled_index", "frame_pcd_offset"])
 def test_numbers_of_points_are_refused_by_who_takes_points_out(key):
     with pytest.raises(ConfigError, match=f"expected a sample without {key}"):
         KeepFinite()(sample_of(**{key: np.zeros((2, 5), dtype=int)}))
@@ -150,3 +152,18 @@ def test_a_batch_with_a_list_keeps_every_cloud_in_step():
     assert batch["offset"].tolist() == [len(KEPT), 2 * len(KEPT)]
     assert batch["segment"].tolist() == KEPT * 2
     assert {len(batch[key]) for key in ("plane", "normal", "curvature")} == {2 * len(KEPT)}
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("batch", np.arange(NUM_POINTS) % 2),
+        ("batch", np.zeros(NUM_POINTS - 1, dtype=int)),
+        ("offset", np.array([-3, NUM_POINTS])),
+        ("offset", np.array([30, 20, NUM_POINTS])),
+        ("offset", np.array([NUM_POINTS - 1])),
+    ],
+)
+def test_clouds_that_do_not_lie_one_after_the_other_are_refused(key, values):
+    with pytest.raises(ConfigError, match=f"expected {key} to ascend"):
+        CenterCloud()(sample_of(**{key: values}))

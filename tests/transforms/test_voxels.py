@@ -110,11 +110,16 @@ def test_voxels_never_cross_the_clouds_of_a_batch(rng):
     assert torch.equal(both["inverse"], torch.cat([one["inverse"], one["inverse"] + count]))
 
 
-def test_centered_cloud_and_origin_give_the_coordinates_back():
-    coord = torch.tensor([[4e6, 5e6, 1.0], [4e6 + 2, 5e6, 3.0]], dtype=torch.float64)
-    sample = CenterCloud()(CenterCloud()({"coord": coord}))
-    assert sample["coord"].abs().max() == 1
-    assert torch.equal(sample["coord"] + sample["origin"], coord)
+def test_centered_cloud_and_origin_give_the_coordinates_back(dtype):
+    # From 2^24 on float32 has every second number, and the middle is between two of them.
+    far = 2.0**24
+    coord = torch.tensor([[far, 5e6, 1], [far + 2, 5e6, 3], [far, 5e6, 1]], dtype=dtype)
+    sample = CenterCloud()({"coord": coord})
+    assert sample["coord"].tolist() == [[-1, 0, -1], [1, 0, 1], [-1, 0, -1]]
+    assert torch.equal(sample["coord"] + sample["origin"], coord.double())
+    again = CenterCloud()({**sample, "coord": sample["coord"][::2]})
+    assert again["coord"].tolist() == [[0, 0, 0]] * 2
+    assert torch.equal(again["coord"] + again["origin"], coord[::2].double())
 
 
 def test_points_that_are_not_finite_leave_with_their_entries():
