@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
+from torchrg.io import read_cloud, write_cloud
+from torchrg.io.columns import merge_limits, narrow_integers
 from torchrg.io.fields import assemble_cloud
+from torchrg.structures import Cloud
 
 PATH = Path("a.any")
 
@@ -95,3 +98,29 @@ def test_coordinates_need_their_names_and_one_number_each():
         assemble_cloud(PATH, {"x": np.zeros(2), "y": np.zeros(2)})
     with pytest.raises(FormatError, match="expected one number a point in each of x, y, z"):
         assemble_cloud(PATH, {axis: np.zeros((2, 2)) for axis in "xyz"})
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "code"),
+    [
+        (-(2**31), 2**31 - 1, "i4"),
+        (0, 2**31, "u4"),
+        (-1, 2**31, "i8"),
+        (-(2**31) - 1, 0, "i8"),
+        (0, 2**32, "i8"),
+    ],
+)
+def test_integers_are_narrowed_only_where_those_of_all_chunks_fit(low, high, code):
+    limits = {}
+    for chunk in ([0, high], [low, 0]):
+        merge_limits(limits, {"a": np.array(chunk)})
+    values = np.array([low, 0, high])
+    found = narrow_integers(values, ("i4", "u4"), limits["a"])
+    assert found.dtype == code
+    assert found.tolist() == values.tolist()
+
+
+def test_colours_of_sixteen_bits_are_rounded_where_a_format_has_eight(tmp_path):
+    colors = np.array([[128, 129, 65535]], dtype=np.uint16)
+    write_cloud(tmp_path / "a.ply", Cloud(np.zeros((1, 3)), {"color": colors}))
+    assert read_cloud(tmp_path / "a.ply").fields["color"].tolist() == [[0, 1, 255]]

@@ -103,3 +103,24 @@ def test_arguments_are_checked():
 
 def test_every_score_has_a_meaning():
     assert list(METRICS["superpoints"]) == list(PartitionScore._fields)
+
+
+def row_of_points(count):
+    """Points a metre apart: those that have a border within four places are at it."""
+    return torch.arange(float(count))[:, None] * torch.tensor([1.0, 0, 0])
+
+
+@pytest.mark.parametrize(("distance", "share"), [(1.0, 1.0), (0.99, 0.875)])
+def test_borders_agree_up_to_the_distance_and_at_it(distance, share):
+    places = torch.arange(40)
+    score = score_partition(
+        (places >= 21).long(), (places >= 20).long(), row_of_points(40), boundary_distance=distance
+    )
+    assert (score.boundary_recall, score.boundary_precision) == (share, share)
+
+
+def test_borders_among_points_that_are_not_scored_do_not_count():
+    truth = torch.tensor([0] * 10 + [1] * 10 + [-1] * 20)
+    superpoints = torch.tensor([0] * 10 + [1] * 20 + [2] * 10)
+    score = score_partition(superpoints, truth, row_of_points(40), boundary_distance=0.5)
+    assert (score.boundary_recall, score.boundary_precision) == (1, 1)

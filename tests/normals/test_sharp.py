@@ -104,3 +104,12 @@ def test_plane_has_no_sharp_points(rng):
 def test_unknown_rule_is_refused(cube):
     with pytest.raises(ConfigError, match="expected rule to be qn or percentile, got 'mad'"):
         find_sharp_points(cube[2], cube[1], rule="mad")
+
+
+@pytest.mark.parametrize(("equal", "sharp"), [(5, True), (6, False)])
+def test_half_of_the_neighbors_are_no_majority_for_qn(equal, sharp):
+    # Of ten angles Qn is the 15th smallest difference: that of six equal ones is 0.
+    angles = torch.tensor([0.0] * equal + [10.0, 20, 35, 55, 80][-(10 - equal) :]).deg2rad()
+    normals = torch.stack([angles.sin(), torch.zeros(10), angles.cos()], dim=1)
+    neighbors = Neighbors(torch.arange(10)[None])
+    assert find_sharp_points(normals, neighbors, rule="qn", angle_deg=5).tolist() == [sharp]

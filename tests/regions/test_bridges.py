@@ -22,7 +22,7 @@ WHOLE = dataclasses.replace(CUT, growing=dataclasses.replace(CUT.growing, cut_br
 
 
 def crease(angle_deg, noise, joint, width=0.5, num_points=4000):
-    """Faces of 0.5 and ``width`` by 1 metres that meet in an arc of some radius; 1 on the second."""
+    """Faces 0.5 and ``width`` wide, 1 metre long, that meet in an arc; 1 on the second."""
     rng = np.random.default_rng(0)
     along, across = rng.uniform(-0.5, width, num_points), rng.uniform(0, 1, num_points)
     angle = np.radians(angle_deg)

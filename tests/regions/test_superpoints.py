@@ -375,3 +375,9 @@ def test_office_parts_need_half_the_superpoints_of_cut_pursuit(scan):
     assert fine.asa >= 0.95
     assert coarse.count <= 390
     assert coarse.asa >= 0.93
+
+
+def test_a_superpoint_is_on_the_plane_of_more_than_half_of_its_points():
+    parts = torch.tensor([0, 0, 1, 1, 1, 2, 2, -1])
+    planes = torch.tensor([3, -1, 3, 4, 4, -1, -1, 5])
+    assert superpoints.main_planes(parts, planes).tolist() == [-1, 4, -1]
