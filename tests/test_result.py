@@ -212,7 +212,7 @@ def test_what_the_commands_write_is_read_back(tmp_path):
 
 def test_the_page_shows_the_table_of_the_result():
     pytest.importorskip("pydeck", reason="needs the extra view")
-    points = make_room(num_points=60_000, noise=0.004, seed=3).points
+    points = make_room(num_points=20_000, noise=0.004, seed=3).points
     seg = torchrg.segment_planes(points, replace(CLASSIC, planes=PlanesConfig(up="z")))
     result = Result.of(Cloud(points.numpy()), seg)
     shown = table_of_page(make_page(result))

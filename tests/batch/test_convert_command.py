@@ -93,7 +93,7 @@ def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tm
     shown = capsys.readouterr().out
     assert "plane.npy changed" in shown
     assert "2 scans to convert, 1 done" in shown
-    assert convert(*command) == 3
+    assert convert(*command, "--workers", 1) == 3
     captured = capsys.readouterr()
     first, last = captured.err.splitlines()
     assert first.startswith(f"torchrg: bad: {tmp_path / 'in' / 'bad.ply'}: line 2: ")
@@ -211,11 +211,15 @@ def test_depth_frames_are_counted_by_the_second():
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")
-@pytest.mark.parametrize(("flags", "preset"), [([], "s3dis"), (["--preset", "classic"], "classic")])
-def test_s3dis_has_the_settings_made_for_it_unless_told_otherwise(flags, preset, tmp_path):
+def test_s3dis_has_the_settings_made_for_it_unless_told_otherwise(tmp_path, capsys):
     write_clean_room(tmp_path / "in" / "Area_1" / "office_1", 1, {"wall_1": 300, "floor_1": 300})
-    main(["convert", "s3dis", str(tmp_path / "in"), str(tmp_path / "out"), *flags])
+    command = ["convert", "s3dis", str(tmp_path / "in"), str(tmp_path / "out"), "--workers", "1"]
+    main(command)
     (record,) = (tmp_path / "out").rglob(RECORD)
-    used, expected = json.loads(record.read_text())["config"], asdict(load_config(preset))
+    used, expected = json.loads(record.read_text())["config"], asdict(load_config("s3dis"))
     for section in ("normals", "growing", "planes"):
         assert used[section] == expected[section]
+    for preset, told in (("s3dis", "nothing to do"), ("classic", "settings changed")):
+        capsys.readouterr()
+        assert main([*command, "--preset", preset, "--dry-run"]) == 0
+        assert told in capsys.readouterr().out

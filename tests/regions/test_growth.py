@@ -162,7 +162,7 @@ def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
 
 
 def test_no_python_number_is_kept_for_every_point():
-    num_points = 300_000
+    num_points = 150_000
     edges = EdgeLists(np.zeros(num_points + 1, dtype=np.int32), np.empty(0, dtype=np.int32))
     order = np.arange(num_points, dtype=np.int32)[::-1]
     tracemalloc.start()

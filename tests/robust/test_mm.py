@@ -1,3 +1,5 @@
+import functools
+
 import pytest
 import torch
 
@@ -16,16 +18,27 @@ from torchrg.robust import fit_detmm, fit_dets
 from torchrg.robust.mm import breakdown_constant, efficiency_constant
 
 
-def regular_fits(folder, fit, families, convert=torch.from_numpy, without=()):
-    """Fits of patches with at most half of the points on one plane, with the families' answers."""
-    patches, cases, *answers = load_oracles(folder, *families)
+@functools.cache
+def all_fits(folder, fit, convert, without):
+    """Fits of patches with at most half of the points on one plane, by their names."""
+    patches, cases = load_oracles(folder)
     known = {
         name: convert(points)
         for name, points in patches.items()
         if not cases[name]["exact_fit_50"] and name not in ("exact_z0_k26", *without)
     }
-    for name, found in fit_all(known, fit).items():
+    return fit_all(known, fit)
+
+
+def regular_fits(folder, fit, families, convert=torch.from_numpy, without=()):
+    """Those fits, with the families' answers."""
+    _, _, *answers = load_oracles(folder, *families)
+    for name, found in all_fits(folder, fit, convert, tuple(without)).items():
         yield name, found, *(family[name] for family in answers)
+
+
+def fit_for_location(batch):
+    return fit_detmm(batch, tuned_for="location")
 
 
 def assert_same_scatter(found, expected, tolerance, name):
@@ -50,7 +63,7 @@ def test_dets_is_that_of_rrcov_and_of_the_reference(oracles_folder):
 def test_detmm_is_that_of_rrcov_and_of_the_reference(oracles_folder, target, short):
     for name, fit, rrcov, ours in regular_fits(
         oracles_folder,
-        lambda batch: fit_detmm(batch, tuned_for=target),
+        fit_detmm if target == "shape" else fit_for_location,
         ["r_rrcov", "ref_numpy"],
     ):
         known = [ours.get("dets_mm", {}).get(f"mm_{short}_cov")]
