@@ -68,6 +68,18 @@ def test_the_camera_of_an_organised_cloud_is_found(frames):
     assert find_intrinsics(ring.expand(6, 50, 3) * torch.arange(1, 7)[:, None, None]) is None
 
 
+@pytest.mark.parametrize(
+    ("every", "pixels", "found"),
+    [(1, 0.09, True), (1, 0.15, False), (60, 1, False), (120, 1, True)],
+)
+def test_a_camera_puts_nearly_all_points_within_a_tenth_of_a_pixel(every, pixels, found):
+    camera = make_intrinsics(50.0, 50.0, 29.5, 19.5)
+    points = depth_to_points(torch.full((1, 40, 60), 2.0).double(), camera[None])[0]
+    moved = points.view(-1, 3)[::every]
+    moved[:, 0] += 2 / 50 * pixels * (1 - 2 * (torch.arange(len(moved)) % 2))
+    assert (find_intrinsics(points) is not None) == found
+
+
 def test_a_cloud_takes_values_back_into_its_image(frames):
     sample = sample_of(frames[2], color=torch.arange(3 * 144 * 192).view(3, 144, 192) % 251)
     cloud = DepthToCloud()(sample)
