@@ -7,7 +7,7 @@ and a test.
 import dataclasses
 import json
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,15 +26,19 @@ from torchrg.datasets import (
     FolderOfClouds,
     ScanNet,
     SceneFiles,
+    layouts,
     read_pointcept_scene,
     read_room,
     read_scannet_scan,
     write_pointcept_scene,
 )
-from torchrg.datasets.layouts import layout_scan, write_layout
+from torchrg.datasets.folder import folded_name
+from torchrg.datasets.layouts import LayoutScan, check_layout, stem_of, write_layout
+from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.pointcept import GIVEN_ARRAYS
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_depth
+from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import make_intrinsics, points_of_image
 from torchrg.errors import ConfigError, FormatError
@@ -64,17 +68,43 @@ class CloudSource:
     layout: str = "pointcept"
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
     level: int = 0
-    bytes_per_point: ClassVar[int] = 96
+    bytes_per_point: ClassVar[int] = 104
     """What the largest of the layouts takes."""
+    dataset: ClassVar[str] = "ScanNet"
+    """The data set whose layouts it has; clouds without labels are written as those of ScanNet."""
 
     def described(self, **options: Any) -> dict[str, Any]:  # noqa: ANN401
         """Return these settings, as far as they are not the usual ones, after others."""
         described = {**options, "superpoint": self.superpoint}
         if self.layout != "pointcept":
-            described["layout"] = self.layout
+            described |= {"layout": self.layout, "version": layouts.VERSION}
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
             described |= {"partition": dataclasses.asdict(self.partition), "level": self.level}
         return json.loads(json.dumps(described))  # type: ignore[no-any-return]
+
+    def checked(self, scans: list[Scan]) -> list[Scan]:
+        """Return scans if none of them would write into the files of another.
+
+        See :func:`torchrg.datasets.folder.folded_name`.
+        """
+        taken: dict[str, str] = {}
+        for scan in scans if self.layout != "pointcept" else ():
+            stem = stem_of(self.layout, scan.name, _place(scan))
+            other = taken.setdefault(folded_name(stem), scan.name)
+            if other != scan.name:
+                raise FormatError(
+                    f"expected files of its own for each scan, got {stem} for {other} and "
+                    f"{scan.name} in layout {self.layout}; rename one, or choose layout pointcept."
+                )
+        return scans
+
+    def check_lists(self, out: Path) -> None:
+        """Raise FormatError if :meth:`write_lists` would replace files from elsewhere."""
+        check_lists(self.layout, self.dataset, out)
+
+    def write_lists(self, out: Path) -> None:
+        """Write what the layout has for the data set as a whole, from all scans in ``out``."""
+        write_lists(self.layout, self.dataset, out)
 
     def part(
         self,
@@ -98,15 +128,27 @@ class CloudSource:
         given: Mapping[str, Any],
         seg: Segmentation,
         parts: NDArray[np.int32] | None,
+        **more: Any,  # noqa: ANN401
     ) -> list[str]:
-        """Write what is ``given`` of each point, and what was found, in the layout."""
+        """Write what is ``given`` of each point, and what was found, in the layout.
+
+        ``more`` is what :class:`torchrg.datasets.layouts.LayoutScan` has beside.
+        """
         if self.layout == "pointcept" or parts is None:
             origin = cloud.origin.tolist()
             return write_pointcept_scene(folder, given, seg, superpoint=parts, origin=origin)
-        arrays = {name: np.asarray(values) for name, values in given.items()}
-        labels, normals = seg.labels.numpy(), seg.normals.numpy()
-        place = scan.name if scan.item is None else str(scan.item)
-        parted = layout_scan(cloud, scan.name, place, parts, labels, normals, arrays)
+        split, name = layouts.split_name(scan.name)
+        parted = LayoutScan(
+            name,
+            split,
+            _place(scan),
+            coord=cloud.points.numpy(),
+            normal=seg.normals.numpy(),
+            superpoint=parts,
+            plane=seg.labels.numpy(),
+            given={name: np.asarray(values) for name, values in given.items()},
+            **{"dataset": self.dataset, **more},
+        )
         out = folder.parents[scan.name.count("/")]
         return write_layout(self.layout, folder, out, parted, seg.planes, cloud.origin)
 
@@ -116,6 +158,11 @@ class CloudSource:
             return ()
         place = " ".join(f"{value:.12g}" for value in cloud.origin)
         return (f"coordinates are written about {place}, as they are far from the origin",)
+
+
+def _place(scan: Scan) -> str:
+    """Return where a scan is in its data set."""
+    return scan.name if scan.item is None else str(scan.item)
 
 
 @dataclass(frozen=True)
@@ -164,7 +211,9 @@ class FolderSource(CloudSource):
             )
         if self.columns is not None and not any(map(takes_columns, files)):
             raise ConfigError("expected text or .npy for --columns, got files that name their own.")
-        return [self._scan(scene) for scene in scenes]
+        for scene in scenes:
+            check_layout(self.layout, _dataset({file.stem for file in scene.files}), scene.name)
+        return self.checked([self._scan(scene) for scene in scenes])
 
     def _scan(self, scene: SceneFiles) -> Scan:
         """Return a cloud with its input files."""
@@ -203,8 +252,18 @@ class FolderSource(CloudSource):
             origin = cloud.origin.tolist()
             files = write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
         else:
-            files = self.write(scan, folder, cloud, given, seg, parts)
+            dataset = _dataset(given.keys())
+            files = self.write(scan, folder, cloud, given, seg, parts, dataset=dataset)
         return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
+
+
+def _dataset(names: Collection[str]) -> str:
+    """Return the data set that a folder in Pointcept's layout is of, by what it holds.
+
+    It is ScanNet, as far as layouts know, or nothing where it has classes of which nobody knows
+    what they are.
+    """
+    return "" if "segment" in names and "segment20" not in names else "ScanNet"
 
 
 @dataclass(frozen=True)
@@ -218,6 +277,7 @@ class S3DISSource(CloudSource):
         settings: How to segment.
         areas: Numbers of the areas.
         class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
+            Other layouts have an order of their own.
     """
 
     root: Path
@@ -225,6 +285,7 @@ class S3DISSource(CloudSource):
     areas: tuple[int, ...]
     class_order: str = "pointcept"
     in_place: ClassVar[bool] = False
+    dataset: ClassVar[str] = "S3DIS"
 
     def describe(self) -> dict[str, Any]:
         """Return the kind and what else decides results."""
@@ -232,14 +293,23 @@ class S3DISSource(CloudSource):
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
+        check_layout(self.layout, self.dataset, self.dataset)
+        if self.layout != "pointcept" and self.class_order != "pointcept":
+            raise ConfigError(
+                f"expected --class-order with --layout pointcept, got layout {self.layout}, which "
+                "has the order of its own program; leave it out."
+            )
         require("pyarrow", extra="s3dis", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
-        return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
+        return self.checked(
+            [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
+        )
 
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read, segment and write one room."""
         begin("read")
-        room = read_room(self.root / scan.name, class_order=self.class_order)
+        order = layouts.CLASS_ORDERS.get(self.layout, self.class_order)
+        room = read_room(self.root / scan.name, class_order=order)
         cloud = Cloud(room.coord, source=scan.name)
         notes = [
             *check_finite(cloud),
@@ -280,24 +350,40 @@ class ScanNetSource(CloudSource):
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
-        return [
-            Scan(name, files, estimate_points(mesh), mesh.parent.relative_to(self.root).as_posix())
-            for name, mesh, files in ScanNet(self.root).scenes
-        ]
+        scans = []
+        for name, mesh, files in ScanNet(self.root).scenes:
+            dataset = _dataset_of_mesh(mesh)
+            check_layout(self.layout, dataset, dataset)
+            place = mesh.parent.relative_to(self.root).as_posix()
+            if dataset == "ScanNet++":
+                # Programs that read superpoints of it have scans where the release has data.
+                place = f"scans/{mesh.parent.parent.name}/scans"
+            scans.append(Scan(name, files, estimate_points(mesh), place))
+        return self.checked(scans)
 
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read, segment and write one scan."""
         begin("read")
-        given = read_scannet_scan(scan.inputs[0], self.root)
-        cloud = Cloud(given["coord"], source=str(scan.inputs[0]))
+        mesh = scan.inputs[0]
+        given = read_scannet_scan(mesh, self.root)
+        cloud = Cloud(given["coord"], source=str(mesh))
+        dataset, objects = _dataset_of_mesh(mesh), None
+        if self.layout == "scannet" and dataset == "ScanNet":
+            objects = read_objects(mesh, len(cloud))
         notes = (*check_finite(cloud), *self.notes(cloud))
         if "instance" not in given and not scan.name.startswith("test/"):
             notes += ("no labels: annotations or the table of their words are missing",)
         seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         parts = self.part(cloud, seg, given.get("color"), begin)
         begin("write")
-        files = self.write(scan, folder, cloud, given, seg, parts)
+        more = {"dataset": dataset, "objects": objects}
+        files = self.write(scan, folder, cloud, given, seg, parts, **more)
         return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=notes)
+
+
+def _dataset_of_mesh(mesh: Path) -> str:
+    """Return which of the two a mesh is of."""
+    return "ScanNet++" if mesh.name == MESH_PLUSPLUS else "ScanNet"
 
 
 def find_areas(root: Path) -> tuple[int, ...]:

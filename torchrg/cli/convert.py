@@ -26,6 +26,7 @@ from torchrg.batch.run import (
 )
 from torchrg.batch.scans import Job, Source
 from torchrg.batch.sources import (
+    CloudSource,
     FolderSource,
     RGBDSource,
     S3DISSource,
@@ -98,9 +99,12 @@ class CloudArguments(Arguments):
     """Level of the superpoints that is written; 0 is the finest."""
     layout: console.Layout = "pointcept"
     """Files that are written: a folder for each scan (pointcept), or superpoints and planes where
-    other programs look for them: segs.json for Mask3D's own preprocessing, SAI3D and others
-    (scannet), files of OneFormer3D, UniDet3D and ESAM (mmdet3d), of SPFormer (spformer), of ISBNet,
-    Open3DIS and SphericalMask (isbnet), what Mask3D trains on (mask3d), bare arrays (npy)."""
+    other programs look for them, with classes and objects: OneFormer3D, UniDet3D and ESAM
+    (mmdet3d), SPFormer (spformer), ISBNet, Open3DIS and SphericalMask (isbnet), Mask3D (mask3d);
+    bare arrays (npy); segs.json and, of annotated scans, aggregation.json in the place of the
+    release's, for SAI3D and for preprocessing (scannet), where superpoints end at objects, which is
+    more than a network may know of scans that it is scored on. Of S3DIS there are pointcept,
+    mmdet3d, isbnet, mask3d and npy, of ScanNet++ pointcept, scannet and npy."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
     usual_preset: ClassVar[str] = DEFAULT_PRESET
@@ -163,7 +167,7 @@ class S3DISArguments(CloudArguments):
     areas: tuple[int, ...] = ()
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
-    """What the numbers in segment.npy mean."""
+    """What the numbers in segment.npy mean. Other layouts have the order of their programs."""
     usual_preset: ClassVar[str] = "s3dis"
 
     def source(self, root: Path, out: Path) -> Source:
@@ -263,7 +267,10 @@ def run(argv: list[str]) -> int:
     arguments = arguments if arguments.dry_run else arguments.prepared()
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with console.warnings_as_lines():
-        jobs = list_jobs(arguments.source(root, out), out, only=arguments.only)
+        source = arguments.source(root, out)
+        jobs = list_jobs(source, out, only=arguments.only)
+    if isinstance(source, CloudSource):
+        source.check_lists(out)
     if arguments.dry_run:
         plan = _look_at(jobs, arguments)
         print(format_plan(plan), _say_costs(plan, out, arguments), sep="\n")
@@ -329,6 +336,8 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
         plan, reports, engine=arguments.engine, workers=workers, unit=arguments.unit
     )
     code = _finish(report, out, unit=arguments.unit)
+    if isinstance(source := plan.jobs[0].source, CloudSource) and not report.disk_full:
+        source.write_lists(out)
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)

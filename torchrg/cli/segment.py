@@ -1,8 +1,9 @@
 """``torchrg segment``: plane labels of scans."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import PROCESS_BYTES, available_memory, memory_of_scan
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import Scan, check_finite, write_results
@@ -148,14 +150,28 @@ def run(argv: list[str]) -> int:
     if arguments.pages:
         _check_pages(arguments, pictures)
     arguments = dataclasses.replace(arguments, settings=console.prepared(arguments.settings))
-    code = run_each(
-        _segment, arguments, [_name_of(cloud) for cloud in clouds], clouds, outputs, pictures
-    )
+    names = [_name_of(cloud) for cloud in clouds]
+    with _sharing(arguments, outputs):
+        code = run_each(_segment, arguments, names, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
         print(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
+
+
+@contextlib.contextmanager
+def _sharing(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
+    """Keep scans of a layout, whose files are in the same folders, from those of one another."""
+    if arguments.layout in (None, "pointcept"):
+        yield
+        return
+    source = CloudSource(layout=arguments.layout)
+    source.checked([Scan(path.name, (), 0) for path in outputs])
+    with DirectoryLock(arguments.out):
+        source.check_lists(arguments.out)
+        yield
+        source.write_lists(arguments.out)
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:

@@ -1,8 +1,9 @@
 """Superpoints and planes of a scan in the files that networks on superpoints load.
 
-:data:`LAYOUTS` has a function for each family of programs. It returns the files of one scan by
-their paths below the output directory; :func:`write_layout` puts them there. Superpoints are int64
-everywhere, as programs that read raw bytes take them for such.
+:data:`LAYOUTS` has a function for each family of programs and each data set that they read. It
+returns the files of one scan by their paths below the output directory; :func:`write_layout` puts
+them there, and :mod:`torchrg.datasets.lists` lists them where a program has lists. Superpoints are
+int64 everywhere, as programs that read raw bytes take them for such.
 """
 
 import io
@@ -11,7 +12,7 @@ import pickle
 import pickletools
 import re
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,9 @@ from numpy.typing import NDArray
 
 from torchrg.datasets.pointcept import write_files
 from torchrg.datasets.scannet import NYU_IDS
-from torchrg.errors import FormatError
+from torchrg.errors import ConfigError, FormatError
 from torchrg.result import describe_planes
-from torchrg.structures import Cloud, Planes
+from torchrg.structures import Planes
 
 Files = dict[str, NDArray[Any] | bytes]
 """Contents by paths below the output directory: arrays as ``.npy``, or bytes."""
@@ -34,8 +35,17 @@ _STUFF = 2
 """Classes of ScanNet below this number, wall and floor, are no objects."""
 _CENTERED = 127.5
 """Half of the largest colour: what SPFormer and ISBNet divide colours by before they take off 1."""
-_SPLITS = {"train": "train", "val": "validation", "test": "test"}
+MODES = {"train": "train", "val": "validation", "test": "test"}
 """Names of splits in Mask3D."""
+_MOST_OBJECTS = 999
+"""Objects that a scan may have in Mask3D, whose ground truth is the class in thousands and the
+number of the object, counted from one."""
+_EXACT = 2**24
+"""Largest number up to which float32 holds every whole one."""
+_S3DIS_FOLDER = "Stanford3dDataset_v1.2_Aligned_Version"
+"""Folder in which MMDetection3D looks for the names of the rooms."""
+VERSION = 2
+"""To be raised when a layout gets other files, so that scans with the old ones are done again."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +54,10 @@ class LayoutScan:
 
     Attributes:
         name: What its files are called.
-        split: ``train``, ``val`` or ``test``.
+        listed: ``train``, ``val`` or ``test``, or nothing where the data set does not say.
         folder: Where it is in its own data set, which some programs keep.
+        dataset: The data set whose classes and objects it has, a key of a row of :data:`LAYOUTS`;
+            ``"ScanNet"`` without any.
         coord: Coordinates, shape ``(N, 3)``, float32.
         normal: Unit normals, shape ``(N, 3)``.
         superpoint: Superpoint of each point, shape ``(N,)``.
@@ -53,16 +65,24 @@ class LayoutScan:
         given: What else is known: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the
             class of each point, -1 for none, ``category``, its number in NYU40, 0 for none, and
             ``instance``, its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
+        objects: What :func:`torchrg.datasets.scannet.read_objects` returns; None if unknown.
     """
 
     name: str
-    split: str
+    listed: str
     folder: str
+    dataset: str
     coord: NDArray[np.float32]
     normal: NDArray[np.floating]
     superpoint: NDArray[np.integer]
     plane: NDArray[np.integer]
     given: Mapping[str, NDArray[Any]]
+    objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
+
+    @property
+    def split(self) -> str:
+        """One of ``train``, ``val`` and ``test``: those without labels are of the test."""
+        return self.listed or ("test" if self.truth is None else "train")
 
     @property
     def color(self) -> NDArray[np.uint8]:
@@ -83,12 +103,42 @@ class LayoutScan:
 
     @property
     def category(self) -> NDArray[np.int64]:
-        """Category of each point, 0 for none; of other data than ScanNet the class and one."""
-        known = self.given.get("category")
-        if known is None:
-            truth = self.truth
-            return np.zeros(len(self.coord), np.int64) if truth is None else truth[0] + 1
-        return known.astype(np.int64)
+        """Number in NYU40 of the class of each point of ScanNet, 0 for none."""
+        if "category" in self.given or self.truth is None:
+            return self.given.get("category", np.zeros(len(self.coord))).astype(np.int64)
+        return np.array([*NYU_IDS, 0])[self.truth[0]]
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Return the split that the name of a scan begins with, if any, and the name of its files.
+
+    Example:
+        >>> split_name("val/scene0011_00"), split_name("Area_1/office_1")
+        (('val', 'scene0011_00'), ('', 'Area_1_office_1'))
+    """
+    head, _, tail = name.rpartition("/")
+    return (head, tail) if head in MODES else ("", name.replace("/", "_"))
+
+
+def stem_of(layout: str, name: str, folder: str) -> str:
+    """Return what no two scans may have in common in a layout, as their files would be the same.
+
+    ``name`` is that of the scan in its data set, and ``folder`` where it is there.
+    """
+    if layout == "scannet":
+        return folder
+    _, stem = split_name(name)
+    return _short(stem) if layout == "mask3d" else stem
+
+
+def check_layout(layout: str, dataset: str, what: str) -> None:
+    """Raise ConfigError if a layout has no form for a data set, which messages call ``what``."""
+    known = [name for name, forms in LAYOUTS.items() if dataset in forms]
+    if layout not in ("pointcept", *known):
+        raise ConfigError(
+            f"expected --layout to be one of pointcept, {', '.join(known)} for {what}, got "
+            f"{layout}, whose programs do not know its classes; choose another."
+        )
 
 
 def write_layout(
@@ -118,46 +168,57 @@ def write_layout(
             f"{len(scan.coord):,} that are not; remove them, or choose layout pointcept."
         )
     up = "../" * len(place.relative_to(out).parts)
-    contents = {f"{up}{path}": content for path, content in LAYOUTS[layout](scan).items()}
+    files = LAYOUTS[layout][scan.dataset](scan)
+    contents = {f"{up}{path}": content for path, content in files.items()}
     return write_files(place, contents, describe_planes(planes, origin=origin.tolist()))
 
 
-def layout_scan(
-    cloud: Cloud,
-    name: str,
-    folder: str,
-    superpoint: NDArray[np.integer],
-    labels: NDArray[np.integer],
-    normals: NDArray[np.floating],
-    given: Mapping[str, NDArray[Any]],
-) -> LayoutScan:
-    """Return a scan for layouts from a cloud and what was found about it.
-
-    ``name`` is its place in a data set. What comes before the last slash is the split if it is
-    called so; else the name is all of it, and the split is ``test`` without ``instance``, or else
-    ``train``. ``folder`` is where it was found.
-    """
-    head, _, tail = name.rpartition("/")
-    is_split = head in _SPLITS
-    split = head if is_split else ("train" if "instance" in given else "test")
-    flat = tail if is_split else name.replace("/", "_")
-    points = cloud.points.numpy()
-    return LayoutScan(flat, split, folder, points, normals, superpoint, labels, given)
-
-
 def _scannet(scan: LayoutScan) -> Files:
-    """ScanNet's own: superpoints as its Segmentator writes segments."""
-    return {
-        f"{scan.folder}/{scan.name}_vh_clean_2.0.010000.segs.json": _segments(
-            scan, scan.superpoint
-        ),
-        f"{scan.folder}/{scan.name}_vh_clean_2.planes.segs.json": _segments(scan, scan.plane),
-    }
+    """ScanNet's own: superpoints as its Segmentator writes segments, and its objects by them."""
+    first = f"{scan.folder}/{scan.name}_vh_clean_2"
+    if scan.dataset == "ScanNet++":
+        first = f"{scan.folder}/mesh_aligned_0.05"
+    files: Files = {f"{first}.planes.segs.json": _segments(scan, scan.plane)}
+    parts = scan.superpoint
+    if scan.objects is not None:
+        parts = _cut(scan.superpoint, [rows for _, rows in scan.objects])
+        content = {
+            "sceneId": f"scannet.{scan.name}",
+            "appId": "torchrg",
+            "segGroups": [
+                {**known, "segments": np.unique(parts[rows]).tolist()}
+                for known, rows in scan.objects
+            ],
+            "segmentsFile": f"scannet.{scan.name}_vh_clean_2.0.010000.segs.json",
+        }
+        files[f"{scan.folder}/{scan.name}.aggregation.json"] = _json(content)
+    return {f"{first}.0.010000.segs.json": _segments(scan, parts), **files}
+
+
+def _cut(
+    superpoint: NDArray[np.integer], objects: Sequence[NDArray[np.integer]]
+) -> NDArray[np.int64]:
+    """Return superpoints of which each is in an object as a whole, or not at all.
+
+    Objects may overlap, as the release has segments that two of them name.
+
+    Example:
+        >>> _cut(np.array([0, 0, 0, 1, 1]), [np.array([0, 1]), np.array([1, 3])]).tolist()
+        [2, 3, 0, 4, 1]
+    """
+    parts = superpoint.astype(np.int64)
+    for rows in objects:
+        parts[rows] = parts.max(initial=0) + 1 + np.unique(parts[rows], return_inverse=True)[1]
+    return np.unique(parts, return_inverse=True)[1].reshape(-1)
 
 
 def _segments(scan: LayoutScan, labels: NDArray[np.integer]) -> bytes:
     """Return labels as the JSON of segments."""
-    content = {"params": {}, "sceneId": scan.name, "segIndices": labels.tolist()}
+    return _json({"params": {}, "sceneId": scan.name, "segIndices": labels.tolist()})
+
+
+def _json(content: Any) -> bytes:  # noqa: ANN401
+    """Return an object as JSON without blanks."""
     return json.dumps(content, separators=(",", ":")).encode()
 
 
@@ -173,6 +234,8 @@ def _mmdet3d(scan: LayoutScan) -> Files:
         f"points/{scan.name}.bin": vertices.tobytes(),
         f"super_points/{scan.name}.bin": superpoint.tobytes(),
     }
+    if scan.truth is not None or scan.split == "test":
+        files[f"meta_data/scannetv2_{scan.split}/{scan.name}.json"] = _json({"name": scan.name})
     if scan.truth is None:
         return files
     # Objects are counted from one there.
@@ -190,6 +253,34 @@ def _mmdet3d(scan: LayoutScan) -> Files:
         f"instance_mask/{scan.name}.bin": instance.tobytes(),
     }
     return files
+
+
+def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
+    """MMDetection3D: S3DIS about the corner of its room, classes and objects of all points."""
+    low = scan.coord.min(axis=0).astype(np.float64)
+    points = np.hstack([scan.coord - low, scan.color]).astype(np.float32)
+    superpoint = scan.superpoint.astype(np.int64)
+    segment, instance = _labels(scan)
+    instance += 1
+    first = f"s3dis_data/{scan.name}"
+    return {
+        f"{first}_point.npy": points,
+        f"{first}_sem_label.npy": segment,
+        f"{first}_ins_label.npy": instance,
+        f"{_S3DIS_FOLDER}/{scan.folder}/plane.npy": scan.plane.astype(np.int64),
+        f"points/{scan.name}.bin": points.tobytes(),
+        f"super_points/{scan.name}.bin": superpoint.tobytes(),
+        f"semantic_mask/{scan.name}.bin": segment.tobytes(),
+        f"instance_mask/{scan.name}.bin": instance.tobytes(),
+    }
+
+
+def _labels(scan: LayoutScan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return class and object of each point of S3DIS, in which no point is without."""
+    if scan.truth is None:
+        raise FormatError(f"{scan.name}: expected classes and objects of S3DIS, got none.")
+    segment, instance = scan.truth
+    return segment, np.unique(instance, return_inverse=True)[1].reshape(-1)
 
 
 def _boxes(
@@ -225,11 +316,20 @@ def _isbnet(scan: LayoutScan) -> Files:
     }
 
 
+def _isbnet_s3dis(scan: LayoutScan) -> Files:
+    """ISBNet's S3DIS: coordinates as they are, and objects of all classes."""
+    content = (scan.coord, _scaled_color(scan), *_labels(scan))
+    return {
+        f"preprocess/{scan.name}_inst_nostuff.pth": _pickled(content),
+        f"superpoints/{scan.name}.pth": _pickled(scan.superpoint.astype(np.int64)),
+        f"planes/{scan.name}.pth": _pickled(scan.plane.astype(np.int64)),
+    }
+
+
 def _centered(scan: LayoutScan) -> tuple[NDArray[Any], ...]:
     """Return coordinates about their mean, colours in [-1, 1], and classes and objects if known."""
     mean = scan.coord.mean(axis=0, dtype=np.float64)
-    coord = (scan.coord - mean).astype(np.float32)
-    color = (scan.color / _CENTERED - 1).astype(np.float32)
+    coord, color = (scan.coord - mean).astype(np.float32), _scaled_color(scan)
     if scan.truth is None:
         return coord, color
     segment, instance = scan.truth
@@ -239,18 +339,77 @@ def _centered(scan: LayoutScan) -> tuple[NDArray[Any], ...]:
     return coord, color, np.where(segment < 0, _IGNORED, segment).astype(np.float64), objects
 
 
+def _scaled_color(scan: LayoutScan) -> NDArray[np.float32]:
+    """Return colours in [-1, 1]."""
+    return (scan.color / _CENTERED - 1).astype(np.float32)
+
+
 def _mask3d(scan: LayoutScan) -> Files:
-    """Mask3D: one array of all columns; superpoints are the tenth."""
-    split, match = _SPLITS[scan.split], re.fullmatch(r"scene(\d{4}_\d{2})", scan.name)
-    name = match[1] if match else scan.name
-    columns: list[NDArray[Any]] = [scan.coord, scan.color, scan.normal, scan.superpoint[:, None]]
+    """Mask3D: a scan of ScanNet, whose classes are categories of NYU40."""
+    labels = None if scan.truth is None else (scan.category, scan.truth[1])
+    # Mask3D knows a scan by the folder of its mesh.
+    entry = {"scene": scan.name, "raw_filepath": f"{scan.name}/{scan.name}_vh_clean_2.ply"}
+    places = f"{MODES[scan.split]}/{_short(scan.name)}", f"{MODES[scan.split]}/{scan.name}"
+    return _mask3d_files(scan, *places, labels, entry, first_class=0)
+
+
+def _mask3d_s3dis(scan: LayoutScan) -> Files:
+    """Mask3D: a room of S3DIS, whose classes are counted from one in the ground truth."""
+    area, room = scan.folder.split("/")
+    entry = {"scene": room, "area": area, "raw_filepath": scan.folder}
+    return _mask3d_files(scan, scan.folder, scan.folder, _labels(scan), entry, first_class=1)
+
+
+def _mask3d_files(
+    scan: LayoutScan,
+    place: str,
+    truth_place: str,
+    labels: tuple[NDArray[np.int64], NDArray[np.int64]] | None,
+    entry: Mapping[str, Any],
+    first_class: int,
+) -> Files:
+    """One array of all columns, superpoints the tenth; the ground truth; the entry of its list."""
+    mode, _, name = place.partition("/")
+    color = scan.color.astype(np.int64)
+    num_values = 255 * max(len(color), 1)
+    entry = {
+        "filepath": f"{place}.npy",
+        "file_len": len(color),
+        "color_mean": (color.sum(axis=0) / num_values).tolist(),
+        "color_std": ((color**2).sum(axis=0) / (255 * num_values)).tolist(),
+        **entry,
+    }
     files: Files = {f"planes/{scan.name}.npy": scan.plane.astype(np.int64)}
-    if scan.truth is not None:
-        category, instance = scan.category, scan.truth[1]
+    _check_numbers(scan, "superpoints", scan.superpoint, 0, _EXACT)
+    columns: list[NDArray[Any]] = [scan.coord, scan.color, scan.normal, scan.superpoint[:, None]]
+    if labels is not None:
+        category, instance = labels
+        _check_numbers(scan, "numbers of classes", category, 0, _EXACT)
+        _check_numbers(scan, "numbers of objects", instance, -1, _MOST_OBJECTS)
         columns += [category[:, None], instance[:, None]]
-        lines = "".join(f"{number}\n" for number in category * 1000 + instance + 1)
-        files[f"instance_gt/{split}/{scan.name}.txt"] = lines.encode()
-    return {f"{split}/{name}.npy": np.hstack([c.astype(np.float32) for c in columns]), **files}
+        truth = (category + first_class) * 1000 + instance + 1
+        entry["instance_gt_filepath"] = path = f"instance_gt/{truth_place}.txt"
+        files[path] = "".join(f"{number}\n" for number in truth).encode()
+    if labels is not None or mode == "test":
+        files[f"{mode}_database/{name}.json"] = _json(entry)
+    return {f"{place}.npy": np.hstack([c.astype(np.float32) for c in columns]), **files}
+
+
+def _check_numbers(
+    scan: LayoutScan, what: str, numbers: NDArray[np.integer], least: int, end: int
+) -> None:
+    """Refuse numbers that Mask3D would read as others."""
+    bad = numbers[(numbers < least) | (numbers >= end)]
+    if len(bad):
+        raise FormatError(
+            f"{scan.name}: expected {what} from {least} to {end - 1:,} for layout mask3d, whose "
+            f"files hold no others, got {bad[0]:,}; choose another layout."
+        )
+
+
+def _short(name: str) -> str:
+    """Return the name of a scan in Mask3D, which leaves out the first word of ScanNet's."""
+    return re.sub(r"^scene(?=[0-9]{4}_[0-9]{2}$)", "", name)
 
 
 def _npy(scan: LayoutScan) -> Files:
@@ -261,15 +420,19 @@ def _npy(scan: LayoutScan) -> Files:
     }
 
 
-LAYOUTS: dict[str, Callable[[LayoutScan], Files]] = {
-    "scannet": _scannet,
-    "mmdet3d": _mmdet3d,
-    "spformer": _spformer,
-    "isbnet": _isbnet,
-    "mask3d": _mask3d,
-    "npy": _npy,
+LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
+    "scannet": dict.fromkeys(("ScanNet", "ScanNet++", ""), _scannet),
+    "mmdet3d": {"ScanNet": _mmdet3d, "S3DIS": _mmdet3d_s3dis},
+    "spformer": {"ScanNet": _spformer},
+    "isbnet": {"ScanNet": _isbnet, "S3DIS": _isbnet_s3dis},
+    "mask3d": {"ScanNet": _mask3d, "S3DIS": _mask3d_s3dis},
+    "npy": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _npy),
 }
-"""What returns the files of a scan, by the name of the layout."""
+"""What returns the files of a scan, by the name of the layout and the data set; that without a name
+has labels whose classes nobody knows. Clouds without labels are written as those of ScanNet."""
+CLASS_ORDERS = {"mmdet3d": "pointcept", "isbnet": "spt", "mask3d": "pointcept"}
+"""Order of the classes of S3DIS in a layout, a key of :data:`torchrg.datasets.CLASS_ORDERS`, by the
+names that the data sets of the programs give to the numbers."""
 
 
 def _pickled(content: Any) -> bytes:  # noqa: ANN401

@@ -147,7 +147,10 @@ def write_files(
     others = [name for name in _written(place) if "/" in name and name not in contents]
     for name, path in paths.items():
         if name not in owned and os.path.lexists(path):
-            raise FormatError(f"{path}: was not written by torchrg; move it away to have another.")
+            raise FormatError(
+                f"{path}: was not written by torchrg for this scan; move it away, or choose "
+                "another directory."
+            )
     for folder in {place, *(path.parent for path in paths.values())}:
         make_folder(folder)
     for name in owned - set(contents):

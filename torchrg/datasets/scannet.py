@@ -162,6 +162,24 @@ def read_scannet_scan(mesh: Path, root: Path) -> dict[str, NDArray[Any]]:
     return arrays | _labels(files, root, len(cloud))
 
 
+def read_objects(mesh: Path, count: int) -> list[tuple[dict[str, Any], NDArray[np.integer]]] | None:
+    """Read the objects of a scan of ScanNet, as its annotation lists them.
+
+    Args:
+        mesh: The mesh of the scan.
+        count: Its number of vertices.
+
+    Returns:
+        ``id``, ``objectId`` and ``label`` of each object, and its vertices; None of a scan without
+        annotation. A vertex may be of several objects.
+
+    Raises:
+        FormatError: If a file is damaged, or is of another number of vertices.
+    """
+    files = _files_of(mesh)
+    return list(_groups(files, count)) if {"segments", "groups"} <= files.keys() else None
+
+
 def _meshes(root: Path) -> Iterator[Path]:
     """Yield the mesh of each scan in natural order."""
     for folder in (root, *listed(root)):

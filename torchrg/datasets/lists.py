@@ -1,0 +1,140 @@
+"""The files of a whole data set in which some programs look up its scans.
+
+Each scan leaves an entry of its own among its files, and a list is its entries in natural order. So
+it holds whatever scans are there, whichever commands wrote them, and equal scans give equal lists.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrg.datasets.folder import natural_key
+from torchrg.datasets.layouts import MODES
+from torchrg.datasets.rooms import CLASS_ORDERS
+from torchrg.datasets.s3dis import ROOMS_PER_AREA
+from torchrg.datasets.scannet import CLASSES, NYU_IDS
+from torchrg.errors import FormatError
+from torchrg.io import atomic_path
+from torchrg.io.files import refusing
+
+Entries = Mapping[str, Sequence[dict[str, Any]]]
+"""Entries of the scans of a list, by the folder that they are in."""
+
+
+def check_lists(layout: str, dataset: str, out: Path) -> None:
+    """Raise FormatError if lists from elsewhere are where :func:`write_lists` would write.
+
+    Args:
+        layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
+        dataset: A key of its row.
+        out: The output directory; it need not exist.
+    """
+    folders, contents = _LISTS.get((layout, dataset), _NONE)
+    if any((out / folder).is_dir() for folder in folders):
+        return
+    for name in contents(dict.fromkeys(folders, ())):
+        if (out / name).exists():
+            raise FormatError(
+                f"{out / name}: is of another data set or program; move it away, or choose another "
+                "directory."
+            )
+
+
+def write_lists(layout: str, dataset: str, out: Path) -> None:
+    """Write the lists of a directory from the entries of the scans that are there, if any is.
+
+    Args:
+        layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
+        dataset: A key of its row.
+        out: The output directory.
+
+    Raises:
+        FormatError: If an entry is damaged, or a list cannot be written.
+    """
+    folders, contents = _LISTS.get((layout, dataset), _NONE)
+    entries = {folder: _read_entries(out, folder) for folder in folders}
+    if any(entries.values()):
+        for name, content in contents(entries).items():
+            with atomic_path(out / name) as beside:
+                beside.write_text(_text(content), encoding="utf-8")
+
+
+def _read_entries(out: Path, folder: str) -> list[dict[str, Any]]:
+    """Return the entries of a list, with files by their whole paths."""
+    paths = sorted((out / folder).glob("[!.]*.json"), key=lambda path: natural_key(path.stem))
+    entries = []
+    for path in paths:
+        message = f"{path}: expected an entry of a list, got: "
+        with refusing(message, ValueError, repair="; move it away, and convert the scan again"):
+            entry = json.loads(path.read_text(encoding="utf-8"))
+        files = {key: str(out / entry[key]) for key in _FILES & entry.keys()}
+        entries.append(entry | files)
+    return entries
+
+
+_FILES = {"filepath", "instance_gt_filepath"}
+"""Parts of an entry that are files."""
+
+
+def _text(content: Any) -> str:  # noqa: ANN401
+    """Return lines as they are, and anything else as YAML."""
+    if isinstance(content, str):
+        return content
+    import yaml
+
+    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+
+def _mmdet3d(entries: Entries) -> dict[str, Any]:
+    """The names of the scans of each split, one a line."""
+    return {
+        f"{folder}.txt": "".join(f"{entry['name']}\n" for entry in found)
+        for folder, found in entries.items()
+    }
+
+
+def _mask3d(entries: Entries) -> dict[str, Any]:
+    """Databases of the splits of ScanNet, its classes, and the colours that are subtracted."""
+    train, validation, test = (entries[f"{mode}_database"] for mode in MODES.values())
+    labels = zip(NYU_IDS, CLASSES, strict=True)
+    return {
+        **{f"{folder}.yaml": [*found] for folder, found in entries.items()},
+        "train_validation_database.yaml": [*train, *validation],
+        "color_mean_std.yaml": _color_mean_std(train or [*validation, *test]),
+        "label_database.yaml": {n: {"name": name, "validation": True} for n, name in labels},
+    }
+
+
+def _mask3d_s3dis(entries: Entries) -> dict[str, Any]:
+    """Databases of the areas of S3DIS and, for each, of all others, which are trained on."""
+    contents: dict[str, Any] = {f"{folder}.yaml": [*found] for folder, found in entries.items()}
+    for folder, own in entries.items():
+        others = [entry for name, found in entries.items() if name != folder for entry in found]
+        contents[f"train_{folder}.yaml"] = others
+        area = folder.removesuffix("_database")
+        contents[f"{area}_color_mean_std.yaml"] = _color_mean_std(others or own)
+    classes = enumerate(CLASS_ORDERS["pointcept"])
+    contents["label_database.yaml"] = {n: {"name": name, "validation": True} for n, name in classes}
+    return contents
+
+
+def _color_mean_std(entries: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """Return mean and deviation of the colours of scans; entries have the mean of squares."""
+    if not entries:
+        return {"mean": [0.0] * 3, "std": [1.0] * 3}
+    mean, squares = (
+        np.mean([entry[key] for entry in entries], axis=0) for key in ("color_mean", "color_std")
+    )
+    return {"mean": mean.tolist(), "std": np.sqrt(squares - mean**2).tolist()}
+
+
+_NONE: tuple[Sequence[str], Callable[[Entries], dict[str, Any]]] = ((), lambda entries: {})
+_LISTS = {
+    ("mmdet3d", "ScanNet"): ([f"meta_data/scannetv2_{split}" for split in MODES], _mmdet3d),
+    ("mask3d", "ScanNet"): ([f"{mode}_database" for mode in MODES.values()], _mask3d),
+    ("mask3d", "S3DIS"): ([f"Area_{area}_database" for area in ROOMS_PER_AREA], _mask3d_s3dis),
+}
+"""Folders of entries, and what makes lists of them, by the layout and the data set."""
