@@ -1,11 +1,14 @@
 """Every scan has a place of its own for its results, or the command ends before it begins."""
 
 import unicodedata
+from functools import partial
 
 import numpy as np
 import pytest
 
+from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource
 from torchrg.cli import main
 from torchrg.config import load_config
@@ -73,6 +76,80 @@ def test_names_that_lead_to_one_place_are_refused(root, tmp_path, capsys, names,
     assert message in captured.err
     assert (captured.err.count("\n"), captured.out) == (1, "")
     assert not (tmp_path / "out").exists()
+
+
+FLAT = ("mmdet3d", "spformer", "isbnet", "mask3d", "npy")
+"""Layouts in which files of all scans are in the same folders."""
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("a/b_c", "a_b/c"), ("train/x", "val/x"), ("a/B_c", "A_b/c"), ("bü/ro", "bu\u0308_ro")],
+)
+def test_files_of_two_scans_in_one_folder_are_refused(root, tmp_path, names):
+    save(root, *(f"{name}.npy" for name in names))
+    for layout in FLAT:
+        with pytest.raises(FormatError, match="expected files of its own for each scan") as error:
+            list_jobs(FolderSource(root, CLASSIC, tmp_path, layout=layout), tmp_path / "out")
+        assert all(name in str(error.value) for name in (*names, layout))
+    for layout in ("pointcept", "scannet"):
+        source = FolderSource(root, CLASSIC, tmp_path, layout=layout)
+        assert len(list_jobs(source, tmp_path / "out")) == 2
+
+
+def test_the_command_refuses_them_before_any_work(root, tmp_path, capsys):
+    save(root, "a/b_c.npy", "a_b/c.npy", "other.npy")
+    for flags in (["--dry-run"], ["--only", "other"], []):
+        assert convert(root, tmp_path / "out", "--layout", "npy", *flags) == 2
+        captured = capsys.readouterr()
+        assert "got a_b_c for a/b_c and a_b/c in layout npy; rename one" in captured.err
+        assert (captured.err.count("\n"), captured.out) == (1, "")
+        assert not (tmp_path / "out").exists()
+
+
+def test_short_names_of_mask3d_are_compared_too(root, tmp_path, capsys):
+    save(root, "scene0011_00.npy", "0011_00.npy")
+    out = tmp_path / "out"
+    assert convert(root, out, "--layout", "mask3d") == 2
+    assert "got 0011_00 for 0011_00 and scene0011_00 in layout mask3d" in capsys.readouterr().err
+    assert convert(root, out, "--layout", "npy", "--dry-run") == 0
+    capsys.readouterr()
+    scans = [str(path) for path in root.iterdir()]
+    assert main(["segment", *scans, "--out", str(out), "--layout", "mask3d"]) == 2
+    captured = capsys.readouterr()
+    assert "expected files of its own for each scan, got 0011_00 for " in captured.err
+    assert (captured.err.count("\n"), captured.out) == (1, "")
+    assert not [*out.iterdir()]
+
+
+def test_a_second_command_does_not_write_into_the_files_of_a_layout(
+    root, tmp_path, capsys, monkeypatch
+):
+    save(root, "hall.npy")
+    monkeypatch.setattr("torchrg.cli.segment.DirectoryLock", partial(DirectoryLock, patience=0))
+    command = ["segment", str(root / "hall.npy"), "--out", str(tmp_path), "--preset", "classic"]
+    with DirectoryLock(tmp_path):
+        assert main([*command, "--layout", "npy"]) == 2
+        assert "another torchrg command" in capsys.readouterr().err
+        assert not (tmp_path / "superpoints").exists()
+        # A folder for each scan is no place of others.
+        assert main([*command, "--layout", "pointcept"]) == 0
+    assert main([*command, "--layout", "npy"]) == 0
+
+
+def test_a_scan_of_another_command_with_the_same_files_is_refused(root, tmp_path):
+    save(root, "a/b_c.npy")
+    save(tmp_path / "second", "a_b/c.npy")
+    reports, before = [], None
+    for folder in (root, tmp_path / "second"):
+        source = FolderSource(folder, CLASSIC, tmp_path / "out", layout="npy")
+        (job,) = list_jobs(source, tmp_path / "out")
+        before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.npy")}
+        reports.append(convert_scan(job))
+    assert [report.status for report in reports] == ["converted", "failed"]
+    assert "a_b_c.npy: was not written by torchrg for this scan" in reports[1].reason
+    assert len(before) == 2
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.npy")} == before
 
 
 @pytest.mark.parametrize("name", ["../x", "/x", "a/../../x"])

@@ -112,12 +112,18 @@ def test_scannet(converted, room):
     folder = converted["scannet"] / "scans" / SCAN
     (path,) = folder.glob("*[0-9].segs.json")
     assert path.name == f"{SCAN}_vh_clean_2.0.010000.segs.json"
-    with path.open() as stream:
-        content = json.load(stream)
+    content = json.loads(path.read_text())
     assert set(content) == {"params", "sceneId", "segIndices"}
-    assert np.array_equal(np.array(content["segIndices"]), room.superpoint)
+    segments = np.array(content["segIndices"])
+    pairs = np.unique(np.stack([segments, room.superpoint, room.instance]), axis=1)
+    assert len(np.unique(segments)) == pairs.shape[1] > NUM_PARTS
     planes = json.loads((folder / f"{SCAN}_vh_clean_2.planes.segs.json").read_text())
     assert planes["segIndices"] == room.plane.tolist()
+    bare = converted["scannet"] / "scans_test" / "scene0799_00"
+    assert sorted(path.name for path in bare.iterdir()) == [
+        "scene0799_00_vh_clean_2.0.010000.segs.json",
+        "scene0799_00_vh_clean_2.planes.segs.json",
+    ]
 
 
 def test_mmdet3d(converted, room):

@@ -2,10 +2,11 @@
 
 Each scan leaves an entry of its own among its files, and a list is its entries in natural order. So
 it holds whatever scans are there, whichever commands wrote them, and equal scans give equal lists.
+Lists of names that a program brings itself stay, and get only what they lack.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
         dataset: A key of its row.
         out: The output directory; it need not exist.
     """
-    folders, contents = _LISTS.get((layout, dataset), _NONE)
+    folders, contents = _DATABASES.get((layout, dataset), _NONE)
     if any((out / folder).is_dir() for folder in folders):
         return
     for name in contents(dict.fromkeys(folders, ())):
@@ -54,12 +55,37 @@ def write_lists(layout: str, dataset: str, out: Path) -> None:
     Raises:
         FormatError: If an entry is damaged, or a list cannot be written.
     """
-    folders, contents = _LISTS.get((layout, dataset), _NONE)
+    out = out.resolve()
+    if (layout, dataset) == ("mmdet3d", "ScanNet"):
+        _write_names(out, [f"meta_data/scannetv2_{split}" for split in MODES])
+    folders, contents = _DATABASES.get((layout, dataset), _NONE)
     entries = {folder: _read_entries(out, folder) for folder in folders}
     if any(entries.values()):
+        import yaml
+
         for name, content in contents(entries).items():
-            with atomic_path(out / name) as beside:
-                beside.write_text(_text(content), encoding="utf-8")
+            _write(out / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+
+def _write_names(out: Path, folders: Iterable[str]) -> None:
+    """Write lists of names for MMDetection3D, which asks for all of them, also for empty ones."""
+    names = {folder: [e["name"] for e in _read_entries(out, folder)] for folder in folders}
+    for folder, own in names.items() if any(names.values()) else ():
+        path = out / f"{folder}.txt"
+        with refusing(f"{path}: expected a name a line, got: ", ValueError):
+            text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        listed = [line.strip() for line in text.splitlines() if line.strip()]
+        others = set(listed) - set(own)
+        missing = [name for name in own if name not in listed]
+        if missing or not others:
+            # A list of the program itself keeps its order; one of ours has that of the entries.
+            _write(path, "".join(f"{name}\n" for name in ([*listed, *missing] if others else own)))
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a list, whole or not at all."""
+    with atomic_path(path) as beside:
+        beside.write_text(text, encoding="utf-8")
 
 
 def _read_entries(out: Path, folder: str) -> list[dict[str, Any]]:
@@ -77,23 +103,6 @@ def _read_entries(out: Path, folder: str) -> list[dict[str, Any]]:
 
 _FILES = {"filepath", "instance_gt_filepath"}
 """Parts of an entry that are files."""
-
-
-def _text(content: Any) -> str:  # noqa: ANN401
-    """Return lines as they are, and anything else as YAML."""
-    if isinstance(content, str):
-        return content
-    import yaml
-
-    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
-
-
-def _mmdet3d(entries: Entries) -> dict[str, Any]:
-    """The names of the scans of each split, one a line."""
-    return {
-        f"{folder}.txt": "".join(f"{entry['name']}\n" for entry in found)
-        for folder, found in entries.items()
-    }
 
 
 def _mask3d(entries: Entries) -> dict[str, Any]:
@@ -128,13 +137,14 @@ def _color_mean_std(entries: Sequence[Mapping[str, Any]]) -> dict[str, list[floa
     mean, squares = (
         np.mean([entry[key] for entry in entries], axis=0) for key in ("color_mean", "color_std")
     )
-    return {"mean": mean.tolist(), "std": np.sqrt(squares - mean**2).tolist()}
+    deviation = np.sqrt(np.maximum(squares - mean**2, 0))
+    # What is of one colour everywhere is not divided by the deviation of it.
+    return {"mean": mean.tolist(), "std": np.where(deviation > 0, deviation, 1.0).tolist()}
 
 
 _NONE: tuple[Sequence[str], Callable[[Entries], dict[str, Any]]] = ((), lambda entries: {})
-_LISTS = {
-    ("mmdet3d", "ScanNet"): ([f"meta_data/scannetv2_{split}" for split in MODES], _mmdet3d),
+_DATABASES = {
     ("mask3d", "ScanNet"): ([f"{mode}_database" for mode in MODES.values()], _mask3d),
     ("mask3d", "S3DIS"): ([f"Area_{area}_database" for area in ROOMS_PER_AREA], _mask3d_s3dis),
 }
-"""Folders of entries, and what makes lists of them, by the layout and the data set."""
+"""Folders of entries, and what makes databases of them, by the layout and the data set."""
