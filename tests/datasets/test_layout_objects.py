@@ -8,10 +8,15 @@ import json
 import numpy as np
 import pytest
 
-from tests.datasets.scannet_tree import WORDS, write_scan, write_tables
+from tests.datasets.scannet_tree import WORDS, write_scan, write_scan_plus, write_tables
+from torchrg import load_config
+from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
+from torchrg.batch.sources import FolderSource, ScanNetSource
 from torchrg.datasets.layouts import LAYOUTS, LayoutScan
 from torchrg.datasets.scannet import read_objects, read_scannet_scan
-from torchrg.errors import FormatError
+from torchrg.errors import ConfigError, FormatError
+from torchrg.scenes import make_room
 
 SCAN = "scene0270_00"
 NUM_POINTS = 400
@@ -205,3 +210,45 @@ def test_numbers_that_mask3d_would_read_as_others_are_refused(
 ):
     with pytest.raises(FormatError, match=f"^{SCAN}: expected {words}"):
         LAYOUTS["mask3d"]["ScanNet"](as_one_object(release, root, number, category))
+
+
+def test_superpoints_of_scannet_plusplus_are_where_sai3d_reads_them(tmp_path):
+    """``init_seg``: ``scans/<scan>/scans/mesh_aligned_0.05.0.010000.segs.json``, by vertex.
+
+    Its objects are in other files, so that superpoints do not end at them.
+    """
+    made = make_room(num_points=700, seed=2)
+    coord, faces = made.points.float().numpy(), made.labels.numpy()
+    color = np.zeros(coord.shape, np.uint8)
+    objects = [("wall", [0, 1]), ("table", [1, 2])]
+    write_scan_plus(tmp_path / "in", "0a5c013435", coord, color, faces, objects)
+    settings, out = load_config("classic"), tmp_path / "out"
+    for layout in ("scannet", "npy"):
+        source = ScanNetSource(tmp_path / "in", settings, layout=layout)
+        (job,) = list_jobs(source, out)
+        assert convert_scan(job).status == "converted"
+    path = out / "scans/0a5c013435/scans/mesh_aligned_0.05.0.010000.segs.json"
+    segments = json.loads(path.read_text())["segIndices"]
+    assert segments == np.load(out / "superpoints" / "0a5c013435.npy").tolist()
+    assert not [*out.rglob("*aggregation*")]
+    for layout in ("mmdet3d", "spformer", "isbnet", "mask3d"):
+        source = ScanNetSource(tmp_path / "in", settings, layout=layout)
+        with pytest.raises(ConfigError, match=r"pointcept, scannet, npy for ScanNet\+\+, got"):
+            list_jobs(source, tmp_path / "other")
+
+
+def test_pointcepts_folders_of_unknown_classes_have_no_layout_with_classes(tmp_path):
+    folder = tmp_path / "in" / "Area_1" / "office_1"
+    folder.mkdir(parents=True)
+    np.save(folder / "coord.npy", np.zeros((5, 3), np.float32))
+    np.save(folder / "segment.npy", np.zeros((5, 1), np.int16))
+    for layout in LAYOUTS:
+        source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path, layout=layout)
+        if layout in ("scannet", "npy"):
+            assert len(list_jobs(source, tmp_path / "out")) == 1
+            continue
+        with pytest.raises(ConfigError, match="scannet, npy for Area_1/office_1, got"):
+            list_jobs(source, tmp_path / "out")
+    np.save(folder / "segment20.npy", np.zeros(5, np.int64))
+    source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path, layout="mask3d")
+    assert len(list_jobs(source, tmp_path / "out")) == 1
