@@ -98,13 +98,12 @@ class CloudArguments(Arguments):
     level: int = 0
     """Level of the superpoints that is written; 0 is the finest."""
     layout: console.Layout = "pointcept"
-    """Files that are written: a folder for each scan (pointcept), or superpoints and planes where
-    other programs look for them, with classes and objects: OneFormer3D, UniDet3D and ESAM
-    (mmdet3d), SPFormer (spformer), ISBNet, Open3DIS and SphericalMask (isbnet), Mask3D (mask3d);
-    bare arrays (npy); segs.json and, of annotated scans, aggregation.json in the place of the
-    release's, for SAI3D and for preprocessing (scannet), where superpoints end at objects, which is
-    more than a network may know of scans that it is scored on. Of S3DIS there are pointcept,
-    mmdet3d, isbnet, mask3d and npy, of ScanNet++ pointcept, scannet and npy."""
+    """Files that are written: a folder for each scan (pointcept), bare arrays (npy), or superpoints
+    with points, classes and objects where other programs look for them. These are OneFormer3D,
+    UniDet3D and ESAM (mmdet3d), SPFormer (spformer), ISBNet, Open3DIS and SphericalMask (isbnet),
+    Mask3D (mask3d), and SAI3D and the preprocessing of others (scannet). The last writes segs.json
+    and, of annotated scans, aggregation.json, to replace those of ScanNet; superpoints end at
+    objects there. S3DIS has neither scannet nor spformer, ScanNet++ no other with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
     usual_preset: ClassVar[str] = DEFAULT_PRESET
