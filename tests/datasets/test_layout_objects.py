@@ -4,6 +4,7 @@ The reading is that of the programs in our own words; each function names whose 
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -136,6 +137,15 @@ def test_the_pair_of_segments_and_groups_has_the_objects_of_the_release(release,
     )
     keys = ("id", "objectId", "label")
     assert [[g[k] for k in keys] for g in groups] == [[g[k] for k in keys] for g in release_groups]
+
+
+def test_segments_beside_the_groups_of_the_release_have_no_objects(release, root, tmp_path):
+    write(tmp_path, LAYOUTS["scannet"]["ScanNet"](release.scan(root)))
+    folder = tmp_path / "scans" / SCAN
+    shutil.copy(release.folder / f"{SCAN}.aggregation.json", folder)
+    assert (read_as_mask3d(folder) == -1).all()
+    with pytest.raises(KeyError):
+        read_as_votenet(folder)
 
 
 def test_segments_of_the_pair_are_superpoints_cut_at_objects_and_nowhere_else(release, root):

@@ -17,6 +17,7 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import S3DISSource
 from torchrg.cli import main
+from torchrg.io.files import make_mark
 
 CLASSIC = load_config("classic")
 NAMES = (
@@ -73,7 +74,7 @@ def converted(root, rooms, tmp_path_factory):
             warnings.simplefilter("ignore")
             reports = [convert_scan(job) for job in list_jobs(source, out)]
         assert [report.status for report in reports] == ["converted"] * 2, reports
-        source.write_lists(out)
+        source.write_lists(out, make_mark())
     return folders
 
 

@@ -102,9 +102,9 @@ class CloudSource:
         """Raise FormatError if :meth:`write_lists` would replace files from elsewhere."""
         check_lists(self.layout, self.dataset, out)
 
-    def write_lists(self, out: Path) -> None:
+    def write_lists(self, out: Path, mark: str) -> None:
         """Write what the layout has for the data set as a whole, from all scans in ``out``."""
-        write_lists(self.layout, self.dataset, out)
+        write_lists(self.layout, self.dataset, out, mark)
 
     def part(
         self,

@@ -336,7 +336,7 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
     )
     code = _finish(report, out, unit=arguments.unit)
     if isinstance(source := plan.jobs[0].source, CloudSource) and not report.disk_full:
-        source.write_lists(out)
+        source.write_lists(out, lock.mark)
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)

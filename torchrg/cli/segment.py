@@ -168,10 +168,10 @@ def _sharing(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
         return
     source = CloudSource(layout=arguments.layout)
     source.checked([Scan(path.name, (), 0) for path in outputs])
-    with DirectoryLock(arguments.out):
+    with DirectoryLock(arguments.out) as lock:
         source.check_lists(arguments.out)
         yield
-        source.write_lists(arguments.out)
+        source.write_lists(arguments.out, lock.mark)
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:

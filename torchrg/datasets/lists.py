@@ -19,7 +19,7 @@ from torchrg.datasets.s3dis import ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import refusing
+from torchrg.io.files import make_folder, marked_parts, refusing, remove_leftovers
 
 Entries = Mapping[str, Sequence[dict[str, Any]]]
 """Entries of the scans of a list, by the folder that they are in."""
@@ -44,18 +44,26 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
             )
 
 
-def write_lists(layout: str, dataset: str, out: Path) -> None:
+def write_lists(layout: str, dataset: str, out: Path, mark: str) -> None:
     """Write the lists of a directory from the entries of the scans that are there, if any is.
 
     Args:
         layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
         dataset: A key of its row.
         out: The output directory.
+        mark: See :func:`torchrg.io.files.marked_parts`; what a killed process left is removed.
 
     Raises:
         FormatError: If an entry is damaged, or a list cannot be written.
     """
     out = out.resolve()
+    remove_leftovers(out, mark)
+    with marked_parts(mark):
+        _write_all(layout, dataset, out)
+
+
+def _write_all(layout: str, dataset: str, out: Path) -> None:
+    """Write the lists of a directory."""
     if (layout, dataset) == ("mmdet3d", "ScanNet"):
         _write_names(out, [f"meta_data/scannetv2_{split}" for split in MODES])
     folders, contents = _DATABASES.get((layout, dataset), _NONE)
@@ -64,13 +72,14 @@ def write_lists(layout: str, dataset: str, out: Path) -> None:
         import yaml
 
         for name, content in contents(entries).items():
-            _write(out / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+            text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+            _write(out, name, text)
 
 
 def _write_names(out: Path, folders: Iterable[str]) -> None:
     """Write lists of names for MMDetection3D, which asks for all of them, also for empty ones."""
-    names = {folder: [e["name"] for e in _read_entries(out, folder)] for folder in folders}
-    for folder, own in names.items() if any(names.values()) else ():
+    found = {folder: [e["name"] for e in _read_entries(out, folder)] for folder in folders}
+    for folder, own in found.items() if any(found.values()) else ():
         path = out / f"{folder}.txt"
         with refusing(f"{path}: expected a name a line, got: ", ValueError):
             text = path.read_text(encoding="utf-8") if path.is_file() else ""
@@ -79,12 +88,14 @@ def _write_names(out: Path, folders: Iterable[str]) -> None:
         missing = [name for name in own if name not in listed]
         if missing or not others:
             # A list of the program itself keeps its order; one of ours has that of the entries.
-            _write(path, "".join(f"{name}\n" for name in ([*listed, *missing] if others else own)))
+            names = [*listed, *missing] if others else own
+            _write(out, path.relative_to(out), "".join(f"{name}\n" for name in names))
 
 
-def _write(path: Path, text: str) -> None:
+def _write(out: Path, name: str | Path, text: str) -> None:
     """Write a list, whole or not at all."""
-    with atomic_path(path) as beside:
+    make_folder((out / name).parent)
+    with atomic_path(out / name, within=out) as beside:
         beside.write_text(text, encoding="utf-8")
 
 
