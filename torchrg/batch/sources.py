@@ -258,10 +258,9 @@ class FolderSource(CloudSource):
 
 
 def _dataset(names: Collection[str]) -> str:
-    """Return the data set that a folder in Pointcept's layout is of, by what it holds.
+    """Return the data set whose classes a folder in Pointcept's layout has, by what it holds.
 
-    It is ScanNet, as far as layouts know, or nothing where it has classes of which nobody knows
-    what they are.
+    Without ``segment`` or with ``segment20`` it is ScanNet, and else nobody knows.
     """
     return "" if "segment" in names and "segment20" not in names else "ScanNet"
 

@@ -206,7 +206,7 @@ def _cut(
 
     Example:
         >>> _cut(np.array([0, 0, 0, 1, 1]), [np.array([0, 1]), np.array([1, 3])]).tolist()
-        [2, 3, 0, 4, 1]
+        [2, 4, 0, 3, 1]
     """
     parts = superpoint.astype(np.int64)
     for rows in objects:
