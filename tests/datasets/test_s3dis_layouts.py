@@ -24,12 +24,7 @@ NAMES = (
     "ceiling", "floor", "wall", "beam", "column", "window", "door",
     "table", "chair", "sofa", "bookcase", "board", "clutter",
 )  # fmt: skip
-"""``class_names.txt`` of MMDetection3D, ``class_map`` of Mask3D."""
-ISBNET_NAMES = (
-    "ceiling", "floor", "wall", "beam", "column", "window", "door",
-    "chair", "table", "bookcase", "sofa", "board", "clutter",
-)  # fmt: skip
-"""``S3DISDataset.CLASSES`` and ``S3DISEval.CLASSES`` of ISBNet."""
+"""``class_names.txt`` of MMDetection3D, ``class_map`` of Mask3D, ``ID2NAME`` of ISBNet."""
 OFFICE = {
     "bookcase_1": 90, "ceiling_1": 70, "chair_1": 60, "chair_2": 50, "floor_1": 80, "sofa_1": 40,
     "stairs_1": 30, "table_1": 60,
@@ -79,7 +74,7 @@ def converted(root, rooms, tmp_path_factory):
 
 
 def test_isbnet(converted, rooms):
-    """``S3DISDataset.get_filenames`` by the area, ``load``, ``getCroppedInstLabel``."""
+    """``S3DISDataset.get_filenames`` by the area, ``load``; classes by ``prepare_s3dis.py``."""
     for name, room in rooms.items():
         (path,) = converted["isbnet"].glob(f"preprocess/{name[:6]}*_inst_nostuff.pth")
         scan = path.name.replace("_inst_nostuff.pth", "")
@@ -88,11 +83,11 @@ def test_isbnet(converted, rooms):
         superpoint = torch.load(
             converted["isbnet"] / "superpoints" / f"{scan}.pth", weights_only=False
         )
-        assert np.array_equal(np.array(ISBNET_NAMES)[segment], room.names)
+        assert np.array_equal(np.array(NAMES)[segment], room.names)
         assert np.array_equal(instance, room.objects)
         assert coord.dtype == color.dtype == np.float32
         assert np.allclose(coord, room.coord, atol=1e-5)
-        assert np.allclose((color + 1) * 127.5, room.color, atol=1e-3)
+        assert np.array_equal(color, room.color)
         assert superpoint.shape == segment.shape
 
 

@@ -276,7 +276,7 @@ class S3DISSource(CloudSource):
         settings: How to segment.
         areas: Numbers of the areas.
         class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
-            Other layouts have an order of their own.
+            Other layouts than Pointcept's have its order.
     """
 
     root: Path
@@ -296,7 +296,7 @@ class S3DISSource(CloudSource):
         if self.layout != "pointcept" and self.class_order != "pointcept":
             raise ConfigError(
                 f"expected --class-order with --layout pointcept, got layout {self.layout}, which "
-                "has the order of its own program; leave it out."
+                "has the order pointcept; leave it out."
             )
         require("pyarrow", extra="s3dis", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
@@ -307,8 +307,7 @@ class S3DISSource(CloudSource):
     def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
         """Read, segment and write one room."""
         begin("read")
-        order = layouts.CLASS_ORDERS.get(self.layout, self.class_order)
-        room = read_room(self.root / scan.name, class_order=order)
+        room = read_room(self.root / scan.name, class_order=self.class_order)
         cloud = Cloud(room.coord, source=scan.name)
         notes = [
             *check_finite(cloud),

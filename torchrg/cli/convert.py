@@ -166,7 +166,7 @@ class S3DISArguments(CloudArguments):
     areas: tuple[int, ...] = ()
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
-    """What the numbers in segment.npy mean. Other layouts have the order of their programs."""
+    """What the numbers in segment.npy mean. Other layouts have the order pointcept."""
     usual_preset: ClassVar[str] = "s3dis"
 
     def source(self, root: Path, out: Path) -> Source:

@@ -319,8 +319,8 @@ def _isbnet(scan: LayoutScan) -> Files:
 
 
 def _isbnet_s3dis(scan: LayoutScan) -> Files:
-    """ISBNet's S3DIS: coordinates as they are, and objects of all classes."""
-    content = (scan.coord, _scaled_color(scan), *_labels(scan))
+    """ISBNet's S3DIS: coordinates and colours as they are, and objects of all classes."""
+    content = (scan.coord, scan.color.astype(np.float32), *_labels(scan))
     return {
         f"preprocess/{scan.name}_inst_nostuff.pth": _pickled(content),
         f"superpoints/{scan.name}.pth": _pickled(scan.superpoint.astype(np.int64)),
@@ -331,7 +331,8 @@ def _isbnet_s3dis(scan: LayoutScan) -> Files:
 def _centered(scan: LayoutScan) -> tuple[NDArray[Any], ...]:
     """Return coordinates about their mean, colours in [-1, 1], and classes and objects if known."""
     mean = scan.coord.mean(axis=0, dtype=np.float64)
-    coord, color = (scan.coord - mean).astype(np.float32), _scaled_color(scan)
+    coord = (scan.coord - mean).astype(np.float32)
+    color = (scan.color / _CENTERED - 1).astype(np.float32)
     if scan.truth is None:
         return coord, color
     segment, instance = scan.truth
@@ -339,11 +340,6 @@ def _centered(scan: LayoutScan) -> tuple[NDArray[Any], ...]:
     objects = np.full(len(segment), _IGNORED, dtype=np.float64)
     objects[is_object] = np.unique(instance[is_object], return_inverse=True)[1].reshape(-1)
     return coord, color, np.where(segment < 0, _IGNORED, segment).astype(np.float64), objects
-
-
-def _scaled_color(scan: LayoutScan) -> NDArray[np.float32]:
-    """Return colours in [-1, 1]."""
-    return (scan.color / _CENTERED - 1).astype(np.float32)
 
 
 def _mask3d(scan: LayoutScan) -> Files:
@@ -432,9 +428,6 @@ LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
 }
 """What returns the files of a scan, by the name of the layout and the data set; that without a name
 has labels whose classes nobody knows. Clouds without labels are written as those of ScanNet."""
-CLASS_ORDERS = {"mmdet3d": "pointcept", "isbnet": "spt", "mask3d": "pointcept"}
-"""Order of the classes of S3DIS in a layout, a key of :data:`torchrg.datasets.CLASS_ORDERS`, by the
-names that the data sets of the programs give to the numbers."""
 
 
 def _pickled(content: Any) -> bytes:  # noqa: ANN401
