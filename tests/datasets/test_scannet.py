@@ -109,7 +109,7 @@ def test_what_is_wrong_names_the_file(tree, scans, tmp_path):
     with pytest.raises(FormatError, match=r"segs.json: expected a segment of each of 8 vertices"):
         _ = ScanNet(tree, "train")[1]
     path.write_text("{")
-    with pytest.raises(FormatError, match=r"segs.json: expected JSON with segIndices"):
+    with pytest.raises(FormatError, match=r"segs.json: expected JSON with a list segIndices"):
         _ = ScanNet(tree, "train")[1]
     with pytest.raises(ConfigError, match="expected split to be one of train, val, test"):
         ScanNet(tree, "trainval")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.files import DAMAGES, check_file, refusing
+from torchrg.io.files import DAMAGES, check_file, read_text, refusing
 
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
@@ -176,12 +176,7 @@ def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
 
 def _words(path: Path) -> list[list[str]]:
     """Return the words of each row; ``#`` begins a comment."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path}: expected text, got other bytes.") from error
+    lines = read_text(path).splitlines()
     words = (line.split("#")[0].replace(",", " ").split() for line in lines)
     return [row for row in words if row]
 

@@ -7,8 +7,11 @@ is a set of vertices.
 import csv
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
+from io import StringIO
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
@@ -18,7 +21,7 @@ from numpy.typing import NDArray
 from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
-from torchrg.io.files import refusing
+from torchrg.io.files import DAMAGES, read_text, refusing
 
 MESH, MESH_PLUSPLUS = "_vh_clean_2.ply", "mesh_aligned_0.05.ply"
 """End of the name of a scan's mesh in ScanNet, and the whole name in ScanNet++."""
@@ -55,6 +58,8 @@ _PLACES = ("", "splits", "meta_data", "metadata/semantic_benchmark")
 """Folders below the root in which such files, and tables of classes, are looked for."""
 _MOST_LABELS = 3
 """Objects that a vertex of ScanNet++ may be of at once."""
+_LARGEST_CLASS = 65_535
+"""Largest number of a class: labels of the release have 16 bits."""
 _NONE = -1
 
 
@@ -84,8 +89,11 @@ class ScanNet(SceneDataset):
         classes: Names of the classes by number.
 
     Raises:
-        FormatError: If there is no such folder, or no scan in it.
+        FormatError: If there is no such folder, no scan in it, or a list or table is damaged.
         ConfigError: If the split is unknown.
+
+    Warns:
+        UserWarning: If a list names scans that are not there.
 
     References:
         [1] A. Dai et al. ScanNet: richly-annotated 3D reconstructions of indoor scenes. CVPR, 2017.
@@ -113,12 +121,15 @@ class ScanNet(SceneDataset):
                 "got none; pass the folder that holds scans or data."
             )
         lists = _lists(self.root)
+        _warn_of_others(lists, {scene.name for scene in scenes})
         named = [scene._replace(name=f"{_split(scene, lists)}/{scene.name}") for scene in scenes]
         self.scenes = [
             scene for scene in named if split is None or scene.name.startswith(f"{split}/")
         ]
         is_plus = any(scene.path.name == MESH_PLUSPLUS for scene in scenes)
         self.classes = tuple(_classes_plus(self.root)) if is_plus else CLASSES
+        # Every scan needs them: what is wrong with them is told before the first.
+        _read_mapping(self.root) if is_plus else _read_categories(self.root)
 
     def read_sample(self, index: int) -> dict[str, Any]:
         """Return the sample of a scan."""
@@ -219,46 +230,60 @@ def _find(root: Path, name: str) -> Path | None:
     return next((path for place in _PLACES if (path := root / place / name).is_file()), None)
 
 
-def _lists(root: Path) -> dict[str, str]:
-    """Return the split of each scan that is on a list."""
+def _lists(root: Path) -> dict[str, tuple[str, Path]]:
+    """Return the split of each scan that is on a list, and the list."""
     found = ((split, _find(root, name)) for split, names in _SPLITS.items() for name in names)
     return {
-        name: split
+        name: (split, path)
         for split, path in found
         if path is not None
-        for name in path.read_text(encoding="utf-8").split()
+        for name in read_text(path).split()
     }
 
 
-def _split(scene: SceneFiles, lists: Mapping[str, str]) -> str:
+def _warn_of_others(lists: Mapping[str, tuple[str, Path]], known: set[str]) -> None:
+    """Warn of names on the lists that are no scans, if there are any."""
+    others = [name for name in lists if name not in known]
+    if others:
+        first = others[0]
+        warnings.warn(
+            f"{lists[first][1]}: {len(others):,} of {len(lists):,} names on the lists are no scans "
+            f"that are there (first: {shortened(first)}); fetch these, or correct the names.",
+            stacklevel=3,
+        )
+
+
+def _split(scene: SceneFiles, lists: Mapping[str, tuple[str, Path]]) -> str:
     """Return the split of a scan."""
     if lists:
-        return lists.get(scene.name, "test")
+        return lists[scene.name][0] if scene.name in lists else "test"
     return "train" if "groups" in _files_of(scene.path) else "test"
 
 
 def _alignment(path: Path) -> dict[str, NDArray[Any]]:
     """Return the motion in the text of a scan, if there is one."""
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         name, _, numbers = line.partition("=")
         if name.strip() == "axisAlignment":
-            with refusing(f"{path}: expected 16 numbers as axisAlignment, got: ", ValueError):
+            message = f"{path}: expected 16 finite numbers as axisAlignment, got: "
+            with refusing(message, *DAMAGES, repair="; fetch it again"):
                 matrix = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
+                if not np.isfinite(matrix).all():
+                    raise ValueError(shortened(numbers.strip()))
             return {"axis_align_matrix": matrix}
     return {}
 
 
 def _labels(files: Mapping[str, Path], root: Path, count: int) -> dict[str, NDArray[Any]]:
     """Return the labels of a scan of ScanNet."""
-    table = _find(root, CATEGORIES)
-    words = {} if table is None else _read_categories(table)
+    words = _read_categories(root)
     found: dict[str, NDArray[Any]] = {}
     if "groups" in files and "segments" in files:
         instance = np.full(count, _NONE, dtype=np.int64)
         numbers = np.zeros((count, 2), dtype=np.int64)
-        for group, rows in _groups(files, count):
-            instance[rows] = group["id"]
-            numbers[rows] = words.get(group["label"], (0, 0))
+        for label, number, rows in _groups(files, count, "id", np.iinfo(np.int32).max):
+            instance[rows] = number
+            numbers[rows] = words.get(label, (0, 0))
         found["instance"] = instance
         if words:
             found |= {"category": numbers[:, 0], "segment200": _places(numbers[:, 1], IDS_200)}
@@ -269,7 +294,14 @@ def _labels(files: Mapping[str, Path], root: Path, count: int) -> dict[str, NDAr
                 f"{files['categories']}: expected a label of each of {count:,} vertices, got "
                 f"{'none' if given is None else f'{len(given):,}'}; fetch it again."
             )
-        found["category"] = given.astype(np.int64)
+        category = given.astype(np.int64)
+        wrong = np.flatnonzero((category < 0) | (category > _LARGEST_CLASS))
+        if len(wrong):
+            raise FormatError(
+                f"{files['categories']}: vertex {wrong[0]:,}: expected a label from 0 to "
+                f"{_LARGEST_CLASS:,}, got {category[wrong[0]]}; fetch it again."
+            )
+        found["category"] = category
     if "category" in found:
         found["segment20"] = _places(found["category"], NYU_IDS)
     return found
@@ -278,21 +310,20 @@ def _labels(files: Mapping[str, Path], root: Path, count: int) -> dict[str, NDAr
 def _labels_plus(mesh: Path, root: Path, count: int) -> dict[str, NDArray[Any]]:
     """Return the labels of a scan of ScanNet++, in which a vertex may be of several objects."""
     files, classes = _files_of(mesh), _classes_plus(root)
-    table = _find(root, "map_benchmark.csv")
-    if not {"segments", "groups"} <= files.keys() or not classes or table is None:
+    renamed = _read_mapping(root)
+    if not {"segments", "groups"} <= files.keys() or not classes or renamed is None:
         return {}
-    renamed = _read_mapping(table)
     segment = np.full((count, _MOST_LABELS), _NONE, dtype=np.int16)
     instance = segment.copy()
     sizes = np.full(segment.shape, np.inf)
     used = np.zeros(count, dtype=np.int64)
-    for group, rows in _groups(files, count):
-        label = classes.get(renamed.get(group["label"], ""))
-        rows = rows[used[rows] < _MOST_LABELS]
+    for word, number, inside in _groups(files, count, "objectId", np.iinfo(np.int16).max):
+        label = classes.get(renamed.get(word, ""))
+        rows = inside[used[inside] < _MOST_LABELS]
         if label is None or not len(rows):
             continue
         place = (rows, used[rows])
-        segment[place], instance[place], sizes[place] = label, group["objectId"], len(rows)
+        segment[place], instance[place], sizes[place] = label, number, len(rows)
         used[rows] += 1
     every, smallest = np.arange(count), sizes.argmin(axis=1)
     for labels in (segment, instance):
@@ -303,67 +334,132 @@ def _labels_plus(mesh: Path, root: Path, count: int) -> dict[str, NDArray[Any]]:
 
 
 def _groups(
-    files: Mapping[str, Path], count: int
-) -> Iterator[tuple[dict[str, Any], NDArray[np.integer]]]:
-    """Yield each object of an annotation with the rows of its vertices."""
-    segments = np.array(_read_json(files["segments"], "segIndices"), dtype=np.int64)
-    if segments.shape != (count,):
+    files: Mapping[str, Path], count: int, key: str, most: int
+) -> Iterator[tuple[str, int, NDArray[np.integer]]]:
+    """Yield label and number of each object of an annotation with the rows of its vertices.
+
+    The number is under a key, and at most so large.
+    """
+    path = files["segments"]
+    segments = _read_list(path, "segIndices")
+    if len(segments) != count:
         raise FormatError(
-            f"{files['segments']}: expected a segment of each of {count:,} vertices, got "
-            f"{len(segments):,}; fetch it again."
+            f"{path}: expected a segment of each of {count:,} vertices, got {len(segments):,}; "
+            "fetch it again."
         )
-    groups = _read_json(files["groups"], "segGroups")
-    message = f"{files['groups']}: expected objects with label and segments, got: "
-    for group in groups:
-        with refusing(message, LookupError, ValueError, TypeError, repair="; fetch it again"):
-            known = {"label": str(group["label"]), "id": int(group.get("id", _NONE))}
-            known["objectId"] = int(group.get("objectId", _NONE))
-            rows = np.flatnonzero(np.isin(segments, np.array(group["segments"], dtype=np.int64)))
-        yield known, rows
+    of_vertices = _whole(path, "segIndices", segments)
+    path = files["groups"]
+    for place, group in enumerate(_read_list(path, "segGroups")):
+        label, number, own = (
+            group.get(name) if isinstance(group, dict) else None
+            for name in ("label", key, "segments")
+        )
+        if not (
+            isinstance(label, str)
+            and type(number) is int
+            and 0 <= number <= most
+            and isinstance(own, list)
+        ):
+            raise FormatError(
+                f"{path}: object {place}: expected a label, a number from 0 to {most:,} as {key}, "
+                f"and a list of segments, got {shortened(group)}; fetch it again."
+            )
+        rows = np.flatnonzero(
+            np.isin(of_vertices, _whole(path, f"segments of object {place}", own))
+        )
+        yield label, number, rows
 
 
-def _read_json(path: Path, key: str) -> Any:  # noqa: ANN401
-    """Return the list that a file has under a key."""
-    message = f"{path}: expected JSON with {key}, got: "
-    with refusing(message, ValueError, LookupError, TypeError, repair="; fetch it again"):
-        return json.loads(path.read_text(encoding="utf-8"))[key]
+def _read_list(path: Path, key: str) -> list[Any]:
+    """Return the list that a file of JSON has under a key."""
+    message = f"{path}: expected JSON with a list {key}, got: "
+    with refusing(message, *DAMAGES, repair="; fetch it again"):
+        found = json.loads(read_text(path))
+        if not isinstance(found, dict) or not isinstance(found.get(key), list):
+            raise TypeError(shortened(found))
+        values: list[Any] = found[key]
+        return values
 
 
-def _read_categories(path: Path) -> dict[str, tuple[int, int]]:
-    """Return the numbers in NYU40 and ScanNet200 of each word of an annotation."""
+def _whole(path: Path, what: str, values: list[Any]) -> NDArray[np.int64]:
+    """Return whole numbers of 64 bits, and refuse all others; ``what`` they are is for messages."""
+    message = f"{path}: expected {what} to be whole numbers, got: "
+    with refusing(message, *DAMAGES, repair="; fetch it again"):
+        if not set(map(type, values)) <= {int}:
+            place = next(i for i, value in enumerate(values) if type(value) is not int)
+            raise TypeError(f"{shortened(values[place])} as number {place:,}")
+        return np.array(values, dtype=np.int64)
+
+
+def _read_rows(path: Path, columns: tuple[str, ...], delimiter: str) -> Iterator[dict[str, str]]:
+    """Yield the rows of a table that has some columns."""
+    message = f"{path}: expected a table with columns {', '.join(columns)}, got: "
+    with refusing(message, csv.Error, *DAMAGES, repair="; fetch it again"):
+        rows = csv.DictReader(StringIO(read_text(path)), delimiter=delimiter)
+        if missing := [name for name in columns if name not in (rows.fieldnames or ())]:
+            raise LookupError(f"none called {missing[0]}")
+        for row in rows:
+            if any(row[name] is None for name in columns):
+                raise LookupError(f"line {rows.line_num:,} with fewer")
+            yield row
+
+
+def _read_categories(root: Path) -> dict[str, tuple[int, int]]:
+    """Return the numbers in NYU40 and ScanNet200 of each word of an annotation.
+
+    There are none without the table of them.
+    """
+    path = _find(root, CATEGORIES)
     numbers: dict[str, tuple[int, int]] = {}
-    message = f"{path}: expected columns raw_category, nyu40id and id, got: "
-    with refusing(message, LookupError, ValueError), path.open(encoding="utf-8") as stream:
-        for row in csv.DictReader(stream, delimiter="\t"):
-            pair = (int(float(row["nyu40id"] or 0)), int(float(row["id"] or 0)))
-            numbers.setdefault(row["raw_category"], pair)
+    columns = ("raw_category", "nyu40id", "id")
+    for row in [] if path is None else _read_rows(path, columns, "\t"):
+        pair = tuple(_class_number(path, row, name) for name in columns[1:])
+        numbers.setdefault(row["raw_category"], (pair[0], pair[1]))
     return numbers
 
 
-def _read_mapping(path: Path) -> dict[str, str]:
-    """Return the class of the benchmark of each word of an annotation; words of none are absent."""
+def _class_number(path: Path | None, row: Mapping[str, str], name: str) -> int:
+    """Return the number of a class in a row of a table, 0 where it is left out."""
+    text = row[name].strip() or "0"
+    try:
+        number = float(text)
+    except ValueError:
+        number = np.nan
+    if not (0 <= number <= _LARGEST_CLASS and number.is_integer()):
+        raise FormatError(
+            f"{path}: {shortened(row['raw_category'])}: expected {name} to be a whole number from "
+            f"0 to {_LARGEST_CLASS:,}, got {shortened(text)}; fetch it again."
+        )
+    return int(number)
+
+
+def _read_mapping(root: Path) -> dict[str, str] | None:
+    """Return the class of the benchmark of each word of an annotation; words of none are absent.
+
+    It is None without the table of them.
+    """
+    path = _find(root, "map_benchmark.csv")
+    if path is None:
+        return None
     classes: dict[str, str] = {}
-    message = f"{path}: expected columns class and semantic_map_to, got: "
-    with refusing(message, LookupError), path.open(encoding="utf-8") as stream:
-        for row in csv.DictReader(stream):
-            target = row["semantic_map_to"]
-            if target and target != "None":
-                classes[row["class"]] = target
-            elif not target:
-                classes.setdefault(row["class"], row["class"])
+    for row in _read_rows(path, ("class", "semantic_map_to"), ","):
+        target = row["semantic_map_to"]
+        if target and target != "None":
+            classes[row["class"]] = target
+        elif not target:
+            classes.setdefault(row["class"], row["class"])
     return classes
 
 
 def _classes_plus(root: Path) -> dict[str | None, int]:
     """Return the numbers of the classes of ScanNet++ by name, none where there is no list."""
     path = _find(root, "top100.txt")
-    lines = [] if path is None else path.read_text(encoding="utf-8").splitlines()
+    lines = [] if path is None else read_text(path).splitlines()
     return {name.strip(): number for number, name in enumerate(filter(str.strip, lines))}
 
 
 def _places(numbers: NDArray[np.integer], known: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return the place of each number in a list, -1 for those that are not in it."""
-    places = np.full(max(int(numbers.max(initial=0)), *known) + 1, _NONE, dtype=np.int64)
-    places[list(known)] = np.arange(len(known))
-    found: NDArray[np.int64] = places[np.maximum(numbers, 0)]
+    """Return the place of each number in an ascending list, -1 for those that are not in it."""
+    places = np.searchsorted(known, numbers).clip(max=len(known) - 1)
+    found: NDArray[np.int64] = np.where(np.array(known)[places] == numbers, places, _NONE)
     return found

@@ -6,6 +6,7 @@ import re
 import secrets
 import shutil
 import struct
+import tokenize
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -23,6 +24,8 @@ DAMAGES = (
     AttributeError,
     AssertionError,
     MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
     struct.error,
 )
 """What libraries raise on damaged files beside their own errors, found by flipping bytes."""
@@ -202,6 +205,19 @@ def check_file(path: Path) -> int:
     if size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; fetch or write it again.")
     return size
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file in UTF-8, without the mark that some programs begin it with."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from error
+    except UnicodeDecodeError as error:
+        found = error.object[error.start : error.start + 1]
+        raise FormatError(
+            f"{path}: byte {error.start}: expected text in UTF-8, got {found!r}; save it as UTF-8."
+        ) from error
 
 
 def check_promise(

@@ -10,7 +10,6 @@ Arrays of another length are left out, and so is what a result says about its pl
 import io
 import json
 import math
-import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -411,7 +410,7 @@ def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> _
     """Read the header of an array and check it against the ``size`` bytes that are there."""
     message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
     repair = "; write it again with numpy.save or numpy.savez"
-    with refusing(message, *DAMAGES, SyntaxError, tokenize.TokenError, repair=repair):
+    with refusing(message, *DAMAGES, repair=repair):
         layout = _read_layout(stream)
     shape, _, dtype, start = layout
     if dtype.hasobject:
