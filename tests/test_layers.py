@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
     {"errors", "version", "_display", "_parallel"},
+    {"precision"},
     {"_checks", "_compile", "_optional", "structures"},
     {"_opaque", "linalg", "neighbors", "config"},
     {"robust"},

@@ -1,6 +1,7 @@
-"""Exceptions that torchrg raises on purpose.
+"""Exceptions that torchrg raises on purpose, and warnings that have a class of their own.
 
-All are a :class:`TorchrgError`; the message says what was expected, what came, and the repair.
+All exceptions are a :class:`TorchrgError`; the message says what was expected, what came, and the
+repair.
 """
 
 
@@ -22,3 +23,7 @@ class ConfigError(TorchrgError, ValueError):
 
 class MissingDependencyError(TorchrgError, ImportError):
     """An optional package is needed and is not installed."""
+
+
+class PrecisionWarning(UserWarning):
+    """Coordinates have lost digits that the spacing of their points needs."""

@@ -45,6 +45,7 @@ from torchrg.neighbors import (
 from torchrg.neighbors.tiles import Part
 from torchrg.normals import ESTIMATORS, STEPS
 from torchrg.normals.consensus.constants import REGIONAL_STEPS
+from torchrg.precision import warn_of_steps
 from torchrg.regions import partition_points, summarize_planes
 from torchrg.regions.edges import EDGE_STEPS, GrowingCloud
 from torchrg.regions.growth import (
@@ -226,6 +227,10 @@ def segment_planes(
         FormatError: If the folder holds the work of another run or something else, or the disk is
             full.
 
+    Warns:
+        PrecisionWarning: If the steps of float32 are more than a tenth of the spacing of the
+            points, as they are far from the origin.
+
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
         >>> seg = segment_planes(grid, "classic")
@@ -244,6 +249,7 @@ def segment_planes(
     if isinstance(points, Tensor | np.ndarray):
         points = as_tensor("segment_planes", "points", points).detach()
         check_points("segment_planes", points)
+        warn_of_steps("segment_planes", points, stacklevel=4)
     else:
         check_chunks("segment_planes", points)
     if not isinstance(config, PipelineConfig):

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.io.fields import are_whole, put_results
+from torchrg.io.files import DAMAGES
 from torchrg.io.npy import map_folder, read_beside
 from torchrg.io.stream import CloudStream, Extent
 from torchrg.metrics.contingency import number_labels
@@ -265,14 +266,20 @@ class Result:
 
     @property
     def superpoints(self) -> Superpoints | None:
-        """What :func:`torchrg.make_superpoints` said about them; None where it was not asked."""
+        """What :func:`torchrg.make_superpoints` said about them; None where it was not asked.
+
+        Numbers that are not below that of points, as where some were left out since, are made anew.
+        """
         if "superpoints" not in self.fields:
             return None
         fields, labels = self.cloud.fields, self.fields["superpoints"].long()
         coarser = (f"superpoints_{i}" for i in range(1, len(fields)))
         levels = (torch.from_numpy(fields[name]).long() for name in coarser if name in fields)
         plane = self.plane_of_superpoint
-        plane = main_planes(labels, self.labels) if plane is None else plane
+        if len(labels) and labels.max() >= len(labels):
+            labels, plane = number_labels(labels)[1], None
+        if plane is None or len(plane) != labels.max() + 1:
+            plane = main_planes(labels, self.labels)
         return Superpoints(labels, plane, tuple(levels))
 
 
@@ -331,7 +338,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         named = torch.equal(result.names, torch.arange(len(sizes)))
         if named and torch.equal(sizes, table.count):
             return replace(result, table=table)
-    except (LookupError, ValueError, TypeError):
+    except DAMAGES:
         # A table of an older version, or of another program that has arrays of these names.
         pass
     note = "its table of planes left out, as it is not that of its labels"
@@ -358,7 +365,7 @@ def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
         try:
             text = (folder / PLANES_FILE).read_text(encoding="utf-8")
             beside |= _arrays_of(json.loads(text))
-        except (LookupError, ValueError, TypeError, AttributeError):
+        except DAMAGES:
             beside["plane_count"] = np.zeros(0)
     return cloud, beside
 
@@ -367,7 +374,7 @@ def _record(text: str) -> dict[str, Any]:
     """Return the record that a text holds, empty if it holds none."""
     try:
         found = json.loads(text)
-    except ValueError:
+    except DAMAGES:
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -1,5 +1,6 @@
 """What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import _display
-from torchrg.errors import ShapeError
+from torchrg.errors import PrecisionWarning, ShapeError
+from torchrg.precision import note_on_steps
 
 UNLABELED = -1
 """Label of a point that belongs to no region."""
@@ -43,6 +45,9 @@ class Cloud:
 
     Raises:
         ShapeError: If ``coordinates`` is no NumPy array.
+
+    Warns:
+        PrecisionWarning: Where :attr:`points` is taken and :attr:`precision_note` is not empty.
 
     Example:
         >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
@@ -93,7 +98,31 @@ class Cloud:
 
         Rows that are not :attr:`finite` are not finite here either.
         """
+        if self.precision_note:
+            warnings.warn(
+                f"{self.source or 'Cloud'}: {self.precision_note}.", PrecisionWarning, stacklevel=3
+            )
+        return self._local
+
+    @cached_property
+    def _local(self) -> Tensor:
+        """:attr:`points`, whatever their precision."""
         return self.about(self.origin)
+
+    @cached_property
+    def precision_note(self) -> str:
+        """What has cost the coordinates digits that the spacing of the points needs, or nothing.
+
+        A line for people, without a full stop: that they were written as float32 far from the
+        origin, or as LAS with too coarse a scale, or reach too far for float32 about any origin.
+        """
+        scale = float(max(getattr(self.header.get("las"), "scales", (0.0,))))
+        if note := note_on_steps(self.coordinates, scale=scale):
+            return note
+        if self.coordinates.dtype == np.float32:
+            return ""
+        cure = "leave out points that are far off, or cut the cloud into parts"
+        return note_on_steps(self._local.numpy(), cure=cure)
 
     def about(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates about an origin of shape ``(3,)``, float32, shape ``(N, 3)``."""

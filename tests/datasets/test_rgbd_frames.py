@@ -78,17 +78,17 @@ def test_tum_frames_are_matched_in_time(tum):
     assert names == ["1.0.png", "1.05.png", "depth.txt", "rgb.txt", "groundtruth.txt"]
 
 
-def test_quaternions_have_any_length_and_zero_is_no_rotation(tmp_path):
-    quaternions = ["0 0 2 2", "0 0 0 0", "nan nan nan nan", "0.1 0.2 0.3 -0.4"]
+def test_quaternions_have_any_length_and_zero_is_no_pose(tmp_path):
+    quaternions = ["0 0 2 2", "0 0 0 0", "nan nan nan nan", "0 0 inf 1", "0.1 0.2 0.3 -0.4"]
     rows = [f"{time} 0.5 0.25 2 {words}\n" for time, words in enumerate(quaternions)]
     write_text(tmp_path / "track.txt", "".join(rows))
-    times, matrices = read_trajectory(tmp_path / "track.txt")
-    poses = torch.stack(matrices)
-    assert times == [0, 1, 2, 3]
+    times, found = read_trajectory(tmp_path / "track.txt")
+    assert times == [0, 1, 2, 3, 4]
+    assert found[1:4] == [None] * 3
+    poses = torch.stack([found[0], found[4]])
     torch.testing.assert_close(poses[0], expected_pose(), rtol=0, atol=1e-15)
-    assert poses[1:3, :3, :3].isnan().all()
     assert (poses[:, :3, 3] == torch.tensor([0.5, 0.25, 2]).double()).all()
-    turn = poses[3, :3, :3]
+    turn = poses[1, :3, :3]
     torch.testing.assert_close(turn @ turn.T, torch.eye(3).double(), rtol=0, atol=1e-15)
     # x y z w = (1, 2, 3, -4) / sqrt(30), by the formula of Hamilton, in thirtieths.
     expected = torch.tensor([[4.0, 28, -10], [-20, 10, 20], [22, 4, 20]]).double() / 30

@@ -18,6 +18,7 @@ from torchrg.batch.task import Converted
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
+from torchrg.io.files import DAMAGES
 from torchrg.result import RECORD as RECORD
 
 _TEXT = b"tEXttorchrg\0"
@@ -130,7 +131,7 @@ def _read_json(job: Recorded) -> Any:  # noqa: ANN401
     try:
         content = job.record.read_bytes()
         return json.loads(_split_text(content)[1] if _is_image(job.record) else content)
-    except (OSError, ValueError):
+    except (OSError, *DAMAGES):
         return None
 
 

@@ -188,7 +188,10 @@ def convert_scan(job: Job) -> TaskReport:
 
 
 def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
-    """Return a warning if points of a cloud are missing or far off; raise FormatError if all are.
+    """Return warnings if points of a cloud are missing, far off, or have lost digits.
+
+    Raises:
+        FormatError: If none is finite.
 
     Example:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
@@ -217,7 +220,8 @@ def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
                 f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which "
                 "costs the others their precision; remove those that are none"
             )
-    return tuple(notes)
+            return tuple(notes)
+    return (*notes, first.precision_note) if first.precision_note else tuple(notes)
 
 
 def write_results(

@@ -465,11 +465,17 @@ class RGBDSource:
 
 
 def num_pixels(path: Path) -> int:
-    """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage."""
-    if path.suffix.lower() != ".png":
-        return path.stat().st_size // 2
-    with path.open("rb") as stream:
-        head = stream.read(_PNG_SIZE_AT + _PNG_SIZE.size)
+    """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage.
+
+    It is 0, too, of a file that is not there, which reading tells.
+    """
+    try:
+        if path.suffix.lower() != ".png":
+            return path.stat().st_size // 2
+        with path.open("rb") as stream:
+            head = stream.read(_PNG_SIZE_AT + _PNG_SIZE.size)
+    except (OSError, ValueError):
+        return 0
     if len(head) < _PNG_SIZE_AT + _PNG_SIZE.size:
         return 0
     width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)

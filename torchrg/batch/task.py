@@ -4,13 +4,14 @@ import os
 import platform
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.errors import TorchrgError
+from torchrg.errors import PrecisionWarning, TorchrgError
 from torchrg.io.files import is_disk_full
 
 
@@ -105,7 +106,10 @@ def report_on(name: str, convert: Callable[[Callable[[str], None]], Converted]) 
     outcome: dict[str, Any]
     reset_peak_memory()
     try:
-        outcome = {"status": "converted", **convert(clock.begin)._asdict()}
+        with warnings.catch_warnings():
+            # It is among the warnings of the report.
+            warnings.simplefilter("ignore", PrecisionWarning)
+            outcome = {"status": "converted", **convert(clock.begin)._asdict()}
         del outcome["files"]
     except Exception as error:  # noqa: BLE001 One task must never end the others.
         is_foreseen = isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)

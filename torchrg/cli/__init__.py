@@ -4,6 +4,7 @@ import difflib
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from io import UnsupportedOperation
@@ -15,7 +16,7 @@ from torchrg.cli.ending import (
     fail,
     raising_interrupts,
 )
-from torchrg.errors import ConfigError, TorchrgError
+from torchrg.errors import ConfigError, PrecisionWarning, TorchrgError
 
 COMMANDS = {
     "segment": "label the planes of scans",
@@ -88,6 +89,8 @@ def _run(arguments: list[str]) -> int:
         hint = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.{hint}")
     command = importlib.import_module(f"torchrg.cli.{name}")
-    with raising_interrupts():
+    with raising_interrupts(), warnings.catch_warnings():
+        # Commands tell of the precision of each file as a line: see check_finite.
+        warnings.simplefilter("ignore", PrecisionWarning)
         code: int = command.run(rest)
     return code

@@ -38,7 +38,7 @@ def run(argv: list[str]) -> int:
     cloud = read_cloud(arguments.file, columns=names.of(arguments.file))
     for name, value in describe_cloud(cloud).items():
         print(f"{name:<12}{value}")
-    for note in cloud.notes:
+    for note in filter(None, (*cloud.notes, cloud.precision_note)):
         print(f"{'note':<12}{note}")
     return 0
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import make_folder
+from torchrg.io.files import DAMAGES, make_folder
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, describe_planes
 from torchrg.structures import Segmentation
@@ -220,7 +220,7 @@ def _written(place: Path) -> list[str]:
         return sorted(set(written))
     except (FileNotFoundError, NotADirectoryError):
         return []
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, *DAMAGES) as error:
         raise FormatError(
             f"{place / PLANES_FILE}: expected a table of planes that torchrg wrote, got another "
             "file; move it away."

@@ -24,8 +24,10 @@ from torchrg.datasets.folder import (
 )
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
+    known_pose,
     read_color,
     read_depth,
+    read_intrinsics,
     read_matrix,
     read_nearest,
     read_timed,
@@ -268,7 +270,7 @@ def _find_icl_nuim(
     camera = make_intrinsics(*_ICL_NUIM_INTRINSICS) if intrinsics is None else intrinsics
     frames = []
     for name, folder in _recordings(root, "depth"):
-        poses: dict[str, Tensor] = {}
+        poses: dict[str, Tensor | None] = {}
         tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
         if tracks:
             numbers, matrices = read_trajectory(tracks[0])
@@ -301,7 +303,7 @@ def _find_scannet(
     frames = []
     for name, folder in _recordings(root, "depth"):
         calibration = folder / "intrinsic" / "intrinsic_depth.txt"
-        camera = read_matrix(calibration)[:3, :3] if intrinsics is None else intrinsics
+        camera = read_intrinsics(calibration) if intrinsics is None else intrinsics
         frames += [
             _posed_frame(
                 image,
@@ -418,13 +420,8 @@ def _posed_frame(
     no_depth: int | None = None,
     sources: tuple[Path, ...] = (),
 ) -> RGBDFrame:
-    """Return a frame whose pose is in a file of its own, if that is there.
-
-    A pose that is not finite, which is how tracking that was lost is written, counts as none.
-    """
-    pose = read_matrix(track) if track.is_file() else None
-    if pose is not None:
-        sources = (*sources, track)
-        pose = pose if bool(pose.isfinite().all()) else None
+    """Return a frame whose pose is in a file of its own, if that is there and it is known."""
+    pose = known_pose(read_matrix(track)) if track.is_file() else None
+    sources = (*sources, track) if track.is_file() else sources
     scale = _MILLIMETERS if depth_scale is None else depth_scale
     return RGBDFrame(image, camera, scale, name, color, pose, no_depth, sources)

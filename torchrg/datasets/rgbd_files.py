@@ -1,5 +1,6 @@
 """Depth, colour and poses from files."""
 
+import math
 import os
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import DAMAGES, check_file, read_text, refusing
+from torchrg.structures import FARTHEST
 
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
@@ -110,26 +112,52 @@ def read_matrix(path: Path) -> Tensor:
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)
 
 
+def read_intrinsics(path: Path) -> Tensor:
+    """Read a camera matrix, shape ``(3, 3)``, float64, from one of four rows of four numbers."""
+    camera = read_matrix(path)[:3, :3]
+    if not bool((camera.abs() <= FARTHEST).all()) or not bool((camera.diagonal() > 0).all()):
+        raise FormatError(
+            f"{path}: expected a camera matrix of focal lengths above 0, got {camera.tolist()}; "
+            "fetch it again."
+        )
+    return camera
+
+
+def known_pose(matrix: Tensor) -> Tensor | None:
+    """Return a pose, or None for one that is not finite or leads nowhere: tracking was lost."""
+    return matrix if bool((matrix.abs() <= FARTHEST).all()) else None
+
+
 def read_timed(path: Path) -> tuple[list[float], list[str]]:
     """Read rows of a time and a file name; return times, ascending, and names."""
     rows = _rows(path, 2, "a time and a file name")
     times = [row[0] for row in _numbers(path, [[row[0]] for row in rows])]
+    _check_times(path, times)
     order = sorted(range(len(times)), key=times.__getitem__)
     return [times[i] for i in order], [rows[i][1] for i in order]
 
 
-def read_trajectory(path: Path) -> tuple[list[float], list[Tensor]]:
+def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
     """Read rows of ``time tx ty tz qx qy qz qw``; return times, ascending, and poses.
 
-    Poses are matrices from camera to world, shape ``(4, 4)``, float64.
+    Poses are matrices from camera to world, shape ``(4, 4)``, float64, or None; see
+    :func:`known_pose`.
     """
     rows = _rows(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
+    _check_times(path, values[:, 0].tolist())
     values = values[values[:, 0].argsort(stable=True)]
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
     poses[:, :3, :3] = _rotations(values[:, 4:])
     poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0].tolist(), list(poses)
+    return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
+
+
+def _check_times(path: Path, times: Sequence[float]) -> None:
+    """Refuse times that come neither before nor after others."""
+    wrong = next((time for time in times if not math.isfinite(time)), None)
+    if wrong is not None:
+        raise FormatError(f"{path}: expected finite times, got {wrong}; repair or delete its row.")
 
 
 def read_nearest(
@@ -154,12 +182,13 @@ def read_nearest(
 def _rotations(quaternions: Tensor) -> Tensor:
     """Return rotation matrices of quaternions x y z w of any length, shape ``(n, 3, 3)``.
 
-    They are not numbers where the quaternion is zero or not, as after tracking that was lost.
+    They are not numbers where the quaternion is zero or not finite.
     """
     from scipy.spatial.transform import Rotation
 
     matrices = torch.full((len(quaternions), 3, 3), torch.nan, dtype=torch.float64)
-    known = quaternions.norm(dim=1) > 0
+    lengths = quaternions.norm(dim=1)
+    known = (lengths > 0) & lengths.isfinite()
     if known.any():
         found = Rotation.from_quat(quaternions[known].numpy()).as_matrix()
         matrices[known] = torch.from_numpy(found)

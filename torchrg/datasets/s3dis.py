@@ -28,6 +28,7 @@ from torchrg.datasets.rooms import (
     read_room,
 )
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.files import DAMAGES
 from torchrg.io.npy import map_array
 
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
@@ -165,7 +166,7 @@ def _load(entry: Path) -> Room | None:
         report = json.loads((entry / "report.json").read_text(encoding="utf-8"))
         coord, color, segment, instance = (map_array(entry / f"{name}.npy") for name in _ARRAYS)
         return Room(coord, color, segment, instance, _report_of(report))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, *DAMAGES):
         return None
 
 

@@ -395,7 +395,7 @@ def _read_rows(path: Path, columns: tuple[str, ...], delimiter: str) -> Iterator
     """Yield the rows of a table that has some columns."""
     message = f"{path}: expected a table with columns {', '.join(columns)}, got: "
     with refusing(message, csv.Error, *DAMAGES, repair="; fetch it again"):
-        rows = csv.DictReader(StringIO(read_text(path)), delimiter=delimiter)
+        rows = csv.DictReader(StringIO(read_text(path), newline=None), delimiter=delimiter)
         if missing := [name for name in columns if name not in (rows.fieldnames or ())]:
             raise LookupError(f"none called {missing[0]}")
         for row in rows:

@@ -92,7 +92,7 @@ GROUP_FORMATS: dict[str, Format] = {
     ".vg": Format(open_vg, write_vg),
     ".bvg": Format(open_bvg, write_bvg),
 }
-"""Formats of planes, which hold coordinates, colours, normals and labels."""
+"""Formats of planes, which hold coordinates, normals and labels, and ``.vg`` also colours."""
 
 
 def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Cloud:
@@ -224,7 +224,8 @@ def write_cloud(
         and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
         identifiers). Superpoints are ``superpoints``, and ``superpoints_1`` and so on for the
         coarser levels; in ``.npz`` also ``plane_of_superpoint``. ``.vg`` and ``.bvg`` hold
-        coordinates, colours, normals and the planes as vertex groups; see :mod:`torchrg.io.vg`.
+        coordinates, normals and the planes as vertex groups, numbered from zero, and ``.vg`` holds
+        colours; see :mod:`torchrg.io.vg`.
 
     Args:
         path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`

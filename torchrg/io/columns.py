@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import LEFT_OUT, WIDEN, Columns, name_aside
+from torchrg.io.fields import LARGEST_WHOLE, LEFT_OUT, WIDEN, Columns, name_aside
 from torchrg.io.files import atomic_path
 from torchrg.io.stream import CloudStream
 from torchrg.structures import Cloud
@@ -137,6 +137,18 @@ def wide_limits(path: Path, stream: CloudStream, spelling: Spelling) -> dict[str
         if not wide:
             break
         merge_limits(limits, flatten_cloud(path, replace(chunk, fields=wide), spelling))
+    return limits
+
+
+def exact_limits(path: Path, stream: CloudStream, spelling: Spelling) -> dict[str, Limits]:
+    """Return the limits of :func:`wide_limits`, all of which float64 holds exactly."""
+    limits = wide_limits(path, stream, spelling)
+    for name, limit in limits.items():
+        if max(map(abs, limit)) >= LARGEST_WHOLE:
+            raise FormatError(
+                f"{path}: expected field {name} within 2^53, got 64-bit integers beyond; "
+                "leave it out or write .npz."
+            )
     return limits
 
 

@@ -68,6 +68,8 @@ COLUMNS_RULE = (
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
 """Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
+LARGEST_WHOLE = 2**53
+"""float64, and so text, tells whole numbers below from all others; this may have been another."""
 WIDEN = 257
 """65535 / 255: what eight bits become in sixteen, and back without loss."""
 
@@ -465,9 +467,14 @@ def _labels(path: Path, labels: NDArray[Any]) -> NDArray[np.int64]:
     if flat.dtype.kind == "f":
         flat = np.where(np.isnan(flat), flat.dtype.type(UNLABELED), flat)
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
-    if not are_whole(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
+    if not are_whole(flat) or (flat.dtype.kind == "u" and largest >= 2.0**63):
         raise FormatError(
             f"{path}: expected labels to be whole numbers of 64 bits; rename or remove that field."
+        )
+    if flat.dtype.kind == "f" and largest >= LARGEST_WHOLE:
+        raise FormatError(
+            f"{path}: expected labels within 2^53, as text and floating-point numbers do not tell "
+            f"others apart, got {largest:.0f}; write them as integers, as in .npz."
         )
     return flat.astype(np.int64)
 

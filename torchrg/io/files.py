@@ -202,6 +202,8 @@ def check_file(path: Path) -> int:
         size = path.stat().st_size
     except FileNotFoundError as error:
         raise FormatError(f"{path}: no such file; check the spelling.") from error
+    except (OSError, ValueError) as error:  # A name that no file can have.
+        raise FormatError(f"{path}: cannot be read: {first_line(error)}.") from error
     if size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; fetch or write it again.")
     return size
@@ -210,14 +212,20 @@ def check_file(path: Path) -> int:
 def read_text(path: Path) -> str:
     """Return the text of a file in UTF-8, without the mark that some programs begin it with."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        content = path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from error
+    try:
+        place = content.find(b"\0")  # No text has it in UTF-8, and all have it in UTF-16.
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        found = error.object[error.start : error.start + 1]
+        place = error.start
+    if place >= 0:
         raise FormatError(
-            f"{path}: byte {error.start}: expected text in UTF-8, got {found!r}; save it as UTF-8."
-        ) from error
+            f"{path}: byte {place}: expected text in UTF-8, got {content[place : place + 1]!r}; "
+            "save it as UTF-8."
+        )
+    return text
 
 
 def check_promise(

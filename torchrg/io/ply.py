@@ -17,9 +17,9 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import (
     Limits,
     Spelling,
+    exact_limits,
     flatten_cloud,
     narrow_integers,
-    wide_limits,
     write_records,
 )
 from torchrg.io.fields import Columns
@@ -89,7 +89,7 @@ def write_ply(path: Path, stream: CloudStream) -> None:
     64-bit integers become 32-bit ones, or ``double`` where that holds them.
     """
     spelling = Spelling()
-    limits = wide_limits(path, stream, spelling)
+    limits = exact_limits(path, stream, spelling)
     words = {code: word for word, code in _TYPES.items()}
 
     def header(columns: Columns) -> list[str]:
@@ -107,23 +107,17 @@ def write_ply(path: Path, stream: CloudStream) -> None:
         path,
         header,
         (
-            {name: _storable(path, name, c, limits.get(name)) for name, c in columns.items()}
+            {name: _storable(c, limits.get(name)) for name, c in columns.items()}
             for columns in chunks
         ),
     )
 
 
-def _storable(path: Path, name: str, column: NDArray[Any], limits: Limits | None) -> NDArray[Any]:
+def _storable(column: NDArray[Any], limits: Limits | None) -> NDArray[Any]:
     """Return a column in a type that PLY has and that holds its limits."""
     column = narrow_integers(column, ("i4", "u4"), limits)
-    if limits is not None and column.dtype.kind in "iu" and column.dtype.itemsize == 8:
-        if max(map(abs, limits)) > 2**53:
-            raise FormatError(
-                f"{path}: expected field {name} within 2^53, got 64-bit integers beyond; "
-                "leave it out or write .npz."
-            )
-        return column.astype(np.float64)
-    return column
+    is_wide = column.dtype.kind in "iu" and column.dtype.itemsize == 8
+    return column.astype(np.float64) if is_wide else column
 
 
 class _Property(NamedTuple):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud
+from torchrg.io.columns import Spelling, exact_limits, flatten_cloud
 from torchrg.io.fields import (
     FIRST_ROWS,
     Columns,
@@ -109,6 +109,7 @@ def _open_lines(path: Path) -> TextIO:
 def write_text(path: Path, stream: CloudStream) -> None:
     """Write points as text that reads back to the same values, names of fields in a comment."""
     spelling = Spelling()
+    exact_limits(path, stream, spelling)
     with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
         for number, chunk in enumerate(stream):
             columns = flatten_cloud(path, chunk, spelling)

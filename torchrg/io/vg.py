@@ -1,7 +1,8 @@
 """Vertex groups, ``.vg`` and ``.bvg``: planes of a cloud for PolyFit, abspy and Easy3D.
 
 A group is a plane ``a x + b y + c z + d = 0`` with the rows of its points. The files hold
-coordinates, colours, normals and groups; other fields are left out. Groups inside of groups are
+coordinates, normals, groups and, ``.vg`` alone, colours; other fields are left out. Groups have no
+numbers: labels are written in ascending order and read back as 0, 1, 2. Groups inside of groups are
 read too, and a point has the innermost.
 """
 

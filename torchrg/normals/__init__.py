@@ -37,6 +37,7 @@ from torchrg.normals.paper import estimate_paper, find_sharp_points
 from torchrg.normals.patches import Estimator, at_all_points
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.normals.robust import fit_normals_robust
+from torchrg.precision import warn_of_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
 from torchrg.structures import Neighbors, NormalFit
 
@@ -130,6 +131,10 @@ def estimate_normals(
             gradients that the method has not.
         ShapeError: If a shape or dtype is not as above.
 
+    Warns:
+        PrecisionWarning: If the steps of float32 are more than a tenth of the spacing of the
+            points, as they are far from the origin.
+
     Example:
         >>> floor = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
         >>> floor[:, 2] = 1.5
@@ -138,6 +143,7 @@ def estimate_normals(
     """
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
+    warn_of_steps("estimate_normals", tensor, stacklevel=4)
     changes = {"method": method, "k": k}
     given = {name: value for name, value in changes.items() if value is not None}
     settings = settings_of("estimate_normals", NormalsConfig, config, given)

@@ -1,0 +1,102 @@
+"""Whether coordinates have steps that are coarse for the spacing of their points.
+
+float32 has 24 bits: a northing of five million metres is a multiple of half a metre there, and so
+are the planes of a room. Nothing that comes later brings back what was lost.
+"""
+
+import math
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from torchrg.errors import PrecisionWarning
+
+_COARSE = 0.1
+"""Step of the coordinates, in spacings of the points, from which on people are told."""
+_SURELY_FINE = 0.01
+"""Step, in spacings of an even surface, up to which nothing is searched. Half of the points of a
+cloud would have to lie ten times as close as on an even surface for it to be :data:`_COARSE`."""
+_QUARTILES = (0.25, 0.75)
+"""Quantiles of each coordinate, between which the middle half of a cloud lies. Single points far
+off, which have coarser steps than the others, play no part."""
+_SAMPLE = 20_000
+"""About as many points tell the spacing."""
+_CELL = 32
+"""Side of the cells that these points are in, in spacings of an even surface, of which seven of
+eight points are not at the border of their cell, where the nearest point may be outside."""
+_PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
+"""Factors of the hash of a cell: M. Teschner et al. Optimized spatial hashing for collision
+detection of deformable objects. VMV, 2003."""
+_MIXING = 0x9E3779B97F4A7C15
+"""Odd factor next to 2^64 over the golden ratio, which spreads such a hash over all 64 bits."""
+
+
+def note_on_steps(
+    points: NDArray[np.floating],
+    *,
+    scale: float = 0.0,
+    cure: str = "write float64, or subtract an offset before saving",
+) -> str:
+    """Return a line for people where the steps of coordinates are more than a tenth of the spacing.
+
+    It is empty where they are not, and where that cannot be told: of fewer than three points, and
+    where half of them are in one place. It does not depend on the order of the points.
+
+    Args:
+        points: Coordinates as they came, shape ``(N, 3)``, float32 or float64; what is not finite
+            does not count. The steps of float64, which has sixteen digits, are not looked at.
+        scale: What the coordinates are multiples of in their file. Default: of nothing.
+        cure: What to do where it is the type that is too coarse, and not the scale.
+
+    Example:
+        >>> points = np.random.default_rng(0).random((1000, 3), dtype=np.float32)
+        >>> note_on_steps(points)
+        ''
+        >>> note_on_steps(points + np.float32(5_400_000))  # doctest: +ELLIPSIS
+        'coordinates have steps of 0.5 for a spacing of about 0.02; write float64, or subtract ...'
+    """
+    is_single = points.dtype == np.float32
+    if not is_single and scale == 0:
+        return ""
+    finite = np.isfinite(points).all(axis=1)
+    known = points if finite.all() else points[finite]
+    if len(known) < 3:
+        return ""
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = np.quantile(known, _QUARTILES, axis=0)
+        width, reach = float((high - low).max()), np.float32(np.abs([low, high]).max())
+        step = max(float(np.spacing(reach)) if is_single else 0.0, scale)
+    even = width / math.sqrt(len(known))
+    if not 0 < width < math.inf or step <= _SURELY_FINE * even:
+        return ""
+    spacing = _spacing(known, _CELL * even) if step < even else even
+    if step <= _COARSE * spacing:
+        return ""
+    cure = "write it with a finer scale" if step == scale else cure
+    return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {cure}"
+
+
+def warn_of_steps(caller: str, points: Tensor, *, stacklevel: int) -> None:
+    """Warn of what :func:`note_on_steps` tells of the points given to a public function."""
+    given = points.detach().cpu().numpy()
+    note = note_on_steps(given, cure="pass float64, or subtract an offset before it is float32")
+    if note:
+        warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=stacklevel + 1)
+
+
+def _spacing(points: NDArray[np.floating], side: float) -> float:
+    """Return the median distance to the nearest other place, of the points in some of all cells.
+
+    The place of a cell decides whether it is one of them, so that no order of the points does.
+    """
+    cells = np.floor(points.astype(np.float64) / side).clip(-(2.0**62), 2.0**62).astype(np.int64)
+    hashes = np.bitwise_xor.reduce(cells * _PRIMES, axis=1).view(np.uint64) * np.uint64(_MIXING)
+    share = min(_SAMPLE / len(points), 1.0)
+    chosen = points[hashes <= share * np.iinfo(np.uint64).max]
+    places = np.unique(chosen.astype(np.float64), axis=0)
+    if len(places) < 2:
+        return math.inf
+    return float(np.median(KDTree(places).query(places, k=2)[0][:, 1]))
