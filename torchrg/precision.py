@@ -9,7 +9,6 @@ import warnings
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchrg.errors import PrecisionWarning
@@ -92,6 +91,8 @@ def _spacing(points: NDArray[np.floating], side: float) -> float:
 
     The place of a cell decides whether it is one of them, so that no order of the points does.
     """
+    from scipy.spatial import cKDTree
+
     cells = np.floor(points.astype(np.float64) / side).clip(-(2.0**62), 2.0**62).astype(np.int64)
     hashes = np.bitwise_xor.reduce(cells * _PRIMES, axis=1).view(np.uint64) * np.uint64(_MIXING)
     share = min(_SAMPLE / len(points), 1.0)
@@ -99,4 +100,4 @@ def _spacing(points: NDArray[np.floating], side: float) -> float:
     places = np.unique(chosen.astype(np.float64), axis=0)
     if len(places) < 2:
         return math.inf
-    return float(np.median(KDTree(places).query(places, k=2)[0][:, 1]))
+    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))

@@ -9,7 +9,7 @@ import tyro
 
 from torchrg.cli.console import ColumnNames, ColumnsFlag, parse
 from torchrg.io import read_cloud
-from torchrg.neighbors import search_knn
+from torchrg.neighbors import canonical_order, search_knn
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
@@ -55,7 +55,11 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         digits = _DIGITS[cloud.coordinates.dtype.itemsize]
         for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
-        places = np.unique(kept - cloud.origin, axis=0)
+        ordered = kept - cloud.origin
+        ordered = ordered[canonical_order(ordered).numpy()]
+        is_first = np.ones(len(ordered), dtype=bool)
+        is_first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+        places = ordered[is_first]
         facts["duplicates"] = f"{len(kept) - len(places):,}"
         facts["spacing"] = "none"
         if len(places) > 1:
