@@ -15,9 +15,9 @@ from torchrg.errors import PrecisionWarning
 
 _COARSE = 0.1
 """Step of the coordinates, in spacings of the points, from which on people are told."""
-_SURELY_FINE = 0.01
+_SURELY_FINE = 1e-3
 """Step, in spacings of an even surface, up to which nothing is searched. Half of the points of a
-cloud would have to lie ten times as close as on an even surface for it to be :data:`_COARSE`."""
+cloud would have to lie a hundred times as close as on an even surface for it to be too coarse."""
 _QUARTILES = (0.25, 0.75)
 """Quantiles of each coordinate, between which the middle half of a cloud lies. Single points far
 off, which have coarser steps than the others, play no part."""

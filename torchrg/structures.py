@@ -117,9 +117,10 @@ class Cloud:
         origin, or as LAS with too coarse a scale, or reach too far for float32 about any origin.
         """
         scale = float(max(getattr(self.header.get("las"), "scales", (0.0,))))
-        if note := note_on_steps(self.coordinates, scale=scale):
+        known = self.coordinates if self.finite.all() else self.coordinates[self.finite]
+        if note := note_on_steps(known, scale=scale):
             return note
-        if self.coordinates.dtype == np.float32:
+        if known.dtype == np.float32:
             return ""
         cure = "leave out points that are far off, or cut the cloud into parts"
         return note_on_steps(self._local.numpy(), cure=cure)

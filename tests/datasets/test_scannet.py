@@ -1,13 +1,15 @@
 """ScanNet and ScanNet++ read as Pointcept's preprocessing defines their labels."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from tests.datasets.scannet_tree import ALIGNMENT, write_scan, write_scan_plus, write_tables
-from torchrg.datasets import ScanNet
-from torchrg.datasets.scannet import IDS_200
+from torchrg import Cloud, write_cloud
+from torchrg.datasets import ScanNet, read_scannet_scan
+from torchrg.datasets.scannet import IDS_200, NYU_IDS, _places
 from torchrg.errors import ConfigError, FormatError
 
 SEGMENTS = np.array([40, 40, 7, 7, 3, 3, 12, 12])
@@ -95,8 +97,6 @@ def test_vertices_of_several_objects_have_the_smallest_first(scans, tmp_path):
     segment, instance = literal_labels(SEGMENTS, objects, {"wall": 0, "chair": 1, "table": 2})
     assert data[0]["segment"].tolist() == segment[:, 0].tolist()
     assert data[0]["instance"].tolist() == instance[:, 0].tolist()
-    from torchrg.datasets import read_scannet_scan
-
     arrays = read_scannet_scan(data.scenes[0].path, tmp_path)
     assert np.array_equal(arrays["segment"], segment)
     assert np.array_equal(arrays["instance"], instance)
@@ -116,3 +116,140 @@ def test_what_is_wrong_names_the_file(tree, scans, tmp_path):
     (tmp_path / "none").mkdir()
     with pytest.raises(FormatError, match="pass the folder that holds scans or data"):
         ScanNet(tmp_path / "none")
+
+
+def test_lists_and_tables_may_begin_with_a_mark(tree, scans, tmp_path):
+    write_tables(tree, ["scene0010_00"], ["scene0002_01"])
+    plain = ScanNet(tree)
+    before = [(plain.scenes[i].name, plain[i]["segment"]) for i in range(2)]
+    for path in tree.rglob("*"):
+        if path.suffix in (".txt", ".tsv", ".json"):
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    data = ScanNet(tree)
+    for i, (name, segment) in enumerate(before):
+        assert data.scenes[i].name == name
+        assert data[i]["segment"].tolist() == segment.tolist()
+    assert np.allclose(data[0]["axis_align_matrix"], ALIGNMENT)
+    write_scan_plus(tmp_path / "plus", "0a5c013435", *scans, SEGMENTS, [("chair", [7])])
+    for path in (tmp_path / "plus" / "metadata" / "semantic_benchmark").iterdir():
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    plus = ScanNet(tmp_path / "plus")
+    assert plus.classes == ("wall", "office chair", "table")
+    assert plus[0]["segment"].tolist() == [-1, -1, 1, 1, -1, -1, -1, -1]
+
+
+def test_names_on_lists_that_are_no_scans_are_told_in_one_line(tree):
+    write_tables(tree, ["scene0010_00", "scene9\x1b[1m", "scene8"], ["scene0002_01", "scene7"])
+    message = r"scannetv2_train\.txt: 3 of 5 names on the lists .*\(first: 'scene9\\x1b\[1m'\)"
+    with pytest.warns(UserWarning, match=message) as caught:
+        data = ScanNet(tree)
+    assert len(caught) == 1
+    assert [scene.name[:4] for scene in data.scenes] == ["val/", "trai", "test"]
+
+
+TABLE = "meta_data/scannetv2-labels.combined.tsv"
+HEAD = b"id\traw_category\tcategory\tcount\tnyu40id\n"
+
+
+LISTS = ("meta_data/scannetv2_train.txt", "meta_data/scannetv2_val.txt")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (LISTS[0], b"sc\xe8ne\n", r"byte 2: expected text in UTF-8, got b'\\xe8'"),
+        (LISTS[1], "scene0".encode("utf-16"), "byte 0: expected text in UTF-8"),
+        (LISTS[1], b"scene0\0", r"byte 6: expected text in UTF-8, got b'\\x00'"),
+        (TABLE, HEAD.replace(b"nyu40id", b"nyu40"), "expected .*, got: none called nyu40id"),
+        (TABLE, HEAD + b"1\twall\n", "expected a table with .*, got: line 2 with fewer"),
+        (TABLE, HEAD + b"1\twall\twall\t3\t1e18\n", "'wall': expected nyu40id .*, got '1e18'"),
+        (TABLE, HEAD + b"1.5\twall\twall\t3\t1\n", "'wall': expected id .*, got '1.5'"),
+        (TABLE, HEAD + b"-1\twall\twall\t3\t1\n", "'wall': expected id .*, got '-1'"),
+        (TABLE, HEAD + b"nan\twall\twall\t3\t1\n", "'wall': expected id .*, got 'nan'"),
+        (TABLE, HEAD + b"1\tw\xe4nde\twall\t3\t1\n", "byte 42: expected text in UTF-8"),
+    ],
+)
+def test_lists_and_tables_are_refused_before_any_scan(tree, name, content, message):
+    write_tables(tree, ["scene0010_00"], ["scene0002_01"])
+    (tree / name).write_bytes(content)
+    with pytest.raises(FormatError, match=rf"{name}: {message}"):
+        ScanNet(tree)
+
+
+GROUP = {"id": 0, "objectId": 0, "segments": [7], "label": "lamp"}
+SEGS, GROUPS = "scene0010_00_vh_clean_2.0.010000.segs.json", "scene0010_00.aggregation.json"
+
+
+def segments(value):
+    return json.dumps({"segIndices": [40, 40, value, 7, 3, 3, 12, 12]})
+
+
+def groups(**changes):
+    group = {key: value for key, value in (GROUP | changes).items() if value is not ...}
+    return json.dumps({"segGroups": [GROUP, group]})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (SEGS, segments(1.7), "expected segIndices to be whole numbers, got: 1.7 as number 2"),
+        (SEGS, segments("7"), "expected segIndices to be whole numbers, got: '7' as number 2"),
+        (SEGS, segments(True), "expected segIndices to be whole numbers, got: True as number 2"),
+        (SEGS, segments([7]), r"expected segIndices to be whole numbers, got: \[7\] as number 2"),
+        (SEGS, segments(10**20), "expected segIndices to be whole numbers, got: Python int"),
+        (SEGS, segments(7).replace("7", "1e400"), "expected segIndices .*, got: inf as number 2"),
+        (SEGS, "7", "expected JSON with a list segIndices, got: 7"),
+        (SEGS, '{"segIndices": 7}', "expected JSON with a list segIndices, got: {"),
+        (SEGS, "[" * 200_000, "expected JSON with a list segIndices, got: maximum recursion"),
+        (SEGS, "9" * 5000, "expected JSON with a list segIndices, got: Exceeds the limit"),
+        (SEGS, b'{"segIndices": ["\xe9"]}', "byte 17: expected text in UTF-8"),
+        (GROUPS, '{"segGroups": 5}', "expected JSON with a list segGroups, got"),
+        (GROUPS, '{"segGroups": [5]}', "object 0: expected a label, .*, got 5"),
+        (GROUPS, groups(id=...), r"object 1: expected .* a number from 0 to [\d,]+ as id"),
+        (GROUPS, groups(id="3"), "object 1: expected"),
+        (GROUPS, groups(id=1.5), "object 1: expected"),
+        (GROUPS, groups(id=-1), "object 1: expected"),
+        (GROUPS, groups(id=10**20), "object 1: expected"),
+        (GROUPS, groups(label=5), "object 1: expected a label"),
+        (GROUPS, groups(segments=7), "object 1: expected .* and a list of segments"),
+        (GROUPS, groups(segments=[7, None]), "expected segments of object 1 to be whole numbers"),
+        ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}nan", "expected 16 finite numbers"),
+        ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}1e400", "expected 16 finite numbers"),
+        ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}", "expected 16 finite numbers"),
+    ],
+)
+def test_annotations_that_are_none_are_refused_by_file_and_place(tree, name, content, message):
+    path = tree / "scans" / "scene0010_00" / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    data = ScanNet(tree)
+    with pytest.raises(FormatError) as caught:
+        _ = data[1]
+    assert re.match(rf"{re.escape(str(path))}: {message}", str(caught.value))
+    assert "\n" not in str(caught.value)
+    assert data[0]["instance"].tolist() == [1, 1, 0, 0, -1, -1, 2, 2]
+
+
+@pytest.mark.parametrize("label", [2**31 - 1, 65_536, -3])
+def test_a_label_above_any_table_is_refused_and_takes_no_memory(tree, scans, label):
+    path = tree / "scans" / "scene0010_00" / "scene0010_00_vh_clean_2.labels.ply"
+    labels = np.array([2, 2, 5, 5, 0, label, 35, 35], np.int32)
+    write_cloud(path, Cloud(scans[0], {"labels": labels}))
+    with pytest.raises(
+        FormatError, match=rf"vertex 5: expected a label from 0 to 65,535, got {label}"
+    ):
+        read_scannet_scan(path.with_name("scene0010_00_vh_clean_2.ply"), tree)
+
+
+def test_classes_are_places_in_their_list():
+    numbers = np.array([0, 1, 12, 13, 14, 39, 40, 65_535])
+    expected = [NYU_IDS.index(number) if number in NYU_IDS else -1 for number in numbers]
+    assert _places(numbers, NYU_IDS).tolist() == expected
+    assert _places(np.array(IDS_200), IDS_200).tolist() == [*range(len(IDS_200))]
+
+
+def test_object_numbers_of_scannetpp_fit_their_arrays(scans, tmp_path):
+    write_scan_plus(tmp_path, "0a5c013435", *scans, SEGMENTS, [("chair", [7])])
+    path = tmp_path / "data" / "0a5c013435" / "scans" / "segments_anno.json"
+    path.write_text(path.read_text().replace('"objectId": 1', '"objectId": 40000'))
+    with pytest.raises(FormatError, match=r"anno\.json: object 0: .* from 0 to 32,767 as objectId"):
+        _ = ScanNet(tmp_path)[0]
