@@ -1,6 +1,7 @@
 """Whatever happens to a file, reading it gives a cloud or one line that names it."""
 
 import random
+import re
 import struct
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
+from torchrg.structures import Cloud
 
 WORDS = [
     b"0",
@@ -126,3 +128,85 @@ def test_every_file_cut_short_is_refused(tmp_path, make_cloud, suffix):
         path.write_bytes(whole[:end])
         with pytest.raises(FormatError, match=rf"cut\{suffix}: "):
             read_cloud(path)
+
+
+def seal(content):
+    """Cut the content of an E57 file into pages, each with its checksum."""
+    crc32c = pytest.importorskip("google_crc32c")
+    pages = [content[i : i + 1020].ljust(1020, b"\0") for i in range(0, len(content), 1020)]
+    return b"".join(page + crc32c.value(page).to_bytes(4, "big") for page in pages)
+
+
+@pytest.fixture(scope="module")
+def e57(tmp_path_factory):
+    """What an E57 file holds before its XML, and the XML."""
+    pytest.importorskip("pye57")
+    path = tmp_path_factory.mktemp("e57") / "whole.e57"
+    random = np.random.default_rng(0)
+    colors = random.integers(0, 256, (30, 3)).astype(np.uint8)
+    write_cloud(path, Cloud(random.random((30, 3)), {"color": colors}))
+    whole = path.read_bytes()
+    content = b"".join(whole[i : i + 1020] for i in range(0, len(whole), 1024))
+    place, length = struct.unpack_from("<QQ", whole, 24)
+    start = place // 1024 * 1020 + place % 1024
+    return content[:start], content[start : start + length]
+
+
+def write_e57_parts(path, before, xml):
+    """Write parts with the lengths and checksums that they have."""
+    content = bytearray(before + xml)
+    struct.pack_into("<Q", content, 16, -(-len(content) // 1020) * 1024)
+    struct.pack_into("<Q", content, 32, len(xml))
+    path.write_bytes(seal(bytes(content)))
+
+
+def test_parts_of_an_e57_file_put_together_read_as_before(tmp_path, e57):
+    write_e57_parts(tmp_path / "again.e57", *e57)
+    expected = np.random.default_rng(0)
+    expected.integers(0, 256, (30, 3))
+    assert np.array_equal(read_cloud(tmp_path / "again.e57").coordinates, expected.random((30, 3)))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_xml_under_valid_checksums_gives_a_cloud_or_a_format_error(tmp_path, e57):
+    before, whole = e57
+    rng = random.Random("xml")
+    path, refused = tmp_path / "damaged.e57", 0
+    for _ in range(80):
+        xml = whole
+        for _ in range(rng.choice([1, 1, 3])):
+            kind = rng.choice(
+                [rb"-?\d+(\.\d+)?(e[+-]\d+)?", rb"</?\w+[^>]*>", rb'"\w+"', rb"<(/?)"]
+            )
+            place = rng.choice(list(re.finditer(kind, xml)))
+            new = rng.choice([*WORDS, place[0] * 2, b'"String"', b"4000000000", b"&x;", b"\xff"])
+            xml = xml[: place.start()] + new + xml[place.end() :]
+        write_e57_parts(path, before, xml)
+        try:
+            assert len(read_cloud(path)) > 0
+        except FormatError as error:
+            refused += 1
+            message = str(error)
+            assert message.startswith(f"{path}: ")
+            assert "\n" not in message
+            assert "checksum" not in message
+    assert 20 < refused < 80
+
+
+@pytest.mark.parametrize("offset", [2**31, 2**32])
+def test_points_far_into_a_file_are_read_from_their_place(tmp_path, offset):
+    path = tmp_path / "sparse.ply"
+    points = np.arange(12, dtype="<f4").reshape(4, 3)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement other {offset // 8}\nproperty double t\n"
+        "element vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    with path.open("wb") as stream:
+        stream.write(header.encode())
+        stream.seek(offset, 1)
+        stream.write(points.tobytes())
+    assert np.array_equal(read_cloud(path).coordinates, points)
+    with path.open("r+b") as stream:
+        stream.truncate(path.stat().st_size - 1)
+    with pytest.raises(FormatError, match=f"byte {len(header) + offset}: expected 48 bytes"):
+        read_cloud(path)

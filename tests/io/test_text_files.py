@@ -1,5 +1,7 @@
 """Points as text of other programs, whole and broken."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -231,3 +233,25 @@ def test_written_text_says_what_its_columns_are(tmp_path):
 def test_broken_text_names_the_line(tmp_path, text, message):
     with pytest.raises(FormatError, match=rf"a\.txt: {message}"):
         read_cloud(save(tmp_path / "a.txt", text))
+
+
+@pytest.mark.parametrize("number", [2**53, 2**53 + 1, -(2**53) - 1, 2**63 - 1])
+@pytest.mark.parametrize("name", ["labels", "id"])
+@pytest.mark.parametrize("suffix", [".xyz", ".txt", ".ply"])
+def test_whole_numbers_that_float64_rounds_are_not_written(tmp_path, number, name, suffix):
+    path = tmp_path / f"cloud{suffix}"
+    cloud = Cloud(np.eye(3), {name: np.array([0, number, -1])})
+    with pytest.raises(FormatError, match=rf"{suffix}: expected field \w+ within 2\^53, got"):
+        write_cloud(path, cloud)
+    assert not list(tmp_path.iterdir())
+    largest = replace(cloud, fields={name: np.array([0, 2**53 - 1, 1 - 2**53])})
+    write_cloud(path, largest)
+    assert read_cloud(path).fields[name].tolist() == [0, 2**53 - 1, 1 - 2**53]
+
+
+@pytest.mark.parametrize("number", [2**53 + 1, -(2**53) - 1, 10**17])
+def test_labels_that_float64_rounds_are_not_read(tmp_path, number):
+    path = tmp_path / "cloud.txt"
+    path.write_text(f"x y z label\n0 0 0 {number}\n")
+    with pytest.raises(FormatError, match=r"cloud\.txt: expected labels within 2\^53"):
+        read_cloud(path)

@@ -84,8 +84,9 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
     cloud = read_cloud(source, columns=names.of(source))
     console.note_input(f"{source}", cloud, target, RESULTS)
-    for note in check_finite(cloud):
-        console.warn(f"{source}: {note}.")
+    check_finite(cloud)
+    if cloud.precision_note:
+        console.warn(f"{source}: {cloud.precision_note}.")
     check_output(target, cloud)
     settings, size = arguments.normals, arguments.chunk_size
     with console.stage_bar(source.name, ("normals", "orientation")) as advance:

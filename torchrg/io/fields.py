@@ -467,7 +467,7 @@ def _labels(path: Path, labels: NDArray[Any]) -> NDArray[np.int64]:
     if flat.dtype.kind == "f":
         flat = np.where(np.isnan(flat), flat.dtype.type(UNLABELED), flat)
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
-    if not are_whole(flat) or (flat.dtype.kind == "u" and largest >= 2.0**63):
+    if not are_whole(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
             f"{path}: expected labels to be whole numbers of 64 bits; rename or remove that field."
         )
