@@ -6,7 +6,6 @@ and a test.
 
 import dataclasses
 import json
-import struct
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,7 +36,7 @@ from torchrg.datasets.layouts import LayoutScan, check_layout, stem_of, write_la
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.pointcept import GIVEN_ARRAYS
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd_files import read_depth
+from torchrg.datasets.rgbd_files import num_pixels, read_depth
 from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import make_intrinsics, points_of_image
@@ -49,8 +48,6 @@ from torchrg.structures import Cloud, Segmentation
 
 _COPIED = tuple(name for name in GIVEN_ARRAYS if name != "normal")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
-_PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
-"""Width and height in the header of a PNG, and the byte at which they begin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -462,24 +459,6 @@ class RGBDSource:
         num_points, num_planes = depth.numel(), len(found.planes.count)
         notes = () if num_planes else ("no plane found",)
         return Converted(num_points, num_planes, tuple(files), warnings=notes)
-
-
-def num_pixels(path: Path) -> int:
-    """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage.
-
-    It is 0, too, of a file that is not there, which reading tells.
-    """
-    try:
-        if path.suffix.lower() != ".png":
-            return path.stat().st_size // 2
-        with path.open("rb") as stream:
-            head = stream.read(_PNG_SIZE_AT + _PNG_SIZE.size)
-    except (OSError, ValueError):
-        return 0
-    if len(head) < _PNG_SIZE_AT + _PNG_SIZE.size:
-        return 0
-    width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
-    return int(width * height)
 
 
 def _plain(frame: RGBDFrame) -> dict[str, Any]:

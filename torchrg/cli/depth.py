@@ -16,12 +16,12 @@ from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.records import describe_run, write_record
 from torchrg.batch.run import make_plan
 from torchrg.batch.scans import Job, Scan
-from torchrg.batch.sources import RGBDSource, num_pixels
+from torchrg.batch.sources import RGBDSource
 from torchrg.batch.task import Converted, TaskReport, report_on
 from torchrg.cli import console
 from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.datasets.folder import listed
-from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, read_depth
+from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
 from torchrg.depth import (
     DepthConfig,
     find_intrinsics,

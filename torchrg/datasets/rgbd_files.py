@@ -2,6 +2,7 @@
 
 import math
 import os
+import struct
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +19,11 @@ from torchrg.structures import FARTHEST
 
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
+_PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
+"""Width and height in the header of a PNG, and the byte at which they begin."""
+_MOST_PIXELS = 1 << 26
+"""Pixels of the largest image that is read, 8192 x 8192. No depth camera has as many, and what is
+made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
 _MOST_SECONDS = 0.02
 """Most seconds between an image and a pose that belong together."""
 
@@ -87,9 +93,32 @@ def _read_image(source: Path, kinds: str) -> NDArray[Any]:
     from kornia_rs import io
 
     check_file(source)
+    if source.suffix.lower() == ".png" and (given := num_pixels(source)) > _MOST_PIXELS:
+        raise FormatError(
+            f"{source}: expected an image of at most {_MOST_PIXELS:,} pixels, got {given:,} in its "
+            "header; the file is damaged, fetch it again, or make it smaller."
+        )
     with refusing(f"{source}: expected a {kinds} image, got: ", Exception):
         # Without a mode, the library says how many bits and channels there are.
         return np.asarray(io.read_image(str(source)))
+
+
+def num_pixels(path: Path) -> int:
+    """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage.
+
+    It is 0, too, of a file that is not there, which reading tells.
+    """
+    try:
+        if path.suffix.lower() != ".png":
+            return path.stat().st_size // 2
+        with path.open("rb") as stream:
+            head = stream.read(_PNG_SIZE_AT + _PNG_SIZE.size)
+    except (OSError, ValueError):
+        return 0
+    if len(head) < _PNG_SIZE_AT + _PNG_SIZE.size:
+        return 0
+    width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
+    return int(width * height)
 
 
 def _read_npy(source: Path) -> NDArray[np.number]:

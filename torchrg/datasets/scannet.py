@@ -188,7 +188,10 @@ def read_objects(mesh: Path, count: int) -> list[tuple[dict[str, Any], NDArray[n
         FormatError: If a file is damaged, or is of another number of vertices.
     """
     files = _files_of(mesh)
-    return list(_groups(files, count)) if {"segments", "groups"} <= files.keys() else None
+    if not {"segments", "groups"} <= files.keys():
+        return None
+    found = _groups(files, count, "id", np.iinfo(np.int32).max)
+    return [({"id": n, "objectId": n, "label": label}, rows) for label, n, rows in found]
 
 
 def _meshes(root: Path) -> Iterator[Path]:

@@ -5,6 +5,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import struct
 import tokenize
 from collections.abc import Iterator
@@ -196,17 +197,19 @@ def check_space(folder: Path, needed: int, what: str, *, repair: str = "") -> No
 
 def check_file(path: Path) -> int:
     """Return the size of a file in bytes; it is there, no directory, and not empty."""
-    if path.is_dir():
-        raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
     try:
-        size = path.stat().st_size
+        status = path.stat()
     except FileNotFoundError as error:
         raise FormatError(f"{path}: no such file; check the spelling.") from error
     except (OSError, ValueError) as error:  # A name that no file can have.
-        raise FormatError(f"{path}: cannot be read: {first_line(error)}.") from error
-    if size == 0:
+        raise FormatError(
+            f"{path}: cannot be read: {getattr(error, 'strerror', error)}."
+        ) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
+    if status.st_size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; fetch or write it again.")
-    return size
+    return status.st_size
 
 
 def read_text(path: Path) -> str:

@@ -271,11 +271,16 @@ def stream_table(path: Path, table: Table, chunk_size: int) -> CloudStream:
 
 @contextmanager
 def reporting_unreadable(path: Path) -> Iterator[None]:
-    """Raise errors of the operating system as a FormatError that names the file."""
+    """Raise errors of the operating system, and of memory, as a FormatError that names the file."""
     try:
         yield
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from error
+    except MemoryError as error:
+        raise FormatError(
+            f"{path}: its points do not fit into memory; use a machine with more, or cut the cloud "
+            "into parts."
+        ) from error
 
 
 def join_columns(chunks: Sequence[Columns]) -> Columns:
