@@ -1,12 +1,17 @@
 """Depth frames from the folders of public data sets."""
 
 import math
+import struct
+import zlib
 
 import kornia_rs
 import numpy as np
 import pytest
 import torch
 
+from torchrg.batch.scans import Job, convert_scan
+from torchrg.batch.sources import RGBDSource
+from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_color, read_depth, read_trajectory
 from torchrg.errors import ConfigError, FormatError, ShapeError
@@ -259,3 +264,70 @@ def test_wrong_frames_are_refused(tmp_path):
         RGBDFrame(path, torch.eye(3), 0.0)
     with pytest.raises(ConfigError, match="expected frames of different names, got 'a' twice"):
         RGBDFrames([RGBDFrame(path, torch.eye(3), 1.0, "a")] * 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("depth.txt", b"nan depth/1.0.png\n", "expected finite times, got nan"),
+        ("groundtruth.txt", b"inf 0 0 0 0 0 0 1\n", "expected finite times, got inf"),
+        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected text in UTF-8, got b'\\xe9'"),
+        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected text in UTF-8, got b'\\x00'"),
+    ],
+)
+def test_lists_that_are_none_are_refused_by_file_and_place(tum, name, content, message):
+    (tum / name).write_bytes(content)
+    with pytest.raises(FormatError, match=f"{name}: {message}"):
+        RGBDFrames.from_folder(tum, "tum")
+
+
+@pytest.mark.parametrize("value", ["1e300", "nan", "-1e13"])
+def test_poses_that_lead_nowhere_are_none(tum, tmp_path, value):
+    (tum / "groundtruth.txt").write_text(f"1.01 0.5 {value} 2 {QUARTER}\n")
+    assert RGBDFrames.from_folder(tum, "tum").frames[0].pose is None
+    root = tmp_path / "scans" / "scene0000_00"
+    write_depth(root / "depth" / "0.png", 1500)
+    write_text(root / "pose" / "0.txt", POSE_ROWS.replace("0.5", value))
+    write_text(root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n" * 2)
+    assert RGBDFrames.from_folder(root, "scannet").frames[0].pose is None
+
+
+@pytest.mark.parametrize("focal", ["0", "-577", "nan", "1e300"])
+def test_a_camera_matrix_of_none_is_refused_with_its_file(tmp_path, focal):
+    root = tmp_path / "scene0000_00"
+    write_depth(root / "depth" / "0.png", 1500)
+    path = root / "intrinsic" / "intrinsic_depth.txt"
+    write_text(path, f"{focal} 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n")
+    with pytest.raises(FormatError, match=r"_depth\.txt: expected a camera matrix of focal"):
+        RGBDFrames.from_folder(tmp_path, "scannet")
+
+
+def test_a_frame_that_is_missing_fails_alone(tum, tmp_path):
+    (tum / "depth" / "1.0.png").unlink()
+    long = "x" * 300
+    (tum / "depth.txt").write_text(f"1.0 depth/1.0.png\n2.0 depth/2.0.png\n3.0 {long}.png\n")
+    source = RGBDSource(tum, DepthConfig(noise=(0.001, 0.0)), "tum")
+    reports = [convert_scan(Job(source, scan, tmp_path / "out")) for scan in source.list_scans()]
+    assert [report.status for report in reports] == ["failed", "converted", "failed"]
+    assert reports[0].reason.startswith(f"{tum / 'depth' / '1.0.png'}: ")
+    assert reports[2].reason.startswith(f"{tum / long}.png: ")
+    assert [report.details for report in reports] == [""] * 3
+
+
+def test_a_png_that_says_it_is_huge_is_refused_before_it_is_unpacked(tmp_path):
+    path = tmp_path / "depth.png"
+    write_depth(path, 1500)
+    header = bytearray(path.read_bytes())
+    header[16:24] = struct.pack(">II", 30_000, 30_000)
+    header[29:33] = struct.pack(">I", zlib.crc32(bytes(header[12:29])))
+    path.write_bytes(bytes(header))
+    with pytest.raises(FormatError, match=r"depth\.png: expected an image of at most .* got 900,"):
+        read_depth(path, depth_scale=1000)
+
+
+def test_a_header_of_an_array_with_an_open_bracket_is_refused(tmp_path):
+    path = tmp_path / "depth.npy"
+    np.save(path, np.ones((4, 6)))
+    path.write_bytes(path.read_bytes().replace(b"(4, 6), }", b"(4, 6,(, "))
+    with pytest.raises(FormatError, match=r"depth\.npy: expected an array of numbers, got: "):
+        read_depth(path, depth_scale=1)
