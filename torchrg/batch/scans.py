@@ -156,10 +156,13 @@ def convert_scan(job: Job) -> TaskReport:
     The record of an earlier run is removed first, and the new one written last: whoever finds a
     record finds complete files.
     """
+    is_new = False
 
     def convert(begin: Callable[[str], None]) -> Converted:
+        nonlocal is_new
         begin("hash")
         description = job.describe()
+        is_new = not job.folder.exists()
         job.folder.mkdir(parents=True, exist_ok=True)
         for folder in (job.folder, *job.folder.parents):
             sync_folder(folder.parent)
@@ -179,7 +182,6 @@ def convert_scan(job: Job) -> TaskReport:
             write_record(job, description, converted)
         return converted
 
-    is_new = not job.folder.exists()
     report = report_on(job.name, convert)
     if report.status == "failed" and is_new:
         with contextlib.suppress(OSError):
