@@ -90,6 +90,8 @@ def test_an_angle_beyond_a_right_one_is_refused():
         ("angle_deg: 91", r"expected angle_deg in \[0, 90\], got 91"),
         ("angles: 5", "unknown key 'angles'; PipelineConfig has .*, angle_deg"),
         ("growing: [", "expected YAML"),
+        pytest.param("[" * 900, "expected YAML, got maximum recursion", id="brackets"),
+        pytest.param("chunk_size: " + "9" * 5000, "expected YAML, got Exceeds", id="digits"),
         ("- 1", "expected a mapping"),
     ],
 )

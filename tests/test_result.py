@@ -312,11 +312,14 @@ def test_a_table_that_is_not_of_the_labels_is_left_out(tmp_path, cloud, seg, cha
     assert result.planes.count.tolist() == counts.tolist()
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"planes": 5}', '{"planes": [{"id": 0}]}'])
+@pytest.mark.parametrize(
+    "content",
+    ["{", "[]", '{"planes": 5}', '{"planes": [{"id": 0}]}', pytest.param("[" * 200_000, id="deep")],
+)
 def test_a_table_of_others_in_a_folder_is_left_out(tmp_path, cloud, seg, content):
     write_pointcept_scene(tmp_path, {"coord": cloud.coordinates}, seg)
     (tmp_path / "planes.json").write_text(content)
-    (tmp_path / "provenance.json").write_bytes(b"\xff[]")
+    (tmp_path / "provenance.json").write_bytes(b"\xff[]" if len(content) < 99 else b"[" * 200_000)
     result = torchrg.read_result(tmp_path)
     assert result.provenance == {}
     assert result.table is None
@@ -378,3 +381,12 @@ def test_a_sample_is_of_the_same_points_in_any_order(cloud, seg):
     assert 500 <= len(found[0]) <= 506
     with pytest.raises(ShapeError, match="expected a segmentation with points, got none"):
         Result.of_sample(CloudStream.of(far), seg._replace(points=None), 500)
+
+
+def test_superpoints_of_numbers_beyond_that_of_points_are_numbered_anew(tmp_path, cloud, parts):
+    numbers = parts.labels.numpy()
+    far = numbers * 100_000_000_000 + 2**31
+    torchrg.write_cloud(tmp_path / "a.npz", replace(cloud, fields={"superpoints": far}))
+    found = torchrg.read_result(tmp_path / "a.npz").superpoints
+    assert found.labels.tolist() == numbers.tolist()
+    assert len(found.plane) == numbers.max() + 1

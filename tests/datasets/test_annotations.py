@@ -159,6 +159,22 @@ def test_any_changed_byte_reads_by_the_rules_or_is_refused(file):
     assert 100 < refused < 300
 
 
+@pytest.mark.parametrize("column", range(6))
+def test_any_byte_in_any_column_reads_by_the_rules_or_is_refused(file, column):
+    lines = text_of(rows_of(6, 3)).split(b"\n")
+    for byte in range(256):
+        words = lines[1].split(b" ")
+        words[column] = words[column][:1] + bytes([byte]) + words[column][2:]
+        content = b"\n".join([lines[0], b" ".join(words), *lines[2:]])
+        file.write_bytes(content)
+        expected = read_by_rules(content)
+        if expected is None:
+            with pytest.raises(FormatError, match=r"line \d: expected"):
+                read_annotation(file)
+        else:
+            check_reads(file, np.column_stack([expected[:, :3], np.rint(expected[:, 3:])]))
+
+
 def test_long_lines_are_shown_in_part(file):
     file.write_bytes(b"1 " * 10_000)
     with pytest.raises(FormatError, match=r"got b'1 1.*\.\.\.'; repair"):

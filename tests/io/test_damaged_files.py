@@ -3,6 +3,7 @@
 import random
 import re
 import struct
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -210,3 +211,10 @@ def test_points_far_into_a_file_are_read_from_their_place(tmp_path, offset):
         stream.truncate(path.stat().st_size - 1)
     with pytest.raises(FormatError, match=f"byte {len(header) + offset}: expected 48 bytes"):
         read_cloud(path)
+
+
+def test_a_cloud_beyond_memory_is_refused_by_its_name(tmp_path, make_cloud, monkeypatch):
+    write_cloud(tmp_path / "large.npy", make_cloud(5))
+    monkeypatch.setattr("torchrg.io.stream.join_columns", Mock(side_effect=MemoryError))
+    with pytest.raises(FormatError, match=r"large\.npy: its points do not fit into memory"):
+        read_cloud(tmp_path / "large.npy")
