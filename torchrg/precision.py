@@ -55,7 +55,7 @@ def note_on_steps(
         >>> note_on_steps(points)
         ''
         >>> note_on_steps(points + np.float32(5_400_000))  # doctest: +ELLIPSIS
-        'coordinates have steps of 0.5 for a spacing of about 0.02; write float64, or subtract ...'
+        'coordinates have steps of 0.5 for a spacing of about 0.03; write float64, or subtract ...'
     """
     is_single = points.dtype == np.float32
     if not is_single and scale == 0:
