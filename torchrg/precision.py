@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchrg.errors import PrecisionWarning
 
-_COARSE = 0.1
-"""Step of the coordinates, in spacings of the points, from which on people are told."""
+_COARSE, _COARSE_GRID = 0.1, 0.5
+"""Step of the coordinates, in spacings of the points, from which on people are told: of single
+precision, which nobody has chosen, and of a grid that a file has been written with."""
 _SURELY_FINE = 1e-3
 """Step, in spacings of an even surface, up to which nothing is searched. Half of the points of a
 cloud would have to lie a hundred times as close as on an even surface for it to be too coarse."""
@@ -39,7 +40,7 @@ def note_on_steps(
     scale: float = 0.0,
     cure: str = "write float64, or subtract an offset before saving",
 ) -> str:
-    """Return a line for people where the steps of coordinates are more than a tenth of the spacing.
+    """Return a line for people where the steps of coordinates are coarse for the spacing.
 
     It is empty where they are not, and where that cannot be told: of fewer than three points, and
     where half of them are in one place. It does not depend on the order of the points.
@@ -67,14 +68,16 @@ def note_on_steps(
     with np.errstate(over="ignore", invalid="ignore"):
         low, high = np.quantile(known, _QUARTILES, axis=0)
         width, reach = float((high - low).max()), np.float32(np.abs([low, high]).max())
-        step = max(float(np.spacing(reach)) if is_single else 0.0, scale)
+        single = float(np.spacing(reach)) if is_single else 0.0
+    step = max(single, scale)
     even = width / math.sqrt(len(known))
     if not 0 < width < math.inf or step <= _SURELY_FINE * even:
         return ""
     spacing = _spacing(known, _CELL * even) if step < even else even
-    if step <= _COARSE * spacing:
+    is_grid = scale > _COARSE_GRID * spacing
+    if not is_grid and single <= _COARSE * spacing:
         return ""
-    cure = "write it with a finer scale" if step == scale else cure
+    step, cure = (scale, "write it with a finer scale") if is_grid else (single, cure)
     return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {cure}"
 
 
