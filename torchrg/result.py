@@ -163,7 +163,8 @@ class Result:
             own = own - span.start
             fields = {name: each[own] for name, each in chunk.fields.items() if name in _KINDS}
             coordinates = chunk.coordinates[own]
-            return replace(chunk, coordinates=coordinates, fields=put_results(fields, found))
+            fields = put_results(fields, found)
+            return replace(chunk, coordinates=coordinates, fields=fields, front=None)
 
         cloud = replace(stream, grid_shape=None).each(take).read()
         return cls(cloud, segmentation.planes, whole=stream.extent)

@@ -42,9 +42,13 @@ class Cloud:
             (the header of a LAS file), ``scans`` and ``coordinate_metadata`` of an E57 file.
         notes: What reading took for granted or left out, a line each without a full stop, for
             people.
+        front: Direction from each point to where its surface was seen from, of any length, zero
+            where unknown, shape ``(N, 3)``, float32; None where the file does not say. By the faces
+            of a mesh, or by where the scanners stood. It is not written with the cloud;
+            :func:`torchrg.normals.orient_cloud` turns normals by it.
 
     Raises:
-        ShapeError: If ``coordinates`` is no NumPy array.
+        ShapeError: If ``coordinates`` is no NumPy array, or ``front`` has another shape.
 
     Warns:
         PrecisionWarning: Where :attr:`points` is taken and :attr:`precision_note` is not empty.
@@ -61,6 +65,7 @@ class Cloud:
     source: str = ""
     header: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    front: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         given: object = self.coordinates
@@ -69,6 +74,10 @@ class Cloud:
             raise ShapeError(
                 "Cloud: expected coordinates to be a NumPy array, got "
                 f"{type(given).__name__}; {repair}."
+            )
+        if self.front is not None and self.front.shape != (len(self), 3):
+            raise ShapeError(
+                f"Cloud: expected front of shape {(len(self), 3)}, got {self.front.shape}."
             )
 
     def __len__(self) -> int:

@@ -43,6 +43,7 @@ from torchrg.depth.camera import make_intrinsics, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.io.npy import map_folder
+from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.structures import Cloud, Segmentation
 
@@ -59,12 +60,14 @@ class CloudSource:
         layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
         partition: How superpoints are made.
         level: Which of their levels is written.
+        orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
     """
 
     superpoint: bool = False
     layout: str = "pointcept"
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
     level: int = 0
+    orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 104
     """What the largest of the layouts takes."""
     dataset: ClassVar[str] = "ScanNet"
@@ -73,6 +76,8 @@ class CloudSource:
     def described(self, **options: Any) -> dict[str, Any]:  # noqa: ANN401
         """Return these settings, as far as they are not the usual ones, after others."""
         described = {**options, "superpoint": self.superpoint}
+        if self.orient != "none":
+            described["orient"] = self.orient
         if self.layout != "pointcept":
             described |= {"layout": self.layout, "version": layouts.VERSION}
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
@@ -103,7 +108,21 @@ class CloudSource:
         """Write what the layout has for the data set as a whole, from all scans in ``out``."""
         write_lists(self.layout, self.dataset, out, mark)
 
-    def part(
+    def segment(
+        self,
+        cloud: Cloud,
+        settings: PipelineConfig,
+        colors: Tensor | NDArray[np.generic] | None,
+        begin: Callable[[str], None],
+    ) -> tuple[Segmentation, NDArray[np.int32] | None]:
+        """Return the planes of a cloud, its normals turned, and its superpoints if wanted."""
+        check_viewpoint(cloud, self.orient, "use --orient interior")
+        seg = segment_planes(cloud.points, settings, on_stage=begin)
+        parts = self._part(cloud, seg, colors, begin)
+        begin("orientation")
+        return seg._replace(normals=orient_cloud(cloud, seg.normals, self.orient)), parts
+
+    def _part(
         self,
         cloud: Cloud,
         seg: Segmentation,
@@ -236,9 +255,8 @@ class FolderSource(CloudSource):
             colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
             cloud = Cloud(sample["coord"].numpy(), colors, source=str(first.parent))
         warnings = (*cloud.notes, *check_finite(cloud), *self.notes(cloud))
-        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
         color = cloud.fields.get("color")
-        parts = self.part(cloud, seg, color, begin)
+        seg, parts = self.segment(cloud, self.settings, color, begin)
         begin("write")
         if is_file:
             others = [name for name in cloud.fields if name != "color"]
@@ -312,8 +330,7 @@ class S3DISSource(CloudSource):
             *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
             *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
         ]
-        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
-        parts = self.part(cloud, seg, room.color, begin)
+        seg, parts = self.segment(cloud, self.settings, room.color, begin)
         begin("write")
         arrays = {name: getattr(room, name) for name in ("coord", "color", "segment", "instance")}
         files = self.write(scan, folder, cloud, arrays, seg, parts)
@@ -361,15 +378,14 @@ class ScanNetSource(CloudSource):
         begin("read")
         mesh = scan.inputs[0]
         given = read_scannet_scan(mesh, self.root)
-        cloud = Cloud(given["coord"], source=str(mesh))
+        cloud = Cloud(given["coord"], source=str(mesh), front=given.pop("front", None))
         dataset, objects = _dataset_of_mesh(mesh), None
         if self.layout == "scannet" and dataset == "ScanNet":
             objects = read_objects(mesh, len(cloud))
         notes = (*check_finite(cloud), *self.notes(cloud))
         if "instance" not in given and not scan.name.startswith("test/"):
             notes += ("no labels: annotations or the table of their words are missing",)
-        seg = segment_planes(cloud.points, self.settings, on_stage=begin)
-        parts = self.part(cloud, seg, given.get("color"), begin)
+        seg, parts = self.segment(cloud, self.settings, given.get("color"), begin)
         begin("write")
         more = {"dataset": dataset, "objects": objects}
         files = self.write(scan, folder, cloud, given, seg, parts, **more)
@@ -409,6 +425,8 @@ class RGBDSource:
         intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
         depth_scale: Stored value of one metre. Default: the layout's.
         compile: Whether to run kernels compiled.
+        orient: To which side normals point: to the camera, unless it says ``"interior"`` or
+            ``"up"``.
     """
 
     root: Path
@@ -417,6 +435,7 @@ class RGBDSource:
     intrinsics: tuple[float, float, float, float] | None = None
     depth_scale: float | None = None
     compile: bool = False
+    orient: CloudOrientation = "auto"
     in_place: ClassVar[bool] = False
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
@@ -428,7 +447,21 @@ class RGBDSource:
             "intrinsics": self.intrinsics,
             "depth_scale": self.depth_scale,
             **({"compile": True} if self.compile else {}),
+            **({"orient": self.orient} if self.turns else {}),
         }
+
+    @property
+    def turns(self) -> bool:
+        """Whether normals shall point elsewhere than to the camera."""
+        return self.orient in ("interior", "up")
+
+    def turned(self, seg: Segmentation, points: Tensor) -> Segmentation:
+        """Return a segmentation of an image, of these points ``(H, W, 3)``, with turned normals."""
+        if not self.turns:
+            return seg
+        cloud = Cloud(points.reshape(-1, 3).numpy())
+        normals = orient_cloud(cloud, seg.normals.view(-1, 3), self.orient)
+        return seg._replace(normals=normals.view_as(seg.normals))
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
@@ -453,6 +486,7 @@ class RGBDSource:
             depth, frame.intrinsics, self.settings, pose=frame.pose, compile=self.compile
         )
         points = points_of_image(depth, frame.intrinsics, frame.pose)
+        found = self.turned(found, points)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = write_results(folder, coord, found)

@@ -191,6 +191,27 @@ CompileFlag = Annotated[
 """Type of the argument --compile."""
 
 
+OrientFlag = Annotated[
+    Literal["auto", "interior", "viewpoint", "up", "none"],
+    tyro.conf.arg(
+        help="To which side normals point: to the front of the faces where the file is a mesh, "
+        "else to the scanner where it names its places, as E57 does, else into the free space of "
+        "rooms (auto); always into rooms (interior), to the scanner (viewpoint) or along +z (up); "
+        "or to that side where the first of z, y, x that is not zero is positive (none).",
+    ),
+]
+"""Type of the argument --orient of clouds."""
+ImageOrientFlag = Annotated[
+    Literal["auto", "interior", "viewpoint", "up", "none"],
+    tyro.conf.arg(
+        help="To which side normals point: to the camera (auto, viewpoint, none), into the free "
+        "space of rooms (interior), or along +z (up), which is the optical axis where no pose of "
+        "the camera is known.",
+    ),
+]
+"""Type of the argument --orient of depth images."""
+
+
 Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "npy"]
 """Type of the argument --layout."""
 

@@ -95,6 +95,7 @@ class CloudArguments(Arguments):
     superpoint: bool = False
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
     in each level: --superpoint 1000,300."""
+    orient: console.OrientFlag = "auto"
     level: int = 0
     """Level of the superpoints that is written; 0 is the finest."""
     layout: console.Layout = "pointcept"
@@ -112,7 +113,7 @@ class CloudArguments(Arguments):
     @property
     def output(self) -> dict[str, Any]:
         """What is written of each cloud, as sources take it."""
-        names = ("superpoint", "layout", "partition", "level")
+        names = ("superpoint", "layout", "partition", "level", "orient")
         return {name: getattr(self, name) for name in names}
 
     def prepared(self) -> Self:
@@ -214,6 +215,7 @@ class RGBDArguments(Arguments):
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
+    orient: console.ImageOrientFlag = "auto"
     compile: console.CompileFlag = False
     unit: ClassVar[str] = "frame"
 
@@ -224,7 +226,10 @@ class RGBDArguments(Arguments):
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
         intrinsics = None if self.intrinsics is None else console.parse_intrinsics(self.intrinsics)
-        return RGBDSource(root, self.depth, self.layout, intrinsics, self.depth_scale, self.compile)
+        return RGBDSource(
+            *(root, self.depth, self.layout, intrinsics, self.depth_scale, self.compile),
+            orient=self.orient,
+        )
 
 
 KINDS: dict[str, type[Arguments]] = {
@@ -295,6 +300,11 @@ def _check(arguments: Arguments) -> None:
         check_library()
     if isinstance(arguments, CloudArguments):
         console.check_level(arguments.level, arguments.partition)
+        if arguments.orient == "viewpoint" and not isinstance(arguments, FolderArguments):
+            raise ConfigError(
+                "expected --orient auto, interior, up or none, as this data set names no places of "
+                "scanners, got viewpoint; use auto."
+            )
         has_superpoints = arguments.superpoint or arguments.layout != "pointcept"
         usual = (SuperpointsConfig(), 0)
         if not has_superpoints and (arguments.partition, arguments.level) != usual:

@@ -76,6 +76,7 @@ class Arguments:
     labels that are written as .png, with _planes in its name."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
+    orient: console.ImageOrientFlag = "auto"
     compile: console.CompileFlag = False
     workers: int | None = None
     """Number of processes of one thread each that label frames side by side. Default: one for each
@@ -137,6 +138,7 @@ class FrameJob(Job):
         pose[:3, 3] = -torch.from_numpy(cloud.origin)
         source = self.source
         seg = segment_depth(depth, intrinsics, source.settings, pose=pose, compile=source.compile)
+        seg = source.turned(seg, cloud.points.view(*depth.shape, 3))
         notes, num_planes = [*cloud.notes], len(seg.planes.count)
         if not is_labels and target.suffix.lower() != ".npz":
             notes += notes_on_results(cloud.fields, RESULT_FIELDS)
@@ -210,7 +212,10 @@ def _list_jobs(sources: tuple[Path, ...], arguments: Arguments) -> list[FrameJob
     if image is not None and None in (camera, arguments.depth_scale):
         flag = "--intrinsics fx,fy,cx,cy" if camera is None else "--depth-scale"
         raise ConfigError(f"{image}: expected {flag}, which depth images do not hold; pass it.")
-    source = RGBDSource(sources[0].parent, arguments.depth, "images", camera, arguments.depth_scale)
+    source = RGBDSource(
+        *(sources[0].parent, arguments.depth, "images", camera, arguments.depth_scale),
+        orient=arguments.orient,
+    )
     targets = console.output_paths(sources, arguments.out, suffix=".png")
     pictures = [
         picture or (target.with_name(f"{target.stem}_planes.png") if _is_png(target) else None)
@@ -292,6 +297,7 @@ def _write_cloud(job: FrameJob, cloud: Cloud, seg: Segmentation) -> None:
         "intrinsics": camera,
         "depth_scale": source.depth_scale,
         "compile": source.compile,
+        "orient": source.orient,
     }
     images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
     rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})

@@ -4,7 +4,6 @@ import dataclasses
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -18,8 +17,8 @@ from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_con
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import put_results
-from torchrg.normals import estimate_normals, orient_normals
-from torchrg.normals.orient import Orientation
+from torchrg.normals import estimate_normals
+from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
 """What is written of each point."""
@@ -33,7 +32,8 @@ class Arguments:
         torchrg normals scan.pcd --out normals.ply
         torchrg normals scan.ply --out normals.ply --orient interior
         torchrg normals scan.ply --out normals.npz --method pca --normals.k 30
-        torchrg normals scan.e57 --out normals.e57 --orient viewpoint --viewpoint 0 0 1.6
+        torchrg normals scan.e57 --out normals.e57 --orient viewpoint
+        torchrg normals scan.ply --out normals.ply --orient viewpoint --viewpoint 0 0 1.6
     """
 
     inputs: console.CloudsFlag
@@ -41,11 +41,14 @@ class Arguments:
     """File to write, its format by suffix; for several inputs a directory."""
     method: NormalMethod | None = None
     """Estimator of the normals, a short form of --normals.method."""
-    orient: Orientation | Literal["none"] = "none"
-    """How the sign of each normal is chosen: towards the viewpoint or along an axis, so that
-    neighbours agree (consistent), or into the free space of rooms (interior)."""
+    orient: CloudOrientation = "none"
+    """How the sign of each normal is chosen: towards the viewpoint or along an axis (up is +z), so
+    that neighbours agree (consistent), into the free space of rooms (interior), or as torchrg
+    segment does it (auto): to the front of the faces of a mesh, to the scanner where the file names
+    its places, else into rooms."""
     viewpoint: tuple[float, float, float] | None = None
-    """Place of the scanner in the coordinates of the input, for --orient viewpoint."""
+    """Place of the scanner in the coordinates of the input, for --orient viewpoint. Default: those
+    that an E57 file names."""
     normals: NormalsConfig = dataclasses.field(default_factory=lambda: load_config().normals)
     """How normals and curvature are estimated."""
     chunk_size: int = PipelineConfig.chunk_size
@@ -62,8 +65,8 @@ def run(argv: list[str]) -> int:
     arguments = console.parse(Arguments, argv, prog="torchrg normals")
     if arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
-    if (arguments.orient == "viewpoint") != (arguments.viewpoint is not None):
-        raise ConfigError("expected --viewpoint X Y Z and --orient viewpoint together.")
+    if arguments.viewpoint is not None and arguments.orient != "viewpoint":
+        raise ConfigError("expected --viewpoint X Y Z together with --orient viewpoint.")
     console.use_threads(arguments.threads)
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
@@ -87,6 +90,8 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     check_finite(cloud)
     if cloud.precision_note:
         console.warn(f"{source}: {cloud.precision_note}.")
+    if arguments.viewpoint is None:
+        check_viewpoint(cloud, arguments.orient, "pass --viewpoint X Y Z, or --orient interior")
     check_output(target, cloud)
     settings, size = arguments.normals, arguments.chunk_size
     with console.stage_bar(source.name, ("normals", "orientation")) as advance:
@@ -94,11 +99,9 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         with compiled(arguments.compile):
             fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
         advance("orientation")
-        if (way := arguments.orient) != "none":
-            place = arguments.viewpoint
-            viewpoint = None if place is None else torch.from_numpy(np.array(place) - cloud.origin)
-            turned = orient_normals(cloud.points, fit.normals, towards=way, viewpoint=viewpoint)
-            fit = fit._replace(normals=turned)
+        place = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
+        turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=place)
+        fit = fit._replace(normals=turned)
     provenance = describe_run(source, settings)
     provenance |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
     provenance |= {"compile": arguments.compile}

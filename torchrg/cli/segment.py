@@ -41,6 +41,8 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.stream import Extent
+from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.normals.sides import check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import (
@@ -92,6 +94,7 @@ class Arguments:
     coarser ones as "superpoints_1" and so on. Numbers say how many there are in each, as in
     --superpoints 1000,300. Colours of the cloud play a part, and a picture shows superpoints
     instead of planes."""
+    orient: console.OrientFlag = "auto"
     level: int = 0
     """Which level of the superpoints --layout takes, 0 the finest."""
     layout: console.Layout | None = None
@@ -252,6 +255,12 @@ def _segment_tiles(
             "raise --limit-memory, or leave it out."
         )
     needed = PROCESS_BYTES + memory_of_picture(min(num_points, MAX_POINTS))
+    if arguments.orient not in ("auto", "none"):
+        raise ConfigError(
+            f"{source}: expected no --orient {arguments.orient} for a cloud of about "
+            f"{num_points:,} points, which takes more than {limit / 1e9:.2f} GB: no tile tells its "
+            "side; raise --limit-memory, or choose none."
+        )
     if picture is not None and needed > limit:
         raise ConfigError(
             f"{source}: expected --limit-memory of at least {needed / 1e9:.2f} GB for --picture, "
@@ -262,6 +271,8 @@ def _segment_tiles(
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
     fields = _check_points(arguments, source, stream, target)
+    if arguments.orient == "auto":
+        console.warn(f"{source}: normals of a cloud in tiles keep their signs, as --orient none.")
     folder = folder_of_work(target, arguments.workdir)
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
@@ -335,7 +346,7 @@ def _is_depth_image(cloud: Cloud) -> bool:
 def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]:
     """Return the provenance of a cloud of one file or of several."""
     settings = arguments.settings.resolved
-    provenance = describe_run(sources[0], settings)
+    provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
     if arguments.columns is not None:
         provenance["columns"] = arguments.columns
     if arguments.voxel is not None:
@@ -358,14 +369,16 @@ def _segment_whole(
     if len(sources) == 1:
         cloud = read_cloud(sources[0], columns=names.of(sources[0]))
     else:
-        cloud = stream.read()
+        clouds = [read_cloud(source, columns=names.of(source)) for source in sources]
+        cloud = merge_streams(list(map(CloudStream.of, clouds))).stream.read()
+    check_viewpoint(cloud, arguments.orient, "use --orient interior")
     _check_points(arguments, source, cloud, target)
     if _is_depth_image(cloud):
         console.warn(
             f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
         )
     settings, voxel = arguments.settings.resolved, arguments.voxel
-    stages = (*STAGES, "superpoints") if arguments.superpoints else STAGES
+    stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
     with console.stage_bar(sources[0].name, stages) as advance:
         seg = segment_planes(cloud.points, settings, voxel=voxel, on_stage=advance)
         parts, provenance = None, _describe(arguments, sources)
@@ -379,6 +392,8 @@ def _segment_whole(
                 voxel=voxel,
             )
             provenance["superpoints"] = dataclasses.asdict(arguments.partition)
+        advance("orientation")
+        seg = _oriented(cloud, seg, arguments)
     if arguments.layout is None:
         write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
     else:
@@ -390,6 +405,19 @@ def _segment_whole(
         print(f"{source}: superpoints of each level: {found}")
     without = console.without(target, cloud.fields)
     _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
+
+
+def _oriented(cloud: Cloud, seg: Segmentation, arguments: Arguments) -> Segmentation:
+    """Return a segmentation whose normals point to their side; with voxels, to that of these."""
+    if arguments.voxel is None:
+        return seg._replace(normals=orient_cloud(cloud, seg.normals, arguments.orient))
+    rows, inverse = sample_voxels(cloud.points, arguments.voxel)
+    front = None if cloud.front is None else cloud.front[rows]
+    few = dataclasses.replace(
+        cloud, coordinates=cloud.coordinates[rows], fields={}, grid_shape=None, front=front
+    )
+    turned = orient_cloud(few, seg.normals[rows], arguments.orient)
+    return seg._replace(normals=restore_points(turned, inverse))
 
 
 def _write_layout(

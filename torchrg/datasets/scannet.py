@@ -1,7 +1,7 @@
 """ScanNet and ScanNet++ as they are released: vertices of a mesh, and what each of them is of.
 
-The points are the vertices; faces are left out. Annotations name groups of segments, and a segment
-is a set of vertices.
+The points are the vertices; what is kept of the faces is which side of a vertex is the front.
+Annotations name groups of segments, and a segment is a set of vertices.
 """
 
 import csv
@@ -135,7 +135,8 @@ class ScanNet(SceneDataset):
         """Return the sample of a scan."""
         name, mesh, _ = self.scenes[index]
         arrays = read_scannet_scan(mesh, self.root)
-        arrays.pop("category", None)
+        for key in ("category", "front"):
+            arrays.pop(key, None)
         if "segment20" in arrays:
             arrays["segment"] = arrays.pop("segment20")
         sample: dict[str, Any] = {key: torch.from_numpy(values) for key, values in arrays.items()}
@@ -156,7 +157,7 @@ def read_scannet_scan(mesh: Path, root: Path) -> dict[str, NDArray[Any]]:
         ``axis_align_matrix`` ``(4, 4)`` float64 and labels as Pointcept stores them: of ScanNet
         ``segment20``, ``segment200``, ``instance`` ``(N,)`` int64, and ``category``, the number in
         NYU40, 0 for none; of ScanNet++ ``segment`` and ``instance`` ``(N, 3)`` int16, the smallest
-        object first.
+        object first. ``front`` ``(N, 3)`` float32 is that of :class:`torchrg.Cloud`, by the faces.
 
     Raises:
         FormatError: If a file is damaged, or is of another number of vertices.
@@ -165,6 +166,8 @@ def read_scannet_scan(mesh: Path, root: Path) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {"coord": cloud.coordinates.astype(np.float32)}
     if "color" in cloud.fields:
         arrays["color"] = cloud.fields["color"]
+    if cloud.front is not None:
+        arrays["front"] = cloud.front
     if mesh.name == MESH_PLUSPLUS:
         return arrays | _labels_plus(mesh, root, len(cloud))
     files = _files_of(mesh)

@@ -26,7 +26,7 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import Spelling, flatten_cloud
 from torchrg.io.fields import Columns
 from torchrg.io.files import DAMAGES, asking_system, atomic_path, check_promise, refusing
-from torchrg.io.stream import CloudStream, Table
+from torchrg.io.stream import CloudStream, Fronts, Table
 from torchrg.structures import Cloud
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -60,13 +60,15 @@ def open_e57(path: Path, size: int) -> Table:
 
     Every scan is moved by its pose, and its normals with it. Points marked as invalid are kept as
     not-a-number. Of several scans, ``scan`` is the number of each point's; a field that some scans
-    lack is zero there, and written for the others alone.
+    lack is zero there, and written for the others alone. The front of a point is where its scanner
+    stood, as far as poses say so.
     """
     pye57 = _pye57("read")
     _check_pages(path)
     with _reading(pye57, path) as file:
         headers = [file.get_header(i) for i in range(file.scan_count)]
-        num_points = sum(header.point_count for header in headers)
+        counts = [header.point_count for header in headers]
+        num_points = sum(counts)
         # Coordinates that differ at all take a bit.
         check_promise(
             path, 0, num_points // 8, f"{num_points:,} points", available=size, at_least=True
@@ -115,7 +117,32 @@ def open_e57(path: Path, size: int) -> Table:
                     yield conformed(_to_world(path, block, scan), number)
 
     header = {"scans": scans} | ({SYSTEM: system} if system else {})
-    return Table(read, num_points, header=header, notes=notes)
+    find = partial(_fronts, scans, counts)
+    return Table(read, num_points, header=header, notes=notes, fronts=find)
+
+
+def _fronts(scans: Sequence["ScanPose"], counts: Sequence[int], cloud: Cloud) -> Fronts:
+    """Return the direction from each point to its scanner, and whose place is no scanner's.
+
+    Programs that know no poses write one that moves nothing, or use it to keep coordinates small.
+    The first kind is known by being that of all scans, the second by a place outside of the points.
+    """
+    if not any(scan.is_moved for scan in scans) or not cloud.finite.any():
+        return None, ()
+    places = np.array([scan.translation for scan in scans])
+    kept = cloud.coordinates[cloud.finite]
+    inside = ((kept.min(axis=0) <= places) & (places <= kept.max(axis=0))).all(axis=1)
+    notes: tuple[str, ...] = ()
+    if not inside.all():
+        notes = (
+            f"the poses of {int((~inside).sum())} of {len(scans)} scans lie outside of the points, "
+            "and are not taken for places of the scanner",
+        )
+    if not inside.any():
+        return None, notes
+    front = np.repeat(places, counts, axis=0) - cloud.coordinates
+    front[~np.repeat(inside, counts) | ~cloud.finite] = 0
+    return front.astype(np.float32), notes
 
 
 def _beside_points(root: Any) -> tuple[str, int]:  # noqa: ANN401

@@ -139,7 +139,7 @@ def merge_streams(streams: Sequence[CloudStream]) -> Merged:
 def _without_points(cloud: Cloud) -> Cloud:
     """Return a cloud with all but its points: chunks of many files would fill the memory."""
     fields = {name: values[:0].copy() for name, values in cloud.fields.items()}
-    return replace(cloud, coordinates=cloud.coordinates[:0].copy(), fields=fields)
+    return replace(cloud, coordinates=cloud.coordinates[:0].copy(), fields=fields, front=None)
 
 
 def _kept(clouds: Sequence[Cloud]) -> tuple[_Kept, list[str]]:

@@ -6,7 +6,11 @@ and face, and takes the memory a header promises; trimesh writes float32 and dro
 """
 
 import io
+import struct
+import sys
 from collections.abc import Iterator
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -22,10 +26,12 @@ from torchrg.io.columns import (
     narrow_integers,
     write_records,
 )
+from torchrg.io.faces import BrokenFacesError, ListOf, find_fronts, split_lists
 from torchrg.io.fields import Columns
 from torchrg.io.files import check_promise
-from torchrg.io.stream import CloudStream, Table, slices
+from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Fronts, Table, slices
 from torchrg.io.text import LINES_AT_ONCE, read_ascii, words_of
+from torchrg.structures import Cloud
 
 _TYPES = {
     "char": "i1",
@@ -42,18 +48,29 @@ _NUMPY_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", 
 _READ_TYPES = _TYPES | {
     name: np.dtype(name).str[1:] for name in (*_NUMPY_NAMES, "float32", "float64")
 }
+_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
+"""Letters of the module struct by NumPy's codes of whole numbers."""
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
 """Bytes of the longest header; a longer one is taken for damage."""
 _LONGEST_LIST = 1 << 20
 """Bytes of the longest list; a longer one is taken for damage."""
+_CORNERS = ("vertex_indices", "vertex_index")
+"""What the list of a face's vertices is called."""
+_BYTES_AT_ONCE = 1 << 22
+"""Bytes of faces that are read together."""
+_SHOWN = 60
+"""Characters of what is wrong in a text that are told."""
 _LENGTH, _LIST = " length", " list"
 """Ends of the names of a list and its length in records. Names in a PLY file have no spaces, so
 that no property is called so."""
 
 
 def open_ply(path: Path, size: int) -> Table:
-    """Open a PLY file: every property of the element ``vertex``; other elements are left out."""
+    """Open a PLY file: every property of the element ``vertex``, and its front by the faces.
+
+    Other elements are left out, and so are faces that come before the vertices.
+    """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
     elements = [element for element in header.elements if element.properties]
@@ -63,13 +80,16 @@ def open_ply(path: Path, size: int) -> Table:
             f"{path}: expected an element vertex with properties, got elements "
             f"{', '.join(names) or 'none'}; write the points as vertices."
         )
+    vertex = names.index("vertex")
+    face = next((i for i in range(vertex + 1, len(names)) if _is_mesh(elements[i])), vertex)
     others = [
         f"{element.num_records:,} of {element.name}"
-        for element in elements
-        if element.name != "vertex" and element.num_records
+        for i, element in enumerate(elements)
+        if i not in (vertex, face) and element.num_records
     ]
-    notes = (f"elements left out, as only vertices are read: {', '.join(others)}",)
-    header = header._replace(elements=elements[: names.index("vertex") + 1])
+    notes = (f"elements left out, as only vertices and their faces are read: {', '.join(others)}",)
+    mesh = header._replace(elements=elements[: face + 1])
+    header = header._replace(elements=elements[: vertex + 1])
     read_records = _read_binary if header.byte_order else _read_text
 
     def read(chunk_size: int) -> Iterator[Columns]:
@@ -80,7 +100,14 @@ def open_ply(path: Path, size: int) -> Table:
 
     at_once = None if header.byte_order else LINES_AT_ONCE
     num_points = header.elements[-1].num_records
-    return Table(read, num_points, at_once, notes=notes if others else ())
+    find = None if face == vertex else partial(_fronts, path, mesh, vertex, size)
+    return Table(read, num_points, at_once, notes=notes if others else (), fronts=find)
+
+
+def _is_mesh(element: "_Element") -> bool:
+    """Return whether the records of an element are faces."""
+    corners = [prop for prop in element.properties if prop.name in _CORNERS and prop.length_code]
+    return element.name == "face" and element.num_records > 0 and len(corners) == 1
 
 
 def write_ply(path: Path, stream: CloudStream) -> None:
@@ -207,19 +234,32 @@ def _read_binary(
     path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
 ) -> Iterator[NDArray[np.void]]:
     """Read the last of the elements of a binary file."""
-    start = header.num_bytes
     *before, vertex = header.elements
-    for element in before:
-        dtype = _check_element(path, stream, element, header.byte_order, start, size)
-        if any(prop.length_code for prop in element.properties):
-            for rows in slices(element.num_records, chunk_size):
-                _check_lists(path, element, _read_records(stream, dtype, rows))
-        start += element.num_records * dtype.itemsize
+    start = _pass_elements(path, stream, header, before, size, chunk_size)
     dtype = _check_element(path, stream, vertex, header.byte_order, start, size)
     for rows in slices(vertex.num_records, chunk_size):
         records = _read_records(stream, dtype, rows)
         _check_lists(path, vertex, records)
         yield records
+
+
+def _pass_elements(
+    path: Path,
+    stream: BinaryIO,
+    header: _Header,
+    elements: list[_Element],
+    size: int,
+    chunk_size: int = POINTS_A_CHUNK,
+) -> int:
+    """Return the byte behind the first elements of a binary file, whose records have one size."""
+    start = header.num_bytes
+    for element in elements:
+        dtype = _check_element(path, stream, element, header.byte_order, start, size)
+        if any(prop.length_code for prop in element.properties):
+            for rows in slices(element.num_records, chunk_size):
+                _check_lists(path, element, _read_records(stream, dtype, rows))
+        start += element.num_records * dtype.itemsize
+    return start
 
 
 def _check_element(
@@ -267,15 +307,18 @@ def _record_type(
 
 def _check_lists(path: Path, element: _Element, records: NDArray[np.void]) -> None:
     """Check that the lists of an element all have one length, so that records have one size."""
-    for name in records.dtype.names or ():
-        if not name.endswith(_LENGTH):
-            continue
-        (length,) = records.dtype[name.removesuffix(_LENGTH) + _LIST].shape
-        if (records[name] != length).any():
-            raise FormatError(
-                f"{path}: expected lists of one length in element {element.name}, which comes "
-                "with or before the vertices; write the vertices first and without lists."
-            )
+    if not _have_one_length(records):
+        raise FormatError(
+            f"{path}: expected lists of one length in element {element.name}, which comes "
+            "with or before the vertices; write the vertices first and without lists."
+        )
+
+
+def _have_one_length(records: NDArray[np.void]) -> bool:
+    """Return whether each list has in all records the length that its type says."""
+    names = [name for name in records.dtype.names or () if name.endswith(_LENGTH)]
+    lengths = [records.dtype[name.removesuffix(_LENGTH) + _LIST].shape[0] for name in names]
+    return all((records[n] == k).all() for n, k in zip(names, lengths, strict=True))
 
 
 def _read_text(
@@ -299,3 +342,104 @@ def _read_text(
         skipped=sum(element.num_records for element in before),
         content="vertices",
     )
+
+
+def _fronts(path: Path, header: _Header, vertex: int, size: int, cloud: Cloud) -> Fronts:
+    """Return the front of each vertex by the last of the elements, and what is wrong with that."""
+    try:
+        with path.open("rb") as stream:
+            if header.byte_order:
+                faces = _corners_of_binary(path, stream, header, size)
+            else:
+                faces = _corners_of_text(stream, header, vertex)
+            return find_fronts(faces, cloud.coordinates, cloud.finite), ()
+    except BrokenFacesError as error:
+        return None, (f"its faces left out, as they are damaged: {error}",)
+    except FormatError as error:
+        return None, (f"its faces left out: {str(error).removeprefix(f'{path}: ').rstrip('.')}",)
+
+
+def _corners_of_binary(
+    path: Path, stream: BinaryIO, header: _Header, size: int
+) -> Iterator[NDArray[np.int64]]:
+    """Yield the vertices of faces, of many at a time as long as all lists have one length."""
+    *before, faces = header.elements
+    start = _pass_elements(path, stream, header, before, size)
+    stream.seek(start)
+    dtype = _record_type(path, stream, faces, header.byte_order, size)
+    name = next(prop.name for prop in faces.properties if prop.name in _CORNERS)
+    done, at_once = 0, max(_BYTES_AT_ONCE // dtype.itemsize, 1)
+    while done < faces.num_records:
+        stream.seek(start + done * dtype.itemsize)
+        some = slice(done, min(done + at_once, faces.num_records))
+        records = _read_records(stream, dtype, some)
+        if len(records) < some.stop - some.start or not _have_one_length(records):
+            break
+        yield records[name + _LIST].astype(np.int64)
+        done = some.stop
+    stream.seek(start + done * dtype.itemsize)
+    lists, tail = _layout(faces, header.byte_order)
+    code = next(np.dtype(header.byte_order + p.code) for p in faces.properties if p.name == name)
+
+    def gather(data: bytes, starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
+        raw = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(length * code.itemsize)]
+        read: NDArray[Any] = np.frombuffer(raw.tobytes(), code)
+        corners: NDArray[np.int64] = read.astype(np.int64).reshape(len(starts), length)
+        return corners
+
+    blocks = iter(partial(stream.read, _BYTES_AT_ONCE), b"")
+    yield from split_lists(blocks, lists, tail, faces.num_records - done, gather)
+
+
+def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator[NDArray[np.int64]]:
+    """Yield the vertices of the faces of an ASCII file, a face a line."""
+    stream.seek(header.num_bytes)
+    *before, faces = header.elements
+    counts = [element.num_records for element in before]
+    lines = islice(stream, sum(counts[:vertex]), None)
+    between = min(sum(counts[vertex:]), sys.maxsize)
+    lines = islice((line for line in lines if line.strip()), between, None)
+
+    def words() -> Iterator[list[float]]:
+        while block := list(islice(lines, LINES_AT_ONCE)):
+            try:
+                yield [float(word) for line in block for word in line.split()]
+            except ValueError as error:
+                raise BrokenFacesError(str(error)[:_SHOWN]) from None
+
+    def gather(data: list[float], starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
+        return np.array(data)[starts[:, None] + np.arange(length)].astype(np.int64)
+
+    lists, tail = _layout(faces, header.byte_order)
+    return split_lists(words(), lists, tail, faces.num_records, gather)
+
+
+def _layout(element: _Element, byte_order: str) -> tuple[list[ListOf], int]:
+    """Return the lists of an element, and how much stands behind the last of them."""
+    lists, skipped = list[ListOf](), 0
+
+    def size(code: str) -> int:
+        return np.dtype(code).itemsize if byte_order else 1
+
+    for prop in element.properties:
+        if prop.length_code is None:
+            skipped += size(prop.code)
+            continue
+        read = _word_as_length
+        if byte_order:
+            read = partial(_read_length, struct.Struct(byte_order + _LETTERS[prop.length_code]))
+        is_corners = prop.name in _CORNERS
+        lists.append(ListOf(skipped, read, size(prop.length_code), size(prop.code), is_corners))
+        skipped = 0
+    return lists, skipped
+
+
+def _read_length(form: struct.Struct, data: bytes, place: int) -> int:
+    """Return the length of a list that begins at a byte."""
+    length: int = form.unpack_from(data, place)[0]
+    return length
+
+
+def _word_as_length(data: list[float], place: int) -> int:
+    """Return the length of a list that begins with a word."""
+    return int(data[place]) if np.isfinite(data[place]) else -1

@@ -33,6 +33,10 @@ SILENT: dict[str, Any] = {"over": "ignore", "invalid": "ignore"}
 """Files may hold any bits as numbers: values that overflow or signal are kept, not reported."""
 
 
+Fronts = tuple[NDArray[np.float32] | None, tuple[str, ...]]
+"""The front of each point of a cloud, as :attr:`torchrg.Cloud.front`, and notes on it."""
+
+
 class Table(NamedTuple):
     """The points of a file as columns by its own names, read when asked for.
 
@@ -46,6 +50,8 @@ class Table(NamedTuple):
         grid_shape: That of the cloud.
         header: That of the cloud.
         notes: Those of the cloud but for names that the values decide.
+        fronts: Finds on which side the points were seen, of the whole cloud; None where the file
+            says nothing about it.
     """
 
     read: Callable[[int], Iterator[Columns]]
@@ -56,6 +62,7 @@ class Table(NamedTuple):
     grid_shape: tuple[int, int] | None = None
     header: Mapping[str, Any] = {}
     notes: tuple[str, ...] = ()
+    fronts: Callable[[Cloud], Fronts] | None = None
 
     def assemble(
         self,
@@ -137,7 +144,10 @@ class CloudStream:
             for rows in slices(len(cloud), chunk_size):
                 fields = {name: values[rows] for name, values in cloud.fields.items()}
                 points = cloud.coordinates[rows]
-                yield replace(cloud, coordinates=points, fields=fields, grid_shape=None)
+                front = None if cloud.front is None else cloud.front[rows]
+                yield replace(
+                    cloud, coordinates=points, fields=fields, grid_shape=None, front=front
+                )
 
         return cls(cut, len(cloud), cloud.grid_shape, cloud.source, cloud.header)
 
@@ -150,8 +160,13 @@ class CloudStream:
         columns = join_columns([{**chunk.fields, "": chunk.coordinates} for chunk in chunks])
         fields = dict(columns)
         points = fields.pop("")
-        notes = chunks[0].notes
-        return Cloud(points, fields, self.grid_shape, self.source, self.header, notes)
+        notes, front = chunks[0].notes, None
+        if any(chunk.front is not None for chunk in chunks):
+            fronts = [
+                np.zeros((len(c), 3), np.float32) if c.front is None else c.front for c in chunks
+            ]
+            front = np.concatenate(fronts)
+        return Cloud(points, fields, self.grid_shape, self.source, self.header, notes, front)
 
     @cached_property
     def extent(self) -> "Extent":
@@ -241,7 +256,9 @@ def read_table(path: Path, table: Table) -> Cloud:
         columns = join_columns(list(table.read(at_once)))
         facts = table.naming.facts(columns) if table.naming is not None else ()
         cloud = table.assemble(path, columns, facts)
-    return replace(cloud, grid_shape=table.grid_shape)
+        front, notes = (None, ()) if table.fronts is None else table.fronts(cloud)
+    notes = cloud.notes + notes
+    return replace(cloud, grid_shape=table.grid_shape, front=front, notes=notes)
 
 
 def stream_table(path: Path, table: Table, chunk_size: int) -> CloudStream:

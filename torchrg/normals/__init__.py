@@ -13,7 +13,8 @@
 | ``paper`` | ``pca``, then ``detmcd`` at sharp points | the published method |
 | ``consensus`` | ``pca``, then planes that neighbours agree on | the default: edges, noise |
 
-Signs are arbitrary until :func:`orient_normals` chooses them. The ``fit_*`` functions take patches
+Signs are arbitrary until :func:`orient_normals` chooses them, or :func:`orient_cloud`, which knows
+what the file of a cloud says about its sides. The ``fit_*`` functions take patches
 of shape ``(*, K, 3)`` and are what the estimators are made of.
 """
 
@@ -37,6 +38,7 @@ from torchrg.normals.paper import estimate_paper, find_sharp_points
 from torchrg.normals.patches import Estimator, at_all_points
 from torchrg.normals.pca import fit_normals_pca
 from torchrg.normals.robust import fit_normals_robust
+from torchrg.normals.sides import orient_cloud
 from torchrg.precision import warn_of_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
 from torchrg.structures import Neighbors, NormalFit
@@ -51,6 +53,7 @@ __all__ = [
     "fit_normals_jet",
     "fit_normals_pca",
     "fit_normals_robust",
+    "orient_cloud",
     "orient_normals",
 ]
 

@@ -130,16 +130,16 @@ def orient_normals(
     if (towards == "viewpoint") != (viewpoint is not None):
         wanted = "a viewpoint" if viewpoint is None else "no viewpoint"
         raise ConfigError(f"orient_normals: expected {wanted} with towards={towards!r}.")
-    upright = _upright(given)
     if viewpoint is not None:
         place = as_tensor("orient_normals", "viewpoint", viewpoint).to(cloud)
         pattern = "3" if place.ndim == 1 else "N 3"
         check_shapes("orient_normals", points=(cloud, "N 3"), viewpoint=(place, pattern))
-        return _face(upright, (place - cloud).to(upright.dtype))
+        return turn_towards(given, (place - cloud).to(given.dtype))
     if towards not in ("consistent", "interior"):
         axis = torch.zeros(3, dtype=given.dtype, device=given.device)
         axis["xyz".index(towards[1])] = 1.0 if towards[0] == "+" else -1.0
-        return _face(upright, axis)
+        return turn_towards(given, axis)
+    upright = _upright(given)
     turn = _turn_outwards if towards == "consistent" else _turn_inside
     if neighbors is not None:
         signs = turn(cloud, upright.detach().to(cloud.dtype), neighbors)
@@ -154,6 +154,16 @@ def orient_normals(
     return upright.index_copy(0, rows, units * signs)
 
 
+def turn_towards(normals: Tensor, directions: Tensor) -> Tensor:
+    """Return normals that form no more than a right angle with a direction, ``(3,)`` or ``(N, 3)``.
+
+    Those at a right angle have a positive first of z, y, x that is not zero.
+    """
+    upright = _upright(normals)
+    away = (upright * directions).sum(dim=-1, keepdim=True) < 0
+    return torch.where(away, -upright, upright)
+
+
 def _upright(normals: Tensor) -> Tensor:
     """Return normals whose first of z, y, x that is not zero is positive."""
     return torch.where((_leading(normals) < 0)[:, None], -normals, normals)
@@ -163,12 +173,6 @@ def _leading(vectors: Tensor) -> Tensor:
     """Return the first of z, y, x that is not zero."""
     x, y, z = vectors.unbind(dim=-1)
     return torch.where(z != 0, z, torch.where(y != 0, y, x))
-
-
-def _face(normals: Tensor, direction: Tensor) -> Tensor:
-    """Return normals reversed where they form more than a right angle with a direction."""
-    away = (normals * direction).sum(dim=-1, keepdim=True) < 0
-    return torch.where(away, -normals, normals)
 
 
 def _turn_outwards(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Tensor:

@@ -158,7 +158,8 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     for name in ("normals", "normals_input"):
         if name in fields:
             fields[name] = (fields[name] @ rotation.T).astype(fields[name].dtype)
-    return replace(cloud, coordinates=coordinates, fields=fields, header={})
+    front = None if cloud.front is None else (cloud.front @ rotation.T).astype(cloud.front.dtype)
+    return replace(cloud, coordinates=coordinates, fields=fields, header={}, front=front)
 
 
 def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:

@@ -37,6 +37,7 @@ from torchrg.transforms.planes import (
     EstimateNormals,
     GrowRegions,
     MakeSuperpoints,
+    OrientNormals,
     SegmentPlanes,
 )
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleVoxels
@@ -49,6 +50,7 @@ __all__ = [
     "GrowRegions",
     "KeepFinite",
     "MakeSuperpoints",
+    "OrientNormals",
     "SampleVoxels",
     "SegmentDepth",
     "SegmentPlanes",

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -18,7 +18,8 @@ from torchrg.config import (
 )
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
-from torchrg.normals import estimate_normals
+from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals.orient import Orientation
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.structures import UNLABELED
@@ -64,6 +65,78 @@ class EstimateNormals(CloudTransform):
         fit = estimate_normals(cloud["coord"], self.config, chunk_size=self.chunk_size)
         found = {"normal": fit.normals, "curvature": fit.curvature}
         return {**found, "residual": fit.residual_rms} if self.residual else found
+
+
+class OrientNormals(CloudTransform):
+    """Choose the sign of the normals that a sample has; see :func:`torchrg.normals.orient_normals`.
+
+    Reads ``coord``, ``normal`` ``(N, 3)`` and, to look at a viewpoint that is not given here,
+    ``viewpoint``: where the scanner stood, of shape ``(3,)``, ``(B, 3)`` for the clouds of a batch,
+    or ``(N, 3)``. Changes ``normal``. Each cloud of a batch is oriented on its own.
+
+    Args:
+        towards: What normals are turned to; ``"up"`` is ``"+z"``.
+        viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
+        keys: Other names for the keys.
+
+    Raises:
+        ConfigError: If ``towards`` is unknown, or does not go with ``viewpoint``.
+
+    Example:
+        >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
+        >>> steps = torch.nn.Sequential(SegmentPlanes(), OrientNormals("viewpoint", (4, 4, -1)))
+        >>> steps({"coord": floor})["normal"][0] + 0
+        tensor([0., 0., -1.])
+    """
+
+    def __init__(
+        self,
+        towards: Orientation | Literal["up"] = "interior",
+        viewpoint: Sequence[float] | None = None,
+        *,
+        keys: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(keys=keys)
+        known = (*get_args(Orientation), "up")
+        if towards not in known:
+            raise ConfigError(
+                f"OrientNormals: expected towards to be one of {', '.join(known)}, got {towards!r}."
+            )
+        if viewpoint is not None and (towards != "viewpoint" or len(viewpoint) != 3):
+            raise ConfigError(
+                "OrientNormals: expected three numbers as viewpoint, with towards='viewpoint', got "
+                f"{viewpoint!r} with {towards!r}."
+            )
+        self.towards: Orientation = "+z" if towards == "up" else towards
+        self.viewpoint = None if viewpoint is None else tuple(map(float, viewpoint))
+        looks = towards == "viewpoint" and viewpoint is None
+        self.reads = ("coord", "normal", *["viewpoint"] * looks)
+
+    def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
+        """Return an entry of a sample; of a viewpoint a row for each point."""
+        values = super().read(sample, name)
+        if name != "viewpoint":
+            return values
+        parts = rows_of_clouds(sample, len(super().read(sample, "coord")))
+        places = values[None] if values.ndim == 1 else values
+        if len(places) not in (1, len(parts)):
+            return places
+        of_clouds = places.expand(len(parts), -1)
+        counts = [part.stop - part.start for part in parts]
+        return of_clouds.repeat_interleave(torch.tensor(counts, device=places.device), dim=0)
+
+    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the normals of a cloud, turned."""
+        points, viewpoint = cloud["coord"], cloud.get("viewpoint")
+        if self.viewpoint is not None:
+            viewpoint = points.new_tensor(self.viewpoint)
+        turned = orient_normals(points, cloud["normal"], towards=self.towards, viewpoint=viewpoint)
+        return {"normal": turned}
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        place = "" if self.viewpoint is None else f", viewpoint={self.viewpoint}"
+        return f"towards={self.towards!r}{place}"
 
 
 class GrowRegions(CloudTransform):

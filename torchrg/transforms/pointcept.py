@@ -23,7 +23,7 @@ import numpy as np
 
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
-from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints
+from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints, OrientNormals
 from torchrg.transforms.rows import OUR_KEYS, with_listed
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
@@ -91,6 +91,7 @@ _TRANSFORMS = (
     SampleVoxels,
     SegmentPlanes,
     MakeSuperpoints,
+    OrientNormals,
 )
 """What configs can name."""
 _OWN: dict[str, Callable[..., dict[str, Any]]] = {}

@@ -34,6 +34,7 @@ from torchrg.transforms.rows import (
 
 KEYS = (
     "coord", "normal", "curvature", "residual", "plane", "inverse", "origin", "color", "superpoint",
+    "viewpoint",
 )  # fmt: skip
 """Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
