@@ -408,7 +408,8 @@ def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator
                 raise BrokenFacesError(str(error)[:_SHOWN]) from None
 
     def gather(data: list[float], starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
-        return np.array(data)[starts[:, None] + np.arange(length)].astype(np.int64)
+        corners: NDArray[np.int64] = np.array(data)[starts[:, None] + np.arange(length)].astype(int)
+        return corners
 
     lists, tail = _layout(faces, header.byte_order)
     return split_lists(words(), lists, tail, faces.num_records, gather)

@@ -2,7 +2,7 @@
 
 import math
 from itertools import product
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ other."""
 _PATCH_BEND = 0.05
 """Largest bend within a smooth patch, that between normals 18 degrees apart."""
 
+_LARGEST_BEND = 2.0
+"""Bend through a plate; links of more tell nothing."""
+
 _FACE_BEND = 0.01
 _USUAL_BENDS = 4.0
 """Largest bend within a face: that between normals 8 degrees apart, or this multiple of the median
@@ -35,7 +38,8 @@ of all, which noise makes larger where points are dense. The two sides of a spar
 one patch, and two faces."""
 
 _LEAST_FACE = 10
-"""Points of a face that decides for itself; smaller ones, as along edges, follow their patch."""
+"""Points of a face that decides for itself. Smaller ones, as along edges, follow their patch, and
+smaller patches, as where noise is large, follow those around them."""
 
 _CLEARLY_OUTWARDS = 1e-3
 """Share of its largest value beyond which a volume or a mean normal cannot be rounding."""
@@ -194,11 +198,44 @@ def _turn_outwards(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Ten
 
 def _turn_inside(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Tensor:
     """Return signs for the freer side, by the votes of faces."""
-    signs, patches, faces = propagate_signs(points, normals, neighbors, within_patches=True)
+    links = _find_links(points, normals, neighbors)
+    signs, patches, faces = propagate_signs(
+        points, normals, neighbors, within_patches=True, links=links
+    )
     votes = vote_free_side(points, normals, neighbors) * signs
     is_large = torch.bincount(faces)[faces] >= _LEAST_FACE
-    decided = torch.where(is_large, _sum_by(faces, votes)[faces], _sum_by(patches, votes)[patches])
+    of_patches = _decide_patches(_sum_by(patches, votes), patches, signs, links)
+    decided = torch.where(is_large, _sum_by(faces, votes)[faces], of_patches[patches])
     return torch.where(decided < 0, -signs, signs)
+
+
+def _decide_patches(votes: Tensor, patches: Tensor, signs: Tensor, links: "_Links") -> Tensor:
+    """Return votes of patches by which small ones agree with those around them, shape ``(M,)``.
+
+    A few points far from others in direction say little on their own, and mostly it is noise that
+    tells them from the face that they are on. Links to patches that have decided tell more, those
+    of little bend most; patches that no link reaches decide for themselves.
+    """
+    decided = torch.where(torch.bincount(patches) < _LEAST_FACE, 0.0, votes.sign())
+    first, second = patches[links.starts], patches[links.ends]
+    between = (first != second).nonzero().squeeze(1)
+    first, second = first[between], second[between]
+    ends = signs[links.starts[between]] * signs[links.ends[between]]
+    trust = (1 - links.bends[between].double() / _LARGEST_BEND).clamp(min=0)
+    agreement = torch.where(links.cosines[between] < 0, -trust, trust) * ends
+    while True:
+        seen = _sum_at(decided, first, second, agreement)
+        most = _sum_at(decided.abs(), first, second, trust)
+        is_new = (decided == 0) & (seen.abs() > _CLEARLY_OUTWARDS * most)
+        if not bool(is_new.any()):
+            return torch.where(decided == 0, votes, decided)
+        decided = torch.where(is_new, seen.sign(), decided)
+
+
+def _sum_at(values: Tensor, first: Tensor, second: Tensor, weights: Tensor) -> Tensor:
+    """Return at each end of links the weighted sum of the values at the others."""
+    sums = torch.zeros_like(values).index_add(0, first, weights * values[second])
+    return sums.index_add(0, second, weights * values[first])
 
 
 def _sum_by(groups: Tensor, values: Tensor) -> Tensor:
@@ -208,7 +245,12 @@ def _sum_by(groups: Tensor, values: Tensor) -> Tensor:
 
 
 def propagate_signs(
-    points: Tensor, normals: Tensor, neighbors: Neighbors, *, within_patches: bool = False
+    points: Tensor,
+    normals: Tensor,
+    neighbors: Neighbors,
+    *,
+    within_patches: bool = False,
+    links: "_Links | None" = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find signs by which neighbouring normals agree, along a minimum spanning tree [1].
 
@@ -238,7 +280,9 @@ def propagate_signs(
     if num_points == 0:
         none = torch.zeros(0, dtype=torch.int64, device=points.device)
         return normals.new_ones(0), none, none
-    starts, ends, bends = _links(points, normals, neighbors)
+    links = _find_links(points, normals, neighbors) if links is None else links
+    starts, ends = (end.cpu().numpy().astype(np.int32) for end in (links.starts, links.ends))
+    bends = links.bends.double().cpu().numpy()
     face_bend = max(_FACE_BEND, _USUAL_BENDS * float(np.median(bends))) if len(bends) else 0.0
     kept = bends <= _PATCH_BEND if within_patches else slice(None)
     # A weight of zero would be no link, so every link weighs one more than its bend.
@@ -266,26 +310,32 @@ def propagate_signs(
     return signs, patches, faces
 
 
-def _links(
-    points: Tensor, normals: Tensor, neighbors: Neighbors
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return both ends and the bend of each link, an end of lower row first."""
+class _Links(NamedTuple):
+    """Links between neighbours, each of shape ``(L,)``.
+
+    Both ends, the one of lower row first, the bend, and the cosine between the normal of one end
+    and the mirrored normal of the other.
+    """
+
+    starts: Tensor
+    ends: Tensor
+    bends: Tensor
+    cosines: Tensor
+
+
+def _find_links(points: Tensor, normals: Tensor, neighbors: Neighbors) -> _Links:
+    """Return the links between each point and its nearest neighbours."""
     indices = neighbors.indices[:, 1 : 1 + _NUM_LINKS].long()
     own = torch.arange(len(points), device=points.device)[:, None].expand_as(indices)
     linked = indices != own
     if neighbors.valid is not None:
         linked &= neighbors.valid[:, 1 : 1 + _NUM_LINKS]
-    pairs = torch.stack([own[linked], indices[linked]])
-    low, high = pairs.amin(dim=0), pairs.amax(dim=0)
-    keys = torch.unique(low * len(points) + high)
+    here, there = own[linked], indices[linked]
+    keys = torch.minimum(here, there) * len(points) + torch.maximum(here, there)
+    keys = torch.unique(keys)
     low, high = keys // len(points), keys % len(points)
     cosine, slope = _agreement(points, normals, low, high)
-    bends = 1 - cosine.abs() + slope
-    return (
-        low.cpu().numpy().astype(np.int32),
-        high.cpu().numpy().astype(np.int32),
-        bends.clamp(min=0).double().cpu().numpy(),
-    )
+    return _Links(low, high, (1 - cosine.abs() + slope).clamp(min=0), cosine)
 
 
 def _agreement(points: Tensor, normals: Tensor, i: Tensor, j: Tensor) -> tuple[Tensor, Tensor]:
