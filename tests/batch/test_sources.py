@@ -35,9 +35,14 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
     }
     compiled = RGBDSource(tmp_path, settings, "images", camera, 9.0, compile=True)
     assert compiled.describe()["compile"] is True
-    options = {"kind": "s3dis", "class_order": "spt", "superpoint": True}
+    turned = RGBDSource(tmp_path, settings, "images", camera, 9.0, orient="up")
+    assert turned.describe()["orient"] == "up"
+    options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}
     assert S3DISSource(tmp_path, CLASSIC, (5,), "spt", superpoint=True).describe() == options
     options = {"kind": "folder", "superpoint": False}
+    # As results were described when normals had the signs that they have with none.
+    assert FolderSource(tmp_path, CLASSIC, tmp_path, orient="none").describe() == options
+    options |= {"orient": "auto"}
     assert FolderSource(tmp_path, CLASSIC, tmp_path).describe() == options
     named = FolderSource(tmp_path, CLASSIC, tmp_path, columns=("x", "y", "z"))
     assert named.describe() == options | {"columns": ["x", "y", "z"]}

@@ -53,11 +53,13 @@ def run(*arguments):
 @pytest.mark.parametrize("flags", [(), ("--voxel", "0.1")])
 def test_tiles_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, flags):
     files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic", *flags)
-    assert run(*files, "--out", tmp_path / "whole.npz", "--limit-memory", "9") == 0
+    whole = ("--out", tmp_path / "whole.npz", "--limit-memory", "9", "--orient", "none")
+    assert run(*files, *whole) == 0
     assert "in tiles of" not in capsys.readouterr().out
     assert run(*files, "--out", tmp_path / "tiles.npz", "--limit-memory", LIMIT) == 0
     said = capsys.readouterr().out.splitlines()
     assert "about 40,000 points take 0.54 GB of memory, the limit is 0.54: in tiles of" in said[0]
+    assert "normals keep their signs, as with --orient none" in said[0]
     assert (tmp_path / "whole.npz").read_bytes() == (tmp_path / "tiles.npz").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles.npz", "whole.npz"]
 
@@ -111,6 +113,10 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
         (
             ("--limit-memory", LIMIT, "--merge", "--picture", "x.png"),
             r"expected --limit-memory of at least 0\.71 GB for --picture, got 0\.54 GB; raise it",
+        ),
+        (
+            ("--limit-memory", LIMIT, "--merge", "--orient", "interior"),
+            "expected no --orient interior for a cloud .* no tile tells its side; raise --limit",
         ),
         (("--ray-address", "auto"), "expected --ray-address together with --engine ray"),
     ],

@@ -128,8 +128,11 @@ def test_bad_points_stay_in_place(tmp_path, capsys):
     [
         (["--method", "best"], "invalid choice 'best'"),
         (["--normals.k", "2"], "expected k >= 3, got 2"),
-        (["--orient", "viewpoint"], "--viewpoint X Y Z and --orient viewpoint together"),
-        (["--viewpoint", "0", "0", "0"], "--viewpoint X Y Z and --orient viewpoint together"),
+        (
+            ["--orient", "viewpoint"],
+            "by viewpoint, got none; pass --viewpoint X Y Z, or --orient interior",
+        ),
+        (["--viewpoint", "0", "0", "0"], "--viewpoint X Y Z together with --orient viewpoint"),
         (["--threads", "0"], "expected --threads >= 1, got 0"),
         (["--chunk-size", "0"], "expected --chunk-size >= 1, got 0"),
     ],

@@ -24,6 +24,7 @@ from torchrg.config import SuperpointsConfig
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.io import read_cloud, write_cloud
+from torchrg.normals import orient_normals
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -59,7 +60,8 @@ class Room:
         self.segment = np.array([NYU_IDS.index(c) if c in NYU_IDS else -1 for c in self.category])
         seg = segment_planes(self.coord, CLASSIC)
         parts = make_superpoints(self.coord, seg, PARTITION, colors=self.color)
-        self.plane, self.normal = seg.labels.numpy(), seg.normals.numpy()
+        self.plane = seg.labels.numpy()
+        self.normal = orient_normals(self.coord, seg.normals).numpy()
         self.superpoint = parts.levels[0].numpy()
 
 

@@ -257,3 +257,40 @@ def test_file_without_scans_is_refused(tmp_path):
         pass
     with pytest.raises(FormatError, match=r"a\.e57: expected at least one scan, got none"):
         read_cloud(tmp_path / "a.e57")
+
+
+def write_stations(path, points, places):
+    """A scan from each place, of all points, in its own frame turned by a quarter."""
+    with pye57.E57(str(path), "w") as file:
+        for place in places:
+            x, y, z = (points - place).T
+            file.write_scan_raw(
+                dict(zip(AXES, (y, -x, z), strict=True)), rotation=QUARTER, translation=place
+            )
+    return path
+
+
+def test_the_front_of_a_point_is_its_scanner(tmp_path):
+    points = np.array([5e5, 4.5e6, 1e2]) + np.random.default_rng(0).uniform(-3, 3, (50, 3))
+    places = points.mean(axis=0) + np.array([[1.0, 0, 0], [-1, 0.5, 0]])
+    cloud = read_cloud(write_stations(tmp_path / "a.e57", points, places))
+    expected = np.concatenate([place - points for place in places])
+    np.testing.assert_allclose(cloud.front, expected, atol=1e-5)
+    assert cloud.front.dtype == np.float32
+    assert cloud.notes == ()
+
+
+def test_poses_that_are_no_places_of_scanners_are_not_taken_for_such(tmp_path):
+    points = np.array([5e5, 4.5e6, 1e2]) + np.random.default_rng(0).uniform(-3, 3, (50, 3))
+    inside, shift = points.mean(axis=0), np.array([500_000.0, 4_500_000.0, 0.0])
+    cloud = read_cloud(write_stations(tmp_path / "a.e57", points, [inside, shift]))
+    assert cloud.front[:50].any(axis=1).all()
+    assert not cloud.front[50:].any()
+    assert cloud.notes == (
+        "the poses of 1 of 2 scans lie outside of the points, and are not taken for places of the "
+        "scanner",
+    )
+    assert read_cloud(write_stations(tmp_path / "b.e57", points, [shift])).front is None
+    # What is written where no pose is known, around the origin.
+    write_cloud(tmp_path / "c.e57", Cloud(points - inside))
+    assert read_cloud(tmp_path / "c.e57").front is None

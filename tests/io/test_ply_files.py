@@ -96,12 +96,13 @@ def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
     else:
         mark = ORDERS[order]
         strips = struct.pack(mark + "dBiiBii", 1.5, 2, 0, 1, 2, 1, 2)
-        body = strips + binary_body(mark) + struct.pack(mark + "Biii", 3, 0, 1, 2)
+        body = strips + binary_body(mark)
+        body += struct.pack(mark + "BiiiBiiii", 3, 0, 1, 2, 4, 0, 1, 2, 0)
     cloud = read_cloud(save(tmp_path / "a.ply", header, body))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
     assert set(cloud.fields) == {"color", "labels"}
-    told = "1 of camera, 2 of strip, 2 of face"
-    assert cloud.notes == (f"elements left out, as only vertices are read: {told}",)
+    told = "1 of camera, 2 of strip"
+    assert cloud.notes == (f"elements left out, as only vertices and their faces are read: {told}",)
     assert next(iter(stream_cloud(tmp_path / "a.ply"))).notes == cloud.notes
 
 

@@ -270,14 +270,13 @@ def _segment_tiles(
         tile_size = choose_tile_size(num_points, limit)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
+    arguments = dataclasses.replace(arguments, orient="none")
     fields = _check_points(arguments, source, stream, target)
-    if arguments.orient == "auto":
-        console.warn(f"{source}: normals of a cloud in tiles keep their signs, as --orient none.")
     folder = folder_of_work(target, arguments.workdir)
     print(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
         f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {folder}, from "
-        "which the same command goes on",
+        "which the same command goes on; normals keep their signs, as with --orient none",
         flush=True,
     )
     with tqdm(unit="tile", leave=False, disable=None) as bar:

@@ -442,5 +442,5 @@ def _read_length(form: struct.Struct, data: bytes, place: int) -> int:
 
 
 def _word_as_length(data: list[float], place: int) -> int:
-    """Return the length of a list that begins with a word."""
-    return int(data[place]) if np.isfinite(data[place]) else -1
+    """Return the length of a list that begins with a word; -1 for one that is none."""
+    return int(data[place]) if 0 <= data[place] < sys.maxsize else -1

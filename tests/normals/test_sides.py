@@ -1,0 +1,101 @@
+"""Signs of the normals of clouds by what their files know, and by rooms where they know nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ConfigError
+from torchrg.normals import estimate_normals, orient_cloud, orient_normals
+from torchrg.scenes import make_room
+from torchrg.structures import Cloud
+
+
+@pytest.fixture(scope="module")
+def room():
+    """A cloud far from the origin whose front is the outside, the normals that it is for, truth."""
+    scene = make_room(6000, 0.003, 1)
+    normals = estimate_normals(scene.points, method="pca", k=20).normals
+    front = (-3 * scene.normals).float().numpy()
+    return Cloud(scene.points.numpy().astype(np.float64) + 5e5, front=front), normals, scene
+
+
+def agrees(normals, truth):
+    return (normals * truth.to(normals)).sum(dim=1) > 0
+
+
+def test_normals_look_to_the_front_whatever_signs_they_had(room):
+    cloud, normals, scene = room
+    for signs in (1, -1):
+        turned = orient_cloud(cloud, signs * normals)
+        assert agrees(turned, -scene.normals)[normals.any(dim=1)].all()
+        assert torch.equal(turned.abs(), normals.abs())
+    assert torch.equal(
+        orient_cloud(cloud, normals, "interior"), orient_normals(cloud.points, normals)
+    )
+
+
+def test_without_a_front_rooms_are_seen_from_inside(room):
+    cloud, normals, scene = room
+    turned = orient_cloud(replace(cloud, front=None), normals)
+    assert torch.equal(turned, orient_normals(cloud.points, normals))
+    assert agrees(turned, scene.normals).double().mean() > 0.9
+
+
+def test_up_and_none_and_a_viewpoint_are_what_they_say(room):
+    cloud, normals, _ = room
+    assert orient_cloud(cloud, normals, "none") is normals
+    assert torch.equal(
+        orient_cloud(cloud, normals, "up"), orient_normals(cloud.points, normals, towards="+z")
+    )
+    place = cloud.coordinates.mean(axis=0)
+    turned = orient_cloud(cloud, normals, "viewpoint", viewpoint=place)
+    arms = torch.from_numpy(place - cloud.coordinates)
+    assert ((turned.double() * arms).sum(dim=1) > -1e-4).all()
+
+
+def test_few_points_without_a_front_follow_the_nearest_that_have_one(room):
+    cloud, normals, scene = room
+    front = cloud.front.copy()
+    lost = torch.randperm(len(front), generator=torch.Generator().manual_seed(1))[:50]
+    front[lost] = 0
+    turned = orient_cloud(replace(cloud, front=front), normals)
+    # To the front, which is the outside, and not into the room.
+    assert agrees(turned[lost], -scene.normals[lost]).double().mean() > 0.85
+    order = torch.randperm(len(front), generator=torch.Generator().manual_seed(2))
+    moved = Cloud(cloud.coordinates[order], front=front[order])
+    assert torch.equal(orient_cloud(moved, -normals[order]), turned[order])
+
+
+def test_many_points_without_a_front_look_into_the_room(room):
+    cloud, normals, _ = room
+    front = cloud.front.copy()
+    front[200:] = 0
+    turned = orient_cloud(replace(cloud, front=front), normals)
+    assert torch.equal(turned[:200], orient_cloud(cloud, normals)[:200])
+    assert torch.equal(turned[200:], orient_normals(cloud.points, normals)[200:])
+
+
+def test_points_without_normals_or_place_need_no_front(room):
+    cloud, normals, scene = room
+    front, normals = cloud.front.copy(), normals.clone()
+    places = cloud.coordinates.copy()
+    front[:3000], normals[:2000], places[2000:3000] = 0, 0, np.nan
+    cloud = Cloud(places, front=front)
+    turned = orient_cloud(cloud, normals)
+    assert not turned[:2000].any()
+    assert agrees(turned[3000:], -scene.normals[3000:]).all()
+
+
+def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(room):
+    cloud, normals, _ = room
+    named = replace(cloud, source="a.ply")
+    message = r"^a\.ply: expected poses of scanners, .* got none; use interior\.$"
+    with pytest.raises(ConfigError, match=message):
+        orient_cloud(named, normals, "viewpoint")
+    # A front by poses is one of scanners.
+    posed = replace(cloud, header={"scans": ()})
+    assert torch.equal(orient_cloud(posed, normals, "viewpoint"), orient_cloud(cloud, normals))
+    with pytest.raises(ConfigError, match="expected towards to be one of viewpoint"):
+        orient_cloud(cloud, normals, "inwards")
