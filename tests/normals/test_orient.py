@@ -282,3 +282,37 @@ def test_wrong_arguments_are_refused():
         orient_normals(points, points, towards="viewpoint", viewpoint=torch.zeros(2, 3))
     with pytest.raises(ShapeError, match="expected normals of shape"):
         orient_normals(points, points[:3])
+
+
+@pytest.fixture(scope="module")
+def spoiled():
+    """Two rooms whose every tenth normal is up to 45 degrees off; the points and the truth."""
+    rng = torch.Generator().manual_seed(3)
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=1500)
+    across = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=rng), dim=1)
+    across -= (across * inwards).sum(dim=1, keepdim=True) * inwards
+    normals = inwards.clone()
+    normals[::10] += torch.nn.functional.normalize(across, dim=1)[::10]
+    return points, torch.nn.functional.normalize(normals, dim=1), inwards
+
+
+def test_single_wrong_normals_take_the_side_of_those_around_them(spoiled):
+    points, normals, inwards = spoiled
+    oriented = orient_normals(points, shuffled_signs(normals))
+    right = (oriented * inwards).sum(dim=1) > 0
+    assert right[::10].double().mean() > 0.995
+    # On their own they would be right less often.
+    near = search_knn(points, 20)
+    alone = vote_free_side(points, normals, near) > 0
+    assert alone[::10].double().mean() < right[::10].double().mean()
+
+
+def test_what_lies_apart_decides_for_itself_however_small_it_is(rng):
+    points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=1500)
+    # Fewer points than a face that decides, farther from the walls than any neighbour.
+    lamp = torch.tensor([2.0, 1.5, 2.2]) + 0.01 * torch.rand(6, 3, generator=rng)
+    lamp[:, 2] = 2.2
+    normals = torch.cat([inwards, torch.tensor([[0.0, 0, 1]]).expand(6, 3)])
+    oriented = orient_normals(torch.cat([points, lamp]), normals)
+    assert torch.equal(oriented[:-6], inwards)
+    assert (oriented[-6:, 2] < 0).all()
