@@ -90,7 +90,8 @@ def orient_normals(
       is oriented on its own.
     - ``"interior"``: into the free space of rooms: floors up, ceilings down, walls into their own
       room, furniture away from its inside. Each point votes by the free paths in front of it and
-      behind, and faces decide by majority. Several rooms, storeys and missing ceilings are
+      behind, and faces decide by majority; a few points whose normals agree with no others follow
+      the face that they are on. Several rooms, storeys and missing ceilings are
       no obstacle; a wall between two rooms is right if it is thicker than about two point spacings,
       a plate seen from both sides if normals of its faces can be told apart. A lone object seen
       from outside is turned inwards, as a room would be: use ``"consistent"`` for it.
