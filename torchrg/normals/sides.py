@@ -56,7 +56,7 @@ def orient_cloud(
         >>> from torchrg.structures import Cloud
         >>> cloud = Cloud(np.eye(3), front=np.array([[0, 0, -1]] * 3, np.float32))
         >>> orient_cloud(cloud, torch.tensor([[0.0, 0.0, 1.0]] * 3))[0] + 0
-        tensor([0., 0., -1.])
+        tensor([ 0.,  0., -1.])
     """
     if towards == "none":
         return normals

@@ -86,7 +86,7 @@ class OrientNormals(CloudTransform):
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
         >>> steps = torch.nn.Sequential(SegmentPlanes(), OrientNormals("viewpoint", (4, 4, -1)))
         >>> steps({"coord": floor})["normal"][0] + 0
-        tensor([0., 0., -1.])
+        tensor([ 0.,  0., -1.])
     """
 
     def __init__(
