@@ -234,7 +234,9 @@ def test_mask3d(converted, room):
     segments, labels = points[:, 9], points[:, 10:12]
     assert np.array_equal(coordinates, room.coord)
     assert np.array_equal(color, room.color)
-    assert np.array_equal(normals, room.normal)
+    assert np.array_equal(abs(normals), abs(room.normal))
+    # Its two faces say to which side the first four look, and the room where the others do.
+    assert np.array_equal(normals[4:], room.normal[4:])
     assert np.array_equal(segments, room.superpoint)
     assert np.array_equal(np.unique(segments), np.arange(NUM_PARTS))
     assert np.array_equal(labels[:, 0], room.category)
