@@ -136,7 +136,7 @@ def test_a_row_alone_is_done_twice(monkeypatch):
         return (tensors[0] * tensors[1][:, None],)
 
     scaled = Kernel(lambda values, factors, table: (values * factors[:, None],), ["n K", "n", "T"])
-    monkeypatch.setattr(Kernel, "_load", lambda self, signature: code)
+    monkeypatch.setattr(Kernel, "load", lambda self, signature: code)
     values, table = torch.arange(4.0).view(1, 4), torch.zeros(5)
     with compiled():
         found = scaled(values, torch.tensor([2.0]), table)
@@ -154,7 +154,7 @@ def test_a_last_row_alone_and_axes_that_follow_from_others(monkeypatch):
         return (tensors[0] + tensors[1],)
 
     added = Kernel(lambda a, b: (a + b,), ["2L+1 n", "n"])
-    monkeypatch.setattr(Kernel, "_load", lambda self, signature: code)
+    monkeypatch.setattr(Kernel, "load", lambda self, signature: code)
     with compiled():
         assert torch.equal(added(torch.ones(9, 1), torch.ones(1))[0], torch.full((9, 1), 2.0))
         assert added(torch.ones(6, 4), torch.ones(4))[0].shape == (6, 4)

@@ -1,6 +1,11 @@
 """The process of a command: ``torchrg`` and ``python -m torchrg``."""
 
+import os
 import sys
+
+if __name__ == "__main__" and not sys.flags.safe_path:
+    # Python has put the folder of the command first; what lies there is data, but for this package.
+    sys.path[:1] = sys.path[:1] if __file__ == f"{sys.path[0]}/torchrg/__main__.py" else []
 
 try:
     import signal
@@ -20,6 +25,12 @@ def main() -> int:
     written, and libraries lose or show exceptions, so the process ends on the spot. When all is
     done they come too late: what is left is Python's own end.
     """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        # One that is closed would be the next file that is opened, with all that is printed in it.
+        if getattr(sys, name) is None:
+            place = os.open(os.devnull, os.O_RDWR)
+            os.dup2(place, number)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r"))
     try:
         on_interrupts(end_at_once)
         return cli.main()

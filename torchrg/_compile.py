@@ -14,6 +14,7 @@ import json
 import multiprocessing
 import os
 import platform
+import stat
 import subprocess
 import sys
 import tempfile
@@ -29,7 +30,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg._parallel import num_cores
+from torchrg._parallel import CHILD_ENVIRONMENT, num_cores
 from torchrg.version import __version__
 
 Outputs = tuple[Tensor, ...]
@@ -61,11 +62,13 @@ results, compiled in a fifth of the time. Short kernels run up to a third faster
 
 _VARIABLES = {
     "TORCHINDUCTOR_COMPILE_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
     "AOT_INDUCTOR_COMPILE_WRAPPER_OPT_LEVEL": "O0",
     "AOT_INDUCTOR_ENABLE_LINE_TABLES": "0",
 }
 """Of the processes that compile: what calls a kernel need not be fast, and no debugger looks."""
+
+_OURS = 0o755
+"""Rights of the folder and its files: the user writes, whatever others may by default."""
 
 _MAX_CALLS = 64
 """Threads that may be inside one kernel at a time; more wait."""
@@ -106,7 +109,7 @@ class Kernel:
                 return self.function(*arguments)
             finally:
                 is_active.reset(token)
-        run = self._code.get(signature) or self._load(signature)
+        run = self._code.get(signature) or self.load(signature)
         tensors = [value.contiguous() for value in arguments if isinstance(value, Tensor)]
         if num_rows > 1:
             return run(tensors)
@@ -138,14 +141,16 @@ class Kernel:
                     return 0
         return num_rows
 
-    def _load(self, signature: Signature) -> Callable[[list[Tensor]], Outputs]:
+    def load(self, signature: Signature) -> Callable[[list[Tensor]], Outputs]:
         """Return the code, or the function itself where there is none."""
         with _lock:
             if signature not in self._code:
-                compile_kernels([(self, signature)])
-                path = self.path(signature)
-                is_there = path is not None and _is_whole(path)
-                code = _open(path) if path is not None and is_there else None
+                path, code = self.path(signature), None
+                if compile_kernels([(self, signature)]) and path is not None:
+                    try:
+                        code = _open(path)
+                    except (OSError, AttributeError, RuntimeError) as error:
+                        _give_up(str(error))
                 self._code[signature] = code or partial(self._run_eagerly, signature)
             return self._code[signature]
 
@@ -239,7 +244,8 @@ def prepare(
         announce: Called with a line of text where kernels have to be compiled first.
 
     Returns:
-        False, after a warning that says why, if there is no compiler, or no place for the code.
+        False, after a warning that says why, if there is no compiler, no place for the code that
+        nobody else can write to, or the system does not load it.
     """
     with _lock:
         if work not in _prepared:
@@ -250,7 +256,9 @@ def prepare(
                     rehearse()
             finally:
                 _needed.reset(token)
-            _prepared[work] = compile_kernels(list(found), announce)
+            _prepared[work] = compile_kernels(list(found), announce) and not any(
+                isinstance(one.load(signature), partial) for one, signature in found
+            )
         return _prepared[work]
 
 
@@ -264,12 +272,24 @@ def compile_kernels(
     """Compile those kernels that are not there yet; False, after a warning, if that fails."""
     paths = [one.path(signature) for one, signature in wanted]
     folder = cache_folder()
+    if folder is not None and not _is_safe(folder):
+        return _give_up(f"others can write to {folder}, set TORCHRG_CACHE_DIR to a folder of yours")
     missing = [path for path in paths if path is not None and not _is_whole(path)]
     if folder is not None and not missing:
         return True
     if folder is None or not os.access(folder, os.W_OK):
         return _give_up("no folder for them can be written, set TORCHRG_CACHE_DIR to one")
     announce(f"compiling kernels, {len(missing)} in all, which the next run will find done")
+    try:
+        return _compile_in(folder, wanted, paths)
+    except OSError as error:
+        return _give_up(f"{error.filename or folder}: {error.strerror or error}")
+
+
+def _compile_in(
+    folder: Path, wanted: Sequence[tuple[Kernel, Signature]], paths: Sequence[Path | None]
+) -> bool:
+    """Compile kernels to those paths in a folder that are not there when no other process does."""
     import filelock  # torch needs it too
 
     with filelock.FileLock(folder / "lock"):
@@ -290,7 +310,7 @@ def compile_kernels(
                 capture_output=True,
                 text=True,
                 check=False,
-                env=os.environ | _VARIABLES | folders,
+                env=os.environ | CHILD_ENVIRONMENT | _VARIABLES | folders,
             )
     if done.returncode:
         return _give_up((done.stderr.strip().splitlines() or ["the compiler failed"])[-1])
@@ -331,18 +351,25 @@ def _build(job: tuple[str, str, Sequence[Kind], str]) -> str:
     code = Path(str(made)).read_bytes()
     part = Path(f"{target}.{os.getpid()}")
     part.write_bytes(code + hashlib.sha256(code).digest())
+    part.chmod(_OURS)
     part.replace(target)
     return ""
 
 
 def _is_whole(path: Path) -> bool:
-    """Tell whether a file of code is there, as it was written."""
+    """Tell whether a file of code is there, as it was written, and nobody else can change it."""
     try:
-        content = path.read_bytes()
+        content = path.read_bytes() if _is_safe(path) else b""
     except OSError:
         return False
     code = content[:-_DIGEST_BYTES]
     return hashlib.sha256(code).digest() == content[-_DIGEST_BYTES:]
+
+
+def _is_safe(path: Path) -> bool:
+    """Tell whether only this user and the system's can write to a file or folder."""
+    status = path.stat()
+    return status.st_uid in (os.geteuid(), 0) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _open(path: Path) -> Callable[[list[Tensor]], Outputs]:
@@ -394,13 +421,14 @@ def cache_folder() -> Path | None:
     """Return the folder of compiled kernels; None if there is none and none can be made.
 
     It is ``$TORCHRG_CACHE_DIR``, by default ``torchrg`` in the user's folder for such files.
-    Machines of one kind may share it.
+    Machines of one kind may share it. One that other users own or can write to is not used, as
+    its code would run as this user's.
     """
     given = os.environ.get("TORCHRG_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     folder = Path(given) if given else home / "torchrg"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(_OURS, parents=True, exist_ok=True)
     except OSError:
         return folder if folder.is_dir() else None
     return folder

@@ -37,6 +37,12 @@ CHUNK_SIZE = 16384
 ROWS_AT_ONCE = 65536
 """Rows that one pass over a cloud takes at a time: few calls, and temporaries of bounded memory."""
 
+CHILD_ENVIRONMENT = dict.fromkeys(
+    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
+) | {"PYTHONSAFEPATH": "1"}
+"""Environment of every process that is started here, set before Python and its libraries read it:
+one thread, and no module from the folder that the command runs in."""
+
 _LEAST_ROWS = 4096
 """Rows at some tenths of a microsecond each that are worth a thread's start."""
 

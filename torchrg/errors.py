@@ -4,6 +4,9 @@ All exceptions are a :class:`TorchrgError`; the message says what was expected, 
 repair.
 """
 
+OUT_OF_MEMORY = "out of memory; use a machine with more, or a smaller part of the data."
+"""What is said where memory could not be had, whatever for."""
+
 
 class TorchrgError(Exception):
     """Base of every error raised by torchrg."""

@@ -1,6 +1,8 @@
 """The local engine: every scan gets its report, whatever happens to the workers."""
 
+import sys
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 
@@ -31,18 +33,35 @@ def test_failures_and_deaths_stop_no_other_scan(faults, tmp_path):
             "7_c": "kill while writing",
             "6_d": "threads",
             "5_e": "sleep 0.2",
+            "4_f": "exit",
         },
     )
     reports = run(jobs)
-    assert {name for name, report in reports.items() if report.status == "failed"} == {"8_b", "7_c"}
-    assert "killed by SIGKILL, twice, the second time alone" in reports["7_c"].reason
+    failed = {name for name, report in reports.items() if report.status == "failed"}
+    assert failed == {"8_b", "7_c", "4_f"}
+    end = "twice, the second time alone"
+    assert (
+        reports["7_c"].reason == f"its process was killed by SIGKILL, {end}; is the memory enough?"
+    )
+    assert reports["4_f"].reason == f"its process ended with 7, {end}"
     assert [reports[name].attempts for name in ("9_a", "8_b", "7_c", "6_d")] == [2, 1, 2, 1]
     assert not list((tmp_path / "out" / "7_c").iterdir())
     # Scans that were lost come again after all others, one at a time.
     log = log_of(tmp_path)
     again = [name for name, what in log if what != "done"][len(jobs) :]
-    assert sorted(again) == ["7_c", "9_a"]
+    assert sorted(again) == ["4_f", "7_c", "9_a"]
     assert log.index(("5_e", "done")) < log.index(("9_a", "done"))
+
+
+def test_a_worker_that_cannot_begin_is_told_by_its_cause(faults, tmp_path, capfd):
+    jobs = faults.make_jobs(tmp_path, {"9_a": "plain"})
+    # Workers do not find the module of their tasks.
+    sys.path.remove(str(Path(faults.__file__).parent))
+    assert run(jobs)["9_a"].reason == (
+        "its process ended with 1, twice, the second time alone: ModuleNotFoundError: No module "
+        "named 'faults'"
+    )
+    assert capfd.readouterr().err == ""
 
 
 def test_the_largest_begin_first_and_share_the_memory(faults, tmp_path):

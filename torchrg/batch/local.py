@@ -10,16 +10,17 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
 
+from torchrg._parallel import CHILD_ENVIRONMENT
 from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import spare_memory
 from torchrg.batch.task import Reports, Task, TaskReport
 
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
-)
-"""Environment of a worker, set before the libraries that read it are loaded."""
 BEAT_SECONDS = 0.5
 """How often an engine yields while no task ends, so that progress is shown and Ctrl-C is heard."""
+_STDERR = 2
+"""Number of the stream for errors, of every process."""
+_LONGEST_CAUSE = 300
+"""Characters, some lines of a terminal, that a report shows of what a process said last."""
 
 
 def run_here(tasks: Sequence[Task]) -> Reports:
@@ -120,9 +121,12 @@ class _Worker:
     def __init__(self, lock: DirectoryLock | None) -> None:
         context = get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, lock))
-        with _one_thread(), _no_interrupts():
+        # What ends it before its first task is a line of a report, no traceback on the terminal.
+        self.errors, errors = os.pipe()
+        with _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
+            self.process = context.Process(target=_serve, args=(theirs, lock, stderr))
             self.process.start()
+        os.close(errors)
         theirs.close()
 
     def begin(self, task: Task, *, attempt: int) -> None:
@@ -145,12 +149,19 @@ class _Worker:
         """Return the report of a task whose worker died."""
         code = self.process.exitcode or 0
         end = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-        return TaskReport(
-            self.task.name,
-            "failed",
-            reason=f"its process {end}, twice, the second time alone; is the memory enough?",
-            attempts=self.attempt,
-        )
+        reason = f"its process {end}, twice, the second time alone"
+        if cause := self._cause():
+            reason = f"{reason}: {cause}"
+        if code == -signal.SIGKILL or cause.startswith("MemoryError"):
+            reason = f"{reason}; is the memory enough?"
+        return TaskReport(self.task.name, "failed", reason=reason, attempts=self.attempt)
+
+    def _cause(self) -> str:
+        """Return what the process said last before its first task, in one line, or nothing."""
+        lines = self.said.decode(errors="replace").splitlines()
+        # A message goes on in lines that are set in; before it is the traceback.
+        begins = [number for number, line in enumerate(lines) if line[:1].strip()]
+        return " ".join(" ".join(lines[begins[-1] :]).split())[:_LONGEST_CAUSE] if begins else ""
 
     def stop(self) -> None:
         """End the process, and remove what it was writing."""
@@ -160,12 +171,18 @@ class _Worker:
             self.process.kill()
             self.process.join()
         self.pipe.close()
+        os.set_blocking(self.errors, False)
+        with os.fdopen(self.errors, "rb") as errors:
+            self.said = errors.read() or b""
         if hasattr(self, "task"):
             self.task.clean()
 
 
-def _serve(pipe: Connection, lock: DirectoryLock | None) -> None:
-    """Run tasks until the pipe closes; the lock is held by being here."""
+def _serve(pipe: Connection, lock: DirectoryLock | None, stderr: Connection | None) -> None:
+    """Run tasks until the pipe closes; the lock is held by being here.
+
+    ``stderr`` is where errors go from the first task on.
+    """
     import torch
 
     Thread(target=_end_with_parent, daemon=True).start()
@@ -175,6 +192,10 @@ def _serve(pipe: Connection, lock: DirectoryLock | None) -> None:
             task = pipe.recv()
         except EOFError:
             return
+        if stderr is not None:
+            os.dup2(stderr.fileno(), _STDERR)
+            stderr.close()
+            stderr = None
         pipe.send(task.run())
 
 
@@ -187,10 +208,10 @@ def _end_with_parent() -> None:
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let processes that are started here use one thread each."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
+def _environment() -> Iterator[None]:
+    """Start processes in the environment for them."""
+    before = {name: os.environ.get(name) for name in CHILD_ENVIRONMENT}
+    os.environ.update(CHILD_ENVIRONMENT)
     try:
         yield
     finally:
@@ -211,3 +232,22 @@ def _no_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+@contextlib.contextmanager
+def _stderr_to(pipe: int) -> Iterator[Connection | None]:
+    """Start processes whose errors go to a pipe, and yield what they return to ours with.
+
+    It is None where this process has closed its own.
+    """
+    try:
+        ours = Connection(os.dup(_STDERR), readable=False)
+    except OSError:
+        yield None
+        return
+    os.dup2(pipe, _STDERR)
+    try:
+        yield ours
+    finally:
+        os.dup2(ours.fileno(), _STDERR)
+        ours.close()

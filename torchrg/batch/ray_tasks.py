@@ -1,10 +1,12 @@
 """The Ray engine: what Ray knows about retries and nodes serves."""
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 from torchrg._optional import require
-from torchrg.batch.local import BEAT_SECONDS, ONE_THREAD
+from torchrg._parallel import CHILD_ENVIRONMENT
+from torchrg.batch.local import BEAT_SECONDS
 from torchrg.batch.task import Reports, Task, TaskReport
 
 _RETRIES = 3
@@ -46,13 +48,15 @@ def run_ray(
         "object_store_memory": _OBJECT_STORE_BYTES,
         "include_dashboard": False,
     }
-    ray.init(
-        address=address or "local",
-        logging_level="error",
-        log_to_driver=False,
-        runtime_env={"env_vars": ONE_THREAD},
-        **({} if address else started),
-    )
+    # Ray lets its processes import from the folder it is called in: one where no data are.
+    with contextlib.chdir("/"):
+        ray.init(
+            address=address or "local",
+            logging_level="error",
+            log_to_driver=False,
+            runtime_env={"env_vars": CHILD_ENVIRONMENT},
+            **({} if address else started),
+        )
     pending: dict[Any, Task] = {}
     try:
         largest = max(

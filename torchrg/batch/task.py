@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.errors import PrecisionWarning, TorchrgError
+from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError
 from torchrg.io.files import is_disk_full
 
 
@@ -147,7 +147,7 @@ class _StageClock:
 def _reason(error: Exception) -> str:
     """Return an error as one line that names the file where it can."""
     if _is_out_of_memory(error):
-        return "out of memory; lower --chunk-size, or use a machine with more."
+        return OUT_OF_MEMORY
     if isinstance(error, OSError):
         return f"{error.filename or 'a file'}: {error.strerror or error}."
     text = " ".join(str(error).split())

@@ -16,7 +16,7 @@ from torchrg.cli.ending import (
     fail,
     raising_interrupts,
 )
-from torchrg.errors import ConfigError, PrecisionWarning, TorchrgError
+from torchrg.errors import OUT_OF_MEMORY, ConfigError, PrecisionWarning, TorchrgError
 
 COMMANDS = {
     "segment": "label the planes of scans",
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except TorchrgError as error:
         return fail(str(error))
     except MemoryError:
-        return fail("out of memory; lower --chunk-size, or split the cloud.")
+        return fail(f"{name}: {OUT_OF_MEMORY}")
     except OSError as error:
         # What could not be printed Python would try again when it ends, and complain.
         with suppress(UnsupportedOperation, AttributeError):

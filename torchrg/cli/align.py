@@ -107,7 +107,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
         _write_matrix(arguments.matrix, whole.numpy())
     tilt, turn = _angles(whole)
     seconds = time.perf_counter() - begin
-    print(
+    console.say(
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
         f"{seconds:.1f} s -> {target}"
     )

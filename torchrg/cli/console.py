@@ -21,6 +21,8 @@ from torchrg.cli.ending import INTERRUPTED as INTERRUPTED
 from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
 from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
 from torchrg.cli.ending import fail as fail
+from torchrg.cli.ending import printable as printable
+from torchrg.cli.ending import say as say
 from torchrg.cli.ending import warn as warn
 from torchrg.cli.help import format_help, list_flags
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
@@ -44,7 +46,7 @@ def warnings_as_lines() -> Iterator[None]:
         warnings.simplefilter("always", UserWarning)
         yield
     for warning in caught:
-        warn(str(warning.message))
+        warn(" ".join(str(warning.message).split()))
 
 
 def parse(
@@ -80,10 +82,15 @@ def parse(
 
 
 def _nearest(message: str, kind: type) -> str:
-    """Return a question where a message is on a flag that is none, and one is much like it."""
-    wrong = re.search(r"^Unrecognized options: (--[\w.-]+)", message)
+    """Return a question where a message is on a flag that is none: one like it, or a file."""
+    wrong = re.search(r"^Unrecognized options: (-[^ ]+)", message)
+    if wrong is None:
+        return ""
+    # A file whose name begins as a flag does.
+    file = Path(wrong[1].rstrip("."))
     names = [flag.name for flag in list_flags(kind)]
-    found = difflib.get_close_matches(wrong[1], names, n=1) if wrong else []
+    found = difflib.get_close_matches(wrong[1], names, n=1)
+    found = [f"./{file}"] if os.path.lexists(file) else found
     return f" Did you mean {found[0]}?" if found else ""
 
 
@@ -179,6 +186,12 @@ ColumnsFlag = Annotated[
     ),
 ]
 """Type of the argument --columns."""
+
+
+_MOST_THREADS = 1024
+"""More than any machine has cores; many more cannot be started, and torch ends with the process."""
+_MOST_GIGABYTES = 1_000_000
+"""A petabyte, more than any machine has memory."""
 
 
 CompileFlag = Annotated[
@@ -306,28 +319,31 @@ def _is_archive(target: Path) -> bool:
 def prepared(settings: PlaneSettings) -> PlaneSettings:
     """Compile the kernels that the settings need if they ask for it; a line says so."""
     with warnings_as_lines():
-        found = prepare_kernels(settings.resolved, announce=lambda text: print(text, flush=True))
+        found = prepare_kernels(settings.resolved, announce=say)
     return dataclasses.replace(settings, resolved=found)
 
 
 def prepared_for_depth(wanted: bool) -> bool:
     """Compile the kernels of depth images if that is wanted, and tell whether it was done."""
     with warnings_as_lines():
-        return wanted and prepare_depth_kernels(lambda text: print(text, flush=True))
+        return wanted and prepare_depth_kernels(say)
 
 
 def use_threads(threads: int | None) -> None:
     """Let torch use so many threads; None leaves it to torch."""
-    if threads is not None and threads < 1:
-        raise ConfigError(f"expected --threads >= 1, got {threads}.")
+    if threads is not None and not 1 <= threads <= _MOST_THREADS:
+        raise ConfigError(f"expected --threads from 1 to {_MOST_THREADS:,}, got {threads}.")
     if threads is not None:
         torch.set_num_threads(threads)
 
 
 def check_engine(limit_memory: float | None, engine: str, ray_address: str | None) -> None:
     """Refuse what is said about memory and the engine where it makes no sense."""
-    if limit_memory is not None and not limit_memory > 0:
-        raise ConfigError(f"expected --limit-memory > 0, in GB, got {limit_memory}.")
+    if limit_memory is not None and not 0 < limit_memory <= _MOST_GIGABYTES:
+        raise ConfigError(
+            f"expected --limit-memory above 0 and at most {_MOST_GIGABYTES:,} GB, got "
+            f"{limit_memory}."
+        )
     if ray_address is not None and engine != "ray":
         raise ConfigError("expected --ray-address together with --engine ray.")
 
@@ -335,7 +351,9 @@ def check_engine(limit_memory: float | None, engine: str, ray_address: str | Non
 @contextlib.contextmanager
 def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
     """Show a progress bar on a terminal; what is yielded is called as each stage begins."""
-    with tqdm(total=len(stages), desc=name, unit="stage", leave=False, disable=None) as bar:
+    with tqdm(
+        total=len(stages), desc=printable(name), unit="stage", leave=False, disable=None
+    ) as bar:
 
         def advance(stage: str) -> None:
             bar.set_postfix_str(stage)
@@ -353,7 +371,7 @@ def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         hall     1,000
         office      20
     """
-    table = [list(head), *map(list, rows)]
+    table = [list(map(printable, row)) for row in (head, *rows)]
     widths = [max(len(row[column]) for row in table) for column in range(len(head))]
     numeric = [
         all(row[column][:1].isdigit() or row[column] == "" for row in table[1:])

@@ -365,7 +365,7 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
             entries.append(draw_entry(folder, name, read_result(job.folder), words=words))
         except (TorchrgError, OSError) as error:
             console.warn(f"{name}: no page: {error}")
-    print(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
+    console.say(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
 
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
@@ -386,7 +386,7 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     more = f"{state}, {out / REPORT} says more."
     code = finish(report, out, unit="scan", failed=more)
     if code == 0:
-        print(f"{state} -> {out}")
+        console.say(f"{state} -> {out}")
     return code
 
 
@@ -446,7 +446,7 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
         ]
     )
     notes = [
-        f"{scan.name}: {note}"
+        console.printable(f"{scan.name}: {note}")
         for scan in shown
         for note in (
             *(f"repaired: {text}" for text in scan.repairs),

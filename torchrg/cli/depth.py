@@ -256,7 +256,7 @@ def _label_one(job: FrameJob) -> int:
     found, words = job.label()
     for warning in found.warnings:
         console.warn(f"{job.name}: {warning}")
-    print(f"{job.name}: {words}, {time.perf_counter() - begin:.1f} s -> {job.target}")
+    console.say(f"{job.name}: {words}, {time.perf_counter() - begin:.1f} s -> {job.target}")
     return 0
 
 
@@ -280,7 +280,7 @@ def _label_sequence(jobs: Sequence[FrameJob], arguments: Arguments) -> int:
         tell_failure(frame)
     code = finish(report, arguments.out, unit="frame")
     num_new = len(report.with_status("converted"))
-    print(
+    console.say(
         f"{len(report.complete):,} of {len(jobs):,} frames, "
         f"{sum(frame.num_regions for frame in report.complete):,} planes, {report.seconds:,.1f} s, "
         f"{num_new / max(report.seconds, 1e-9):.2f} frames a second -> {arguments.out}"

@@ -1,4 +1,4 @@
-"""How commands end: with one line and an exit code, also when they are interrupted."""
+"""Lines that commands print, and how they end: with one line and an exit code, interrupted too."""
 
 import contextlib
 import os
@@ -20,9 +20,26 @@ _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Ctrl-C, and what batch systems send."""
 
 
+def printable(text: str) -> str:
+    r"""Return text in which what moves the cursor, or turns or hides text, is written as escapes.
+
+    Names of files and fields may hold such characters, and bytes that are no text.
+
+    Example:
+        >>> printable("caf\u00e9 \x1b[31m\n\u202e\udce9")
+        'café \\x1b[31m\\n\\u202e\\udce9'
+    """
+    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
+
+
+def say(*lines: str) -> None:
+    """Print lines on stdout."""
+    print(*map(printable, lines), sep="\n", flush=True)
+
+
 def fail(message: str, *, code: int = USAGE_ERROR) -> int:
     """Print one line on stderr and return the exit code."""
-    print(f"torchrg: {' '.join(message.split())}", file=sys.stderr)
+    print(f"torchrg: {printable(message)}", file=sys.stderr)
     return code
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from torchrg.cli.console import ColumnNames, ColumnsFlag, parse
+from torchrg.cli.console import ColumnNames, ColumnsFlag, parse, say
 from torchrg.io import read_cloud
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.structures import Cloud
@@ -37,9 +37,9 @@ def run(argv: list[str]) -> int:
     names = ColumnNames.parse(arguments.columns, [arguments.file])
     cloud = read_cloud(arguments.file, columns=names.of(arguments.file))
     for name, value in describe_cloud(cloud).items():
-        print(f"{name:<12}{value}")
+        say(f"{name:<12}{value}")
     for note in filter(None, (*cloud.notes, cloud.precision_note)):
-        print(f"{'note':<12}{note}")
+        say(f"{'note':<12}{note}")
     return 0
 
 

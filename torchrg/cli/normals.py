@@ -120,4 +120,4 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
     without = console.without(target, cloud.fields)
-    print(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}{without}")
+    console.say(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}{without}")

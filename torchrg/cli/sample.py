@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from torchrg.cli.console import parse
+from torchrg.cli.console import parse, say
 from torchrg.io import check_output, write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -39,5 +39,5 @@ def run(argv: list[str]) -> int:
     fields = {"labels": room.labels.numpy(), "normals": room.normals.numpy()}
     write_cloud(arguments.out, Cloud(room.points.numpy(), fields))
     num_faces = int(room.labels.max()) + 1
-    print(f"{arguments.out}: {len(room.points):,} points, {num_faces} faces")
+    say(f"{arguments.out}: {len(room.points):,} points, {num_faces} faces")
     return 0

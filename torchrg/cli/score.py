@@ -118,7 +118,7 @@ def run(argv: list[str]) -> int:
         rows, printed = {predicted.stem: scores}, scores
     if arguments.csv is not None:
         with atomic_path(arguments.csv) as path:
-            path.write_text(_as_csv(rows), encoding="utf-8")
+            path.write_text(_as_csv(rows), encoding="utf-8", errors="surrogateescape")
     if arguments.json:
         print(json.dumps(printed))
         return 0

@@ -159,7 +159,7 @@ def run(argv: list[str]) -> int:
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
-        print(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
+        console.say(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
 
 
@@ -273,11 +273,10 @@ def _segment_tiles(
     arguments = dataclasses.replace(arguments, orient="none")
     fields = _check_points(arguments, source, stream, target)
     folder = folder_of_work(target, arguments.workdir)
-    print(
+    console.say(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
         f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {folder}, from "
-        "which the same command goes on; normals keep their signs, as with --orient none",
-        flush=True,
+        "which the same command goes on; normals keep their signs, as with --orient none"
     )
     with tqdm(unit="tile", leave=False, disable=None) as bar:
 
@@ -289,7 +288,7 @@ def _segment_tiles(
         with segmented_in_tiles(
             sources,
             stream,
-            folder,
+            folder.absolute(),
             settings,
             tile_size=tile_size,
             target=target,
@@ -401,7 +400,7 @@ def _segment_whole(
         _draw(arguments, picture, Result.of(cloud, seg, parts))
     if parts is not None:
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
-        print(f"{source}: superpoints of each level: {found}")
+        console.say(f"{source}: superpoints of each level: {found}")
     without = console.without(target, cloud.fields)
     _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
 
@@ -454,7 +453,7 @@ def _report(source: str, seg: Segmentation, extent: Extent, target: str, seconds
         console.warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes.count)
     share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
-    print(
+    console.say(
         f"{source}: {num_points:,} points, {num_planes:,} planes, {share:.1f} % of the points "
         f"labelled, {seconds:.1f} s -> {target}"
     )

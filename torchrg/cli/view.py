@@ -15,6 +15,7 @@ from torchrg.cli.console import (
     check_drawing,
     is_page,
     parse,
+    say,
     warn,
 )
 from torchrg.errors import ConfigError
@@ -87,7 +88,7 @@ def run(argv: list[str]) -> int:
     up = None if arguments.up is None else _direction(arguments.up)
     write = _write_page if is_page(arguments.out) else _write_picture
     said = write(arguments, _read(arguments.file, arguments), up)
-    print(f"{arguments.file} -> {arguments.out} ({said})")
+    say(f"{arguments.file} -> {arguments.out} ({said})")
     return 0
 
 

@@ -28,6 +28,7 @@ DAMAGES = (
     SyntaxError,
     tokenize.TokenError,
     struct.error,
+    tokenize.TokenError,
 )
 """What libraries raise on damaged files beside their own errors, found by flipping bytes."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -98,5 +98,5 @@ def write_index(folder: Path, title: str, entries: Sequence[Entry]) -> Path:
     """
     text = template_of("gallery.html.jinja").render(title=title, entries=entries)
     with atomic_path(folder / INDEX) as beside:
-        beside.write_text(text, encoding="utf-8")
+        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
     return folder / INDEX

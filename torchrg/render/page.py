@@ -192,7 +192,7 @@ def write_page(path: str | os.PathLike[str], page: Page) -> None:
         FormatError: If the file cannot be written.
     """
     with atomic_path(path) as beside:
-        beside.write_text(page.html, encoding="utf-8")
+        beside.write_text(page.html, encoding="utf-8", errors="backslashreplace")
 
 
 def check_library() -> None:
