@@ -1,6 +1,7 @@
 """Argument checks that never read tensor values, so they cost no device synchronisation."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeGuard, TypeVar, get_args
 
@@ -195,10 +196,33 @@ def has_values(*tensors: Tensor | None) -> bool:
         return False
 
 
+def _plain(value: object) -> object:
+    """Return tensors of a class of somebody's own, whose results would be too, as tensors."""
+    return value.as_subclass(Tensor) if is_tensor(value) and type(value) is not Tensor else value
+
+
+@contextmanager
+def made_on_cpu() -> Iterator[None]:
+    """Let tensors be made on the CPU here, though ``torch.set_default_device`` names another.
+
+    Example:
+        >>> with torch.device("meta"), made_on_cpu():
+        ...     torch.zeros(2).device
+        device(type='cpu')
+    """
+    if torch.get_default_device().type == "cpu":
+        yield
+        return
+    with torch.device("cpu"):
+        yield
+
+
 def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Keep compilers out of a function of clouds, and refuse tensors without values.
 
-    A compiler breaks its graph there and compiles the rest of the model.
+    A compiler breaks its graph there and compiles the rest of the model. What the function makes
+    without a word about the device is on the CPU, whatever ``torch.set_default_device`` says.
+    Subclasses of tensors are taken as tensors.
     """
 
     @wraps(function)
@@ -212,7 +236,9 @@ def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
                 f"{function.__name__}: expected points with values, got those of vmap, torch.func "
                 "or the meta device; functions of clouds run outside of them."
             )
-        return function(*args, **kwargs)
+        with made_on_cpu():
+            plain: Callable[..., Result] = function
+            return plain(*map(_plain, args), **{name: _plain(kwargs[name]) for name in kwargs})
 
     return call
 

@@ -142,7 +142,7 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, cap
     [
         (["rooms", "IN", "OUT"], "expected a kind of data set (s3dis, folder"),
         (["folder", "IN", "OUT", "--workers", "0"], "expected --workers >= 1, got 0"),
-        (["folder", "IN", "OUT", "--limit-memory", "0"], "expected --limit-memory > 0"),
+        (["folder", "IN", "OUT", "--limit-memory", "0"], "expected --limit-memory above 0"),
         (["folder", "IN", "OUT", "--chunk-size", "0"], "expected --chunk-size >= 1"),
         (["folder", "IN", "OUT", "--ray-address", "auto"], "together with --engine ray"),
         (["folder", "IN", "OUT", "--engine", "spark"], "engine"),

@@ -105,7 +105,13 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
             ("--limit-memory", "0.1"),
             "a.npz: expected --limit-memory of at least 0.54 GB for about 20,000",
         ),
-        (("--limit-memory", "-1"), "expected --limit-memory > 0, in GB, got -1"),
+        (
+            ("--limit-memory", "-1"),
+            "expected --limit-memory above 0 and at most 1,000,000 GB, got -1",
+        ),
+        (("--limit-memory", "inf"), "at most 1,000,000 GB, got inf"),
+        (("--limit-memory", "nan"), "at most 1,000,000 GB, got nan"),
+        (("--threads", "100000"), "expected --threads from 1 to 1,024, got 100000"),
         (
             ("--limit-memory", LIMIT, "--merge", "--superpoints"),
             "expected no --superpoints for a cloud .* no tile tells it; raise --limit-memory",

@@ -306,7 +306,10 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
         ([str(frame), *CAMERA[:2], *out], "frame.png: expected --depth-scale, which depth images"),
         ([str(frame), "--intrinsics", "1,2,3", *CAMERA[2:], *out], "four numbers without blanks"),
         ([str(frame), str(frame), *CAMERA, *out], "expected a directory for 2 inputs"),
-        ([str(frame), *CAMERA[:4], "--threads", "0", *out], "expected --threads >= 1, got 0"),
+        (
+            [str(frame), *CAMERA[:4], "--threads", "0", *out],
+            "expected --threads from 1 to 1,024, got 0",
+        ),
         ([str(frame), *CAMERA, "--workers", "0", *out], "expected --workers >= 1, got 0"),
         ([str(tmp_path / "list.pcd"), *out], "expected an organised cloud"),
         ([str(tmp_path / "turned.pcd"), *out], "expected points of a pinhole camera"),

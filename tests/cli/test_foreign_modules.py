@@ -25,7 +25,7 @@ def folder(tmp_path):
     for name in ("in", "here"):
         (tmp_path / name).mkdir()
     for seed, name in enumerate("ab"):
-        points = make_room(num_points=20_000, noise=0.003, seed=seed).points
+        points = make_room(num_points=40_000, noise=0.003, seed=seed).points
         np.save(tmp_path / "in" / f"{name}.npy", points[:2000])
         np.save(tmp_path / "here" / f"{name}.npy", points)
         np.save(tmp_path / "here" / f"depth_{name}.npy", np.full((60, 80), 2.0, np.float32))
@@ -43,11 +43,11 @@ def folder(tmp_path):
             ("depth", "depth_a.npy", "depth_b.npy", *CAMERA, "--out", "../out", "--workers", "2"),
             marks=pytest.mark.slow,
         ),
-        pytest.param((*SEGMENT, "--limit-memory", "0.53"), marks=pytest.mark.slow),
+        pytest.param((*SEGMENT, "--limit-memory", "0.542"), marks=pytest.mark.slow),
         pytest.param((*SEGMENT, "--compile"), marks=pytest.mark.slow),
         pytest.param((*CONVERT, "--engine", "ray"), marks=[pytest.mark.slow, needs_ray]),
         pytest.param(
-            (*SEGMENT, "--limit-memory", "0.53", "--engine", "ray"),
+            (*SEGMENT, "--limit-memory", "0.542", "--engine", "ray"),
             marks=[pytest.mark.slow, needs_ray],
         ),
     ],
@@ -73,5 +73,5 @@ def test_no_module_beside_the_scans_is_run(folder, arguments):
 def test_the_module_called_as_a_command_runs_none_of_them(folder):
     command = [sys.executable, "-m", "torchrg", "info", "a.npy"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert "20,000 of float32" in done.stdout, done.stderr
+    assert "40,000 of float32" in done.stdout, done.stderr
     assert not (folder.parent / "ran").exists(), (folder.parent / "ran").read_text()

@@ -133,7 +133,7 @@ def test_bad_points_stay_in_place(tmp_path, capsys):
             "by viewpoint, got none; pass --viewpoint X Y Z, or --orient interior",
         ),
         (["--viewpoint", "0", "0", "0"], "--viewpoint X Y Z together with --orient viewpoint"),
-        (["--threads", "0"], "expected --threads >= 1, got 0"),
+        (["--threads", "0"], "expected --threads from 1 to 1,024, got 0"),
         (["--chunk-size", "0"], "expected --chunk-size >= 1, got 0"),
     ],
 )

@@ -138,7 +138,10 @@ def test_scannet_frames_have_files_of_their_own(tmp_path):
             write_color(root / "color" / f"{number}.jpg")
         write_text(root / "pose" / "0.txt", POSE_ROWS)
         write_text(root / "pose" / "1.txt", "-inf -inf -inf -inf\n" * 4)
-        write_text(root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n" * 2)
+        write_text(
+            root / "intrinsic" / "intrinsic_depth.txt",
+            "577 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n",
+        )
     data = RGBDFrames.from_folder(tmp_path, "scannet")
     assert len(data) == 4
     assert data.scenes[2].name == "scene0000_01/0"

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrg._parallel import num_cores
 from torchrg.batch.local import run_here, run_local
 from torchrg.batch.lock import DirectoryLock
+from torchrg.batch.memory import available_memory
 from torchrg.batch.records import describe_run, write_record
 from torchrg.batch.run import make_plan
 from torchrg.batch.scans import Job, Scan
@@ -43,6 +44,8 @@ _COLORED_FROM = 200
 colour. Choosing colours from all pixels would take as long as finding the planes."""
 _NO_IMAGES = ("planes", "points")
 """Parts of a segmentation of an image that are no images."""
+_LEAST_BYTES_A_PIXEL = 300
+"""Memory that labelling takes at least for each pixel."""
 _FRAMES_OF_WORKER = 8
 """Least number of frames for each worker where no number of workers is given. To start one takes as
 long as some frames of 640 x 480 pixels take."""
@@ -131,6 +134,7 @@ class FrameJob(Job):
         """
         target, is_labels = self.target, _is_png(self.target)
         description = self.describe() if is_labels else {}
+        _check_memory(self.inputs[0])
         cloud, depth, intrinsics = _read_frame(self.inputs[0], self.source)
         check_place(target) if is_labels else check_output(target, cloud)
         # Results are about the cloud's origin.
@@ -234,6 +238,17 @@ def _list_jobs(sources: tuple[Path, ...], arguments: Arguments) -> list[FrameJob
         FrameJob(source, scan, target.parent, target=target, picture=picture)
         for scan, target, picture in zip(scans, targets, pictures, strict=True)
     ]
+
+
+def _check_memory(image: Path) -> None:
+    """Refuse a PNG that says it has more pixels than memory has room for, before it is read."""
+    size, free = num_pixels(image) if _is_png(image) else 0, available_memory()
+    if (needed := size * _LEAST_BYTES_A_PIXEL) > free:
+        raise FormatError(
+            f"{image}: expected an image that memory has room for, got {size:,} pixels, which take "
+            f"at least {needed / 1e9:,.1f} GB of {free / 1e9:,.1f} that are free; make it smaller, "
+            "or use a machine with more."
+        )
 
 
 def _is_png(path: Path) -> bool:

@@ -27,13 +27,12 @@ from torchrg.datasets.rgbd_files import (
     known_pose,
     read_color,
     read_depth,
-    read_intrinsics,
     read_matrix,
     read_nearest,
     read_timed,
     read_trajectory,
 )
-from torchrg.depth.camera import make_intrinsics
+from torchrg.depth.camera import check_camera, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -85,6 +84,7 @@ class RGBDFrame:
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
+        check_camera("RGBDFrame", self.intrinsics)
         if not 0 < self.depth_scale < float("inf"):
             raise ConfigError(
                 f"RGBDFrame: expected depth_scale > 0, the stored value of one metre, got "
@@ -303,7 +303,8 @@ def _find_scannet(
     frames = []
     for name, folder in _recordings(root, "depth"):
         calibration = folder / "intrinsic" / "intrinsic_depth.txt"
-        camera = read_intrinsics(calibration) if intrinsics is None else intrinsics
+        camera = read_matrix(calibration)[:3, :3] if intrinsics is None else intrinsics
+        check_camera(f"{calibration if intrinsics is None else root}", camera)
         frames += [
             _posed_frame(
                 image,

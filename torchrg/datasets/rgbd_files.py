@@ -141,17 +141,6 @@ def read_matrix(path: Path) -> Tensor:
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)
 
 
-def read_intrinsics(path: Path) -> Tensor:
-    """Read a camera matrix, shape ``(3, 3)``, float64, from one of four rows of four numbers."""
-    camera = read_matrix(path)[:3, :3]
-    if not bool((camera.abs() <= FARTHEST).all()) or not bool((camera.diagonal() > 0).all()):
-        raise FormatError(
-            f"{path}: expected a camera matrix of focal lengths above 0, got {camera.tolist()}; "
-            "fetch it again."
-        )
-    return camera
-
-
 def known_pose(matrix: Tensor) -> Tensor | None:
     """Return a pose, or None for one that is not finite or leads nowhere: tracking was lost."""
     return matrix if bool((matrix.abs() <= FARTHEST).all()) else None

@@ -5,8 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_shapes, has_values
 from torchrg.errors import ConfigError
+from torchrg.structures import FARTHEST
 
 
 def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = None) -> Tensor:
@@ -30,6 +31,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
+        ConfigError: If a camera matrix is none.
 
     Example:
         >>> camera = torch.tensor([[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
@@ -66,13 +68,37 @@ def read_intrinsics(caller: str, given: Any) -> Tensor:  # noqa: ANN401
 
     Raises:
         ShapeError: If it is no tensor, array or camera.
+        ConfigError: If it is no matrix of a pinhole camera without skew.
 
     Example:
         >>> read_intrinsics("f", torch.eye(4)[None]).shape
         torch.Size([1, 3, 3])
     """
     tensor = as_tensor(caller, "intrinsics", getattr(given, "camera_matrix", given))
-    return tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
+    tensor = tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
+    if tensor.shape[-2:] == (3, 3) and has_values(tensor):
+        check_camera(caller, tensor)
+    return tensor
+
+
+def check_camera(caller: str, intrinsics: Tensor) -> None:
+    """Raise ConfigError where one of some matrices ``(*, 3, 3)`` is that of no camera.
+
+    Example:
+        >>> check_camera("f", torch.diag(torch.tensor([50.0, 0.0, 1.0])))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ConfigError: f: expected intrinsics of rows (fx, 0, cx), (0, fy, cy), ...
+    """
+    matrices = intrinsics.detach().reshape(-1, 3, 3).double().cpu()
+    focal = matrices.diagonal(dim1=1, dim2=2)[:, :2]
+    others = matrices[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    is_camera = (matrices.abs() <= FARTHEST).all() and focal.reciprocal().isfinite().all()
+    if not (is_camera and (others == others.new_tensor([0, 0, 0, 0, 1])).all()):
+        raise ConfigError(
+            f"{caller}: expected intrinsics of rows (fx, 0, cx), (0, fy, cy), (0, 0, 1), finite, "
+            f"with fx and fy not 0, got {intrinsics.tolist()}."
+        )
 
 
 def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
@@ -102,7 +128,8 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
         >>> make_intrinsics(525, 525, 319.5, 239.5)[0].tolist()
         [525.0, 0.0, 319.5]
     """
-    matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    rows = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    matrix = torch.tensor(rows, dtype=torch.float64, device="cpu")
     if not bool(matrix.isfinite().all()) or fx == 0 or fy == 0:
         raise ConfigError(
             "make_intrinsics: expected finite fx, fy, cx, cy with fx and fy not 0, got "

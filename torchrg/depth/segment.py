@@ -54,6 +54,7 @@ def segment_depth(
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
+        ConfigError: If ``intrinsics`` is no matrix of a camera.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])

@@ -238,7 +238,7 @@ def closest_between(directions: Tensor, clusters: Tensor) -> float:
         return 0.0
     new = torch.cat([torch.ones_like(repeated[:1]), ~repeated])
     chord = _closest_chord(points[new], clusters[new])
-    return float(chord_to_angle(torch.tensor(chord, dtype=torch.float64)))
+    return float(chord_to_angle(torch.tensor(chord, dtype=torch.float64, device="cpu")))
 
 
 def _closest_chord(points: Tensor, clusters: Tensor) -> float:

@@ -196,5 +196,6 @@ def _subsample(directions: Tensor, size: int, seed: int) -> Tensor:
     if len(directions) <= size:
         return directions
     order = canonical_order(torch.where(directions[:, 2:] < 0, -directions, directions))
-    chosen = torch.randperm(len(order), generator=torch.Generator().manual_seed(seed))[:size]
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(len(order), generator=generator, device="cpu")[:size]
     return directions[order[chosen.to(order.device)]]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchrg._checks import made_on_cpu
 from torchrg.errors import ConfigError
 from torchrg.linalg.eigen import eigh3_of_few
 from torchrg.regions.fit import with_table_sign
@@ -23,6 +24,7 @@ _LEAST_SHARE = 0.02
 """Share of the area of all planes below which those of a direction are furniture, not a room."""
 
 
+@made_on_cpu()
 def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> Tensor:
     r"""Return the motion that sets a room upright, with walls along x and y and the floor at 0.
 
@@ -77,7 +79,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
         warnings.warn(
             "align_axes: expected upright planes for the directions of x and y, got none of some "
             "size; it is turned upright only.",
-            stacklevel=2,
+            stacklevel=3,
         )
         heading = _horizontal(torch.eye(3, dtype=torch.float64)[given.abs().argmin()], axis)
     rotation = torch.stack([heading, torch.linalg.cross(axis, heading), axis])

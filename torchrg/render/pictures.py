@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.io.files import atomic_path
+from torchrg.io.files import atomic_path, refusing
 from torchrg.metrics.contingency import INTEGERS
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint
@@ -326,7 +326,8 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[Any]) -> Non
         )
     from kornia_rs import io
 
-    with atomic_path(path) as beside:
+    repair = "; rename it, as pictures need a name in UTF-8"
+    with atomic_path(path) as beside, refusing(f"{path}: ", UnicodeEncodeError, repair=repair):
         if is_picture:
             io.write_image_png_u8(str(beside), np.ascontiguousarray(values), "rgb")
         else:

@@ -293,9 +293,9 @@ def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tens
     are at most ``5 * num_sets``, otherwise ``num_sets`` of them.
     """
     if comb(num_points, size) <= 5 * num_sets:
-        return torch.tensor(list(combinations(range(num_points), size)))
+        return torch.tensor(list(combinations(range(num_points), size)), device="cpu")
     generator = torch.Generator().manual_seed(seed)
-    draws = torch.rand(num_sets, num_points, generator=generator)
+    draws = torch.rand(num_sets, num_points, generator=generator, device="cpu")
     return draws.argsort(dim=1, stable=True)[:, :size]
 
 

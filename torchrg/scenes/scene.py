@@ -234,10 +234,10 @@ def label_points(
         points=torch.from_numpy(points),
         labels=torch.from_numpy(labels),
         normals=torch.from_numpy(normals),
-        planar=torch.tensor([surface.plane is not None for surface in model.surfaces]),
+        planar=torch.from_numpy(np.array([s.plane is not None for s in model.surfaces])),
         face_normals=torch.from_numpy(face_normals),
         face_offsets=torch.from_numpy(face_offsets),
-        face_areas=torch.tensor([s.area for s in model.surfaces], dtype=torch.float64),
+        face_areas=torch.from_numpy(np.array([s.area for s in model.surfaces])),
         kinds=tuple(surface.kind for surface in model.surfaces),
         objects=torch.from_numpy(model.objects),
     )

@@ -114,7 +114,10 @@ def survey_noise(
         constants.NOISE_COUNTS, factors, limits, small, strict=True
     ):
         found = factor * _neighbor_quantiles(values, neighbors, quantile)
-        near = radius * (size / torch.as_tensor(count, dtype=radius.dtype)).sqrt()
+        near = (
+            radius
+            * (size / torch.as_tensor(count, dtype=radius.dtype, device=radius.device)).sqrt()
+        )
         share = found / torch.where(radius > 0, limit * near, 1.0)
         below = (1 - share * share).clamp_(min=0)
         scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
