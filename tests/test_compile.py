@@ -2,9 +2,12 @@
 
 import dataclasses
 import hashlib
+import importlib
+import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -83,6 +86,50 @@ def test_without_a_folder_all_runs_as_written(tmp_path, monkeypatch):
     with compiled(), pytest.warns(UserWarning, match="set TORCHRG_CACHE_DIR"):
         found = one(*columns)
     assert torch.equal(found[0], one.function(*columns)[0])
+
+
+def run_as_written(match):
+    """Run a kernel that cannot be had compiled; one line says why."""
+    one, columns = fresh(noise._of_few), few(9, torch.Generator().manual_seed(0))
+    with compiled(), pytest.warns(UserWarning, match=match) as caught:
+        found, _ = one(*columns), one(*columns)
+    assert len(caught) == 1
+    assert torch.equal(found[0], one.function(*columns)[0])
+
+
+def test_a_cache_that_others_can_write_to_is_not_used(folder):
+    for mode in (0o770, 0o707, 0o1777):
+        folder.chmod(mode)
+        run_as_written(rf"others can write to {folder}, set TORCHRG_CACHE_DIR to a folder of yours")
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_a_cache_of_somebody_else_is_not_used(folder):
+    os.chown(folder, 12345, -1)
+    run_as_written("others can write to")
+
+
+def test_a_cache_in_use_by_somebody_else_or_damaged_is_one_line(folder):
+    (folder / "lock").mkdir()
+    run_as_written("lock: Is a directory")
+    (folder / "lock").rmdir()
+    # Code that is whole, and none that the system can load: a file of text, one without symbols.
+    one, columns = fresh(noise._of_few), few(9, torch.Generator().manual_seed(0))
+    path = one.path(tuple(map(_compile._kind, columns)))
+    for code, match in ((b"text", "file too short|invalid ELF"), (_library(), "undefined symbol")):
+        path.write_bytes(code + hashlib.sha256(code).digest())
+        path.chmod(0o644)
+        run_as_written(match)
+    path.chmod(0o666)
+    assert not _compile._is_whole(path)
+    path.chmod(0o644)
+    assert _compile._is_whole(path)
+
+
+def _library():
+    """Return a library of somebody else."""
+    return Path(importlib.import_module("_ctypes").__file__).read_bytes()
 
 
 def test_the_settings_say_whether_kernels_are_compiled(folder, monkeypatch):
