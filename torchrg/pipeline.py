@@ -270,9 +270,9 @@ def prepare_kernels(
 
     That takes three minutes on two cores, and half a gigabyte of memory for each of up to four
     compilers, the first time on a machine. They are kept in the folder ``$TORCHRG_CACHE_DIR``, by
-    default ``~/.cache/torchrg``, which machines of one kind may share. Results differ from those
-    without them by rounding, and are the same for any order of the points, chunk size, number of
-    threads and size of tiles.
+    default ``~/.cache/torchrg``, which machines of one kind may share, but no users: a folder that
+    others own or can write to is not used. Results differ from those without them by rounding, and
+    are the same for any order of the points, chunk size, number of threads and size of tiles.
 
     Args:
         config: Settings.

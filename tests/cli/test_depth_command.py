@@ -7,6 +7,7 @@ import os
 import random
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -352,3 +353,23 @@ def test_pictures_of_segment_are_no_images(tmp_path, capsys):
     for picture in (["--picture", "a.png"], ["--picture=a.png"]):
         assert main(["segment", str(tmp_path / "no.pcd"), "--out", str(tmp_path), *picture]) == 2
         assert "no.pcd: no such file" in capsys.readouterr().err
+
+
+def test_an_image_that_memory_has_no_room_for_is_refused_before_it_is_read(tmp_path, capsys):
+    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 300_000, 300_000)
+    (tmp_path / "huge.png").write_bytes(head + b"\x10\0\0\0\0")
+    out = ["--out", str(tmp_path / "labels.png")]
+    assert main(["depth", str(tmp_path / "huge.png"), *CAMERA, *out]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "huge.png: expected an image that memory has room for, got 90,000,000,000 pix" in line
+
+
+def test_an_array_whose_header_does_not_end_is_one_line(tmp_path, depth, capsys):
+    np.save(tmp_path / "bad.npy", depth.numpy())
+    content = (tmp_path / "bad.npy").read_bytes()
+    assert content.count(b"}") == 1
+    (tmp_path / "bad.npy").write_bytes(content.replace(b"}", b"("))
+    out = ["--out", str(tmp_path / "labels.png")]
+    assert main(["depth", str(tmp_path / "bad.npy"), *CAMERA, *out]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "bad.npy: expected an array of numbers, got: " in line

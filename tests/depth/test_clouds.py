@@ -1,11 +1,13 @@
 """Depth images as clouds, one by one, in batches, and fused."""
 
 import pickle
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.made import cameras_around, render_depth
+from torchrg.datasets import RGBDFrame
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, ShapeError
@@ -208,3 +210,34 @@ def test_what_cannot_be_fused_is_refused(frames):
         fuse_depth([batch_of(frames)])
     with pytest.raises(ShapeError, match="expected values of 6912 points, got 3"):
         fuse_depth([sample]).to_frames(torch.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *(((0, 0), 0.0), ((1, 1), 0.0), ((0, 2), torch.nan), ((1, 1), torch.inf)),
+        *(((0, 0), 1e-320), ((0, 1), 3.0), ((2, 0), 20.0), ((2, 2), 0.0)),
+    ],
+)
+def test_a_matrix_that_is_no_camera_is_refused(place, value):
+    camera = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]], dtype=torch.float64)
+    depth = torch.full((1, 30, 40), 2.0)
+    camera[place] = value
+    sample = {"depth": depth, "intrinsics": camera}
+    calls = {
+        "segment_depth": lambda: segment_depth(depth[0], camera),
+        "depth_to_points": lambda: depth_to_points(depth, camera[None]),
+        "SegmentDepth": lambda: SegmentDepth()(sample),
+        "DepthToCloud": lambda: DepthToCloud()(sample),
+        "RGBDFrame": lambda: RGBDFrame(Path("0.png"), camera, 1000.0, "0"),
+    }
+    for name, call in calls.items():
+        with pytest.raises(ConfigError, match=rf"^{name}: expected intrinsics of rows \(fx, 0, cx"):
+            call()
+
+
+def test_negative_focal_lengths_turn_the_image_over():
+    depth = torch.rand(1, 3, 4, generator=torch.Generator().manual_seed(0)) + 1
+    camera, mirrored = ([[50.0, 0, 2], [0, fy, 1], [0, 0, 1]] for fy in (50.0, -50.0))
+    expected = depth_to_points(depth, torch.tensor([camera])) * torch.tensor([1.0, -1, 1])
+    torch.testing.assert_close(depth_to_points(depth, torch.tensor([mirrored])), expected)
