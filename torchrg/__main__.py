@@ -30,6 +30,7 @@ def main() -> int:
         if getattr(sys, name) is None:
             place = os.open(os.devnull, os.O_RDWR)
             os.dup2(place, number)
+            os.set_inheritable(number, True)
             setattr(sys, name, os.fdopen(number, "w" if number else "r"))
     try:
         on_interrupts(end_at_once)

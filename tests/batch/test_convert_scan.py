@@ -35,8 +35,8 @@ def test_the_record_tells_what_was_made_from_what(faults, tmp_path):
     [
         ("corrupt", "room.txt: line 7: expected six numbers, got five.", True),
         ("bug", "KeyError: 'what'", False),
-        ("memory", "out of memory; lower --chunk-size", True),
-        ("torch memory", "out of memory; lower --chunk-size", True),
+        ("memory", "out of memory; use a machine with more", True),
+        ("torch memory", "out of memory; use a machine with more", True),
         ("full", "result.txt: cannot be written: No space left on device.", True),
     ],
 )

@@ -73,6 +73,28 @@ def test_a_lost_node_loses_no_scan(tmp_path):
     assert max(begun[name] for name in status if name != "9_b") == 2
 
 
+@needs_ray
+@pytest.mark.slow
+def test_a_scan_whose_worker_dies_each_time_fails_with_its_cause_and_leaves_nothing(tmp_path):
+    script = """
+import dataclasses, json, pathlib, sys
+import faults
+from torchrg.batch.ray_tasks import run_ray
+folder = pathlib.Path(sys.argv[1])
+jobs = faults.make_jobs(folder, {"9_a": "kill while writing", "8_b": "kill once", "7_c": "plain"})
+reports = [report for report in run_ray(jobs, workers=2, memory_limit=10**10) if report]
+print(json.dumps([dataclasses.asdict(report) for report in reports]))
+"""
+    reports = {r["name"]: r for r in json.loads(run_python("-c", script, tmp_path))}
+    failed = {name for name, report in reports.items() if report["status"] == "failed"}
+    assert failed == {"9_a"}
+    assert reports["9_a"]["reason"].startswith("WorkerCrashedError: The worker died unexpectedly")
+    assert sorted(results_of(tmp_path / "out")) == [
+        f"{name}/{file}" for name in ("7_c", "8_b") for file in ("provenance.json", "result.txt")
+    ]
+    assert not [*(tmp_path / "out").rglob(".result.*")]
+
+
 def test_ray_is_asked_for_by_name(monkeypatch):
     from torchrg.batch.ray_tasks import run_ray
 

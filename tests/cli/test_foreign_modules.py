@@ -15,7 +15,15 @@ MODULES = ("json", "numpy", "pickle", "random", "select", "torch")
 SEGMENT = ("segment", "a.npy", "--out", "../o.npz", "--preset", "classic")
 CONVERT = ("convert", "folder", "../in", "../out", "--preset", "classic", "--workers", "2")
 CAMERA = ("--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1")
-SEVERAL = "from torchrg.cli import segment; segment.choose_workers = lambda *sizes: 2; "
+COMMAND = """
+import sys
+from torchrg.__main__ import main
+from torchrg.cli import segment
+if __name__ == "__main__":
+    segment.choose_workers = lambda *sizes: 2
+    sys.exit(main())
+"""
+"""As the installed command, a file in a folder of its own; small clouds have processes too."""
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 
 
@@ -54,9 +62,11 @@ def folder(tmp_path):
     ids=["workers", "frames", "tiles", "compile", "ray", "tiles of ray"],
 )
 def test_no_module_beside_the_scans_is_run(folder, arguments):
-    start = f"import sys; {SEVERAL}from torchrg.__main__ import main; sys.exit(main())"
+    command = folder.parent / "bin" / "command"
+    command.parent.mkdir()
+    command.write_text(COMMAND)
     done = subprocess.run(
-        [sys.executable, "-P", "-c", start, *arguments],
+        [sys.executable, str(command), *arguments],
         cwd=folder,
         capture_output=True,
         text=True,

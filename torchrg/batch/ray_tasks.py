@@ -92,6 +92,7 @@ def _collect(ray: Any, reference: Any, task: Task) -> TaskReport:  # noqa: ANN40
     try:
         report: TaskReport = ray.get(reference)
     except ray.exceptions.RayError as error:
+        task.clean()
         text = " ".join(str(error).split())
         return TaskReport(task.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
     return report
