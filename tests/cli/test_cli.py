@@ -167,7 +167,7 @@ def mistakes(tmp_path, room):
         ("ROOM", ["--normals.k", "2"], "expected k >= 3, got 2"),
         ("ROOM", ["--normals.k", "many"], "--normals.k"),
         ("ROOM", ["--no-such-flag"], "no-such-flag"),
-        ("ROOM", ["--threads", "0"], "--threads >= 1"),
+        ("ROOM", ["--threads", "0"], "--threads from 1 to 1,024"),
         ("ROOM", ["--voxel", "nan"], "--voxel > 0"),
     ],
 )

@@ -273,6 +273,8 @@ def _segment_tiles(
     arguments = dataclasses.replace(arguments, orient="none")
     fields = _check_points(arguments, source, stream, target)
     folder = folder_of_work(target, arguments.workdir)
+    if arguments.engine == "ray":
+        folder = folder.absolute()  # Its processes are not in the folder of the command.
     console.say(
         f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
         f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {folder}, from "
@@ -288,7 +290,7 @@ def _segment_tiles(
         with segmented_in_tiles(
             sources,
             stream,
-            folder.absolute(),
+            folder,
             settings,
             tile_size=tile_size,
             target=target,
