@@ -83,9 +83,10 @@ from torchrg.batch.ray_tasks import run_ray
 folder = pathlib.Path(sys.argv[1])
 jobs = faults.make_jobs(folder, {"9_a": "kill while writing", "8_b": "kill once", "7_c": "plain"})
 reports = [report for report in run_ray(jobs, workers=2, memory_limit=10**10) if report]
-print(json.dumps([dataclasses.asdict(report) for report in reports]))
+(folder / "reports.json").write_text(json.dumps([*map(dataclasses.asdict, reports)]))
 """
-    reports = {r["name"]: r for r in json.loads(run_python("-c", script, tmp_path))}
+    run_python("-c", script, tmp_path)
+    reports = {r["name"]: r for r in json.loads((tmp_path / "reports.json").read_text())}
     failed = {name for name, report in reports.items() if report["status"] == "failed"}
     assert failed == {"9_a"}
     assert reports["9_a"]["reason"].startswith("WorkerCrashedError: The worker died unexpectedly")
