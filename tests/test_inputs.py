@@ -58,7 +58,9 @@ CLOUDS |= {
     "superpoints": lambda x: torchrg.make_superpoints(x).labels,
     "orient": lambda x: orient_normals(x, torch.ones(x.shape, dtype=x.dtype, device=x.device)),
     "regions": lambda x: torchrg.grow_regions(
-        *(x, torch.ones_like(x), x.new_zeros(len(x))),
+        x,
+        torch.ones(x.shape, dtype=x.dtype, device=x.device),
+        torch.zeros(len(x), dtype=x.dtype, device=x.device),
         torchrg.search_knn(x, 5),
         "classic",
     ),

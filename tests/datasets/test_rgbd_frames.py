@@ -291,17 +291,19 @@ def test_poses_that_lead_nowhere_are_none(tum, tmp_path, value):
     root = tmp_path / "scans" / "scene0000_00"
     write_depth(root / "depth" / "0.png", 1500)
     write_text(root / "pose" / "0.txt", POSE_ROWS.replace("0.5", value))
-    write_text(root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n" * 2)
+    write_text(
+        root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n"
+    )
     assert RGBDFrames.from_folder(root, "scannet").frames[0].pose is None
 
 
-@pytest.mark.parametrize("focal", ["0", "-577", "nan", "1e300"])
+@pytest.mark.parametrize("focal", ["0", "nan", "1e300"])
 def test_a_camera_matrix_of_none_is_refused_with_its_file(tmp_path, focal):
     root = tmp_path / "scene0000_00"
     write_depth(root / "depth" / "0.png", 1500)
     path = root / "intrinsic" / "intrinsic_depth.txt"
     write_text(path, f"{focal} 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n")
-    with pytest.raises(FormatError, match=r"_depth\.txt: expected a camera matrix of focal"):
+    with pytest.raises(ConfigError, match=r"_depth\.txt: expected intrinsics of rows"):
         RGBDFrames.from_folder(tmp_path, "scannet")
 
 

@@ -193,8 +193,12 @@ def read_objects(mesh: Path, count: int) -> list[tuple[dict[str, Any], NDArray[n
     files = _files_of(mesh)
     if not {"segments", "groups"} <= files.keys():
         return None
-    found = _groups(files, count, "id", np.iinfo(np.int32).max)
-    return [({"id": n, "objectId": n, "label": label}, rows) for label, n, rows in found]
+    most = np.iinfo(np.int32).max
+    by_id, by_object = (_groups(files, count, key, most) for key in ("id", "objectId"))
+    return [
+        ({"id": number, "objectId": other, "label": label}, rows)
+        for (label, number, rows), (_, other, _) in zip(by_id, by_object, strict=True)
+    ]
 
 
 def _meshes(root: Path) -> Iterator[Path]:
