@@ -12,15 +12,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import tyro
-
 sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
 
 from benchmarks import harness
 
+from torchrg.cli.arguments import parse
+
 FOLDER = Path(harness.__file__).parent
 NAMES = sorted(
-    path.stem for path in FOLDER.glob("*.py") if path.stem not in ("__init__", "harness")
+    path.stem
+    for path in FOLDER.glob("*.py")
+    if path.stem not in ("__init__", "harness", "protocols")
 )
 
 
@@ -37,13 +39,9 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if arguments and arguments[0] in NAMES:
         module = importlib.import_module(f"benchmarks.{arguments[0]}")
-        case = tyro.cli(
-            module.Case,
-            prog=f"bench.py {arguments[0]}",
-            description=module.__doc__,
-            args=arguments[1:],
-        )
-        harness.run(case)
+        if not {"-h", "--help"}.isdisjoint(arguments):
+            print(module.__doc__)
+        harness.run(parse(module.Case, arguments[1:], prog=f"bench.py {arguments[0]}"))
         return 0
     print(*(f"{name:12} {title_of(name)}" for name in NAMES), sep="\n")
     return 2 if arguments else 0

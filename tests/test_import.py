@@ -7,7 +7,7 @@ import pytest
 
 import torchrg
 
-HEAVY = ["kornia", "laspy", "matplotlib", "meshio", "pypcd4", "ray", "scipy", "tyro", "yaml"]
+HEAVY = ["kornia", "laspy", "matplotlib", "meshio", "pypcd4", "ray", "scipy", "yaml"]
 SCRIPT = """
 import sys, warnings
 import torchrg

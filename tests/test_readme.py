@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from torchrg.cli import COMMANDS, convert
-from torchrg.cli.help import list_flags
+from torchrg.cli.arguments import list_flags
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

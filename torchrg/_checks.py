@@ -1,6 +1,6 @@
 """Argument checks that never read tensor values, so they cost no device synchronisation."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeGuard, TypeVar, get_args
@@ -34,7 +34,14 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
         native = values.astype(values.dtype.newbyteorder("="), copy=False)
         return torch.from_numpy(np.require(native, requirements=["C", "W"]))
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
-    raise ShapeError(f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}.")
+    repair = ""
+    if isinstance(values, list | tuple):
+        repair = "; torch.tensor makes one of numbers"
+    elif name == "points" and not isinstance(values, np.ndarray):
+        repair = "; read_cloud(path).points is that of a file"
+    raise ShapeError(
+        f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{repair}."
+    )
 
 
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
@@ -154,23 +161,6 @@ def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, .
         length == ((int(axis),) if axis.isdigit() else bound.setdefault(axis, length))
         for axis, length in [*leading, *lengths]
     )
-
-
-def check_chunks(caller: str, points: object) -> None:
-    """Check that something may be a cloud in chunks; raise ShapeError if it cannot.
-
-    Example:
-        >>> check_chunks("f", "scan.ply")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected points to be a tensor, ..., got str; ...
-    """
-    chunks = points if isinstance(points, str | list | tuple) else []
-    if not isinstance(points, Iterable) or not all(hasattr(part, "coordinates") for part in chunks):
-        raise ShapeError(
-            f"{caller}: expected points to be a tensor, a NumPy array or clouds, got "
-            f"{type(points).__name__}; read_cloud(path).points is the tensor of a file."
-        )
 
 
 def is_tensor(value: object) -> TypeGuard[Tensor]:

@@ -405,6 +405,8 @@ class Segmentation(NamedTuple):
         valid: Points that are finite and have a normal, shape ``(N,)``, bool.
         planes: The plane table, M rows.
         points: What was segmented, shape ``(N, 3)``, to show it; None where it is not known.
+        neighbors: Neighbours of the finite points in canonical order, as
+            :func:`torchrg.search_knn` finds them there; None where they were not kept.
     """
 
     labels: Tensor
@@ -414,6 +416,7 @@ class Segmentation(NamedTuple):
     valid: Tensor
     planes: Planes
     points: Tensor | None = None
+    neighbors: Neighbors | None = None
 
     def show(self, **settings: Any) -> Any:  # noqa: ANN401
         """Return the page of the browser, which a notebook shows; needs ``torchrg[view]``.

@@ -26,10 +26,11 @@ from torch import Tensor
 import torchrg
 from benchmarks.harness import Benchmark, Figures, Results, run_program, table
 from benchmarks.peers import MIN_SIZE, pcl_command
+from benchmarks.protocols import count_segcomp, score_evops, score_voxels
 from tests.made import DepthFrame, cameras_around, render_depth
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points
-from torchrg.metrics import score_labels, score_voxels
+from torchrg.metrics import contingency_table, score_labels
 from torchrg.scenes import build_room, make_room
 
 PRESETS = ("classic", "paper", "consensus")
@@ -206,11 +207,12 @@ def _score(cloud: Labelled, labels: Tensor) -> Figures:
     """Return the indices of all protocols."""
     found = score_labels(labels, cloud.truth)
     voxels = score_voxels(cloud.points, labels, cloud.truth, voxel_size=VOXEL_SIZE)
-    shares = ("correct", "over_segmented", "under_segmented", "missed", "noise")
+    table = contingency_table(labels, cloud.truth)
+    evops = score_evops(table)
     return {
         **{name: getattr(found, name) for name in ("regions", "faces", "mean_best_iou")},
         "recall_iou50": found.recall_iou50,
         **{f"voxel {name}": getattr(voxels, name) for name in ("precision", "recall", "f1")},
-        **{name: getattr(found, name) / max(found.faces, 1) for name in shares},
-        **{f"EVOPS {name}": getattr(found, f"evops_{name}") for name in EVOPS},
+        **{n: count / max(found.faces, 1) for n, count in count_segcomp(table)._asdict().items()},
+        **{f"EVOPS {name}": getattr(evops, name) for name in EVOPS},
     }

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from torchrg.batch.memory import memory_between_tiles, memory_of_scan, memory_of_tile
+from torchrg.batch.memory import memory_of_scan, memory_on_disk
 
 MEASURE = """
 import sys
@@ -28,24 +28,12 @@ from torchrg.structures import Cloud
 points = make_room(num_points, noise=0.003, seed=0).points
 config = load_config(preset)
 from torchrg.pipeline import segment_planes
-if what == "scan":
-    reset_peak_memory()
-    segment_planes(points, config)
-    print(peak_memory())
-    sys.exit()
-from torchrg.tiles import TileStore
-peaks, stages = {}, ["points"]
-def note(stage, done, of):
-    peaks[stages[-1]] = max(peaks.get(stages[-1], 0), peak_memory())
-    stages.append(stage)
-    reset_peak_memory()
+from contextlib import nullcontext
+from torchrg import scratch
 reset_peak_memory()
-store = TileStore(folder, tile_size=num_points // 2, on_progress=note)
-segment_planes([Cloud(points.numpy())], config, store=store)
-note("done", 1, 1)
-in_tiles = ("neighbors", "normals", "edges")
-print(max(peaks[stage] for stage in in_tiles))
-print(max(peaks[stage] for stage in peaks if stage not in in_tiles))
+with scratch.on_disk(folder) if what == "disk" else nullcontext():
+    segment_planes(points, config)
+print(peak_memory())
 """
 
 
@@ -66,8 +54,7 @@ def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, preset)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
-def test_what_tiles_and_the_stages_between_them_take_is_what_the_model_says(tmp_path, preset):
-    num_points = 300_000
-    tile, whole = peaks(tmp_path, "tiles", preset, num_points)
-    assert 0.5 * memory_of_tile(num_points // 2) < tile < memory_of_tile(num_points // 2)
-    assert 0.5 * memory_between_tiles(num_points) < whole < memory_between_tiles(num_points)
+def test_what_a_cloud_on_a_disk_takes_is_what_the_model_says(tmp_path, preset):
+    num_points = 1_000_000
+    (peak,) = peaks(tmp_path, "disk", preset, num_points)
+    assert 0.5 * memory_on_disk(num_points) < peak < memory_on_disk(num_points)

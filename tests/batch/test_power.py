@@ -14,25 +14,11 @@ from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.run import list_jobs, make_plan
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
-from torchrg.batch.tiles import folder_of_work, segmented_in_tiles
 from torchrg.config import load_config
-from torchrg.io import stream_cloud, write_cloud
 from torchrg.scenes import make_room
-from torchrg.store import FolderStore
 
 SYSTEM_CALLS = ("fsync", "unlink", "replace", "mkdir", "rmdir")
 """What changes a folder, or flushes it."""
-
-
-def segment(root):
-    """Segment a room in tiles, as the command does."""
-    source, target = root / "room.npy", root / "result.npz"
-    stream, config = stream_cloud(source), load_config("classic")
-    folder = folder_of_work(target, root / "work")
-    with segmented_in_tiles(
-        [source], stream, folder, config, tile_size=400, target=target
-    ) as found:
-        write_cloud(target, stream, found, provenance={})
 
 
 def convert(root):
@@ -47,9 +33,8 @@ def convert(root):
 
 
 def make_rooms(root):
-    """Make a room to segment, and two to convert."""
+    """Make two rooms to convert."""
     (root / "rooms").mkdir(parents=True)
-    np.save(root / "room.npy", make_room(num_points=1500, seed=1).points)
     for seed in (2, 3):
         np.save(root / "rooms" / f"{seed}.npy", make_room(num_points=600, seed=seed).points)
 
@@ -65,11 +50,9 @@ class Moments:
 
     def __init__(self, monkeypatch, disk):
         self.left, self.number, self.on_cut = -1, 0, None
-        write = FolderStore.write
         for name in SYSTEM_CALLS:
             call = disk.fsync if name == "fsync" else getattr(os, name)
             monkeypatch.setattr(os, name, partial(self.pass_by, call))
-        monkeypatch.setattr(FolderStore, "write", lambda *given: self.pass_by(write, *given))
 
     def pass_by(self, call, *given, **options):
         """Do what was asked for, or end if this is the moment."""
@@ -81,18 +64,17 @@ class Moments:
         return call(*given, **options)
 
 
-@pytest.mark.parametrize("command", [segment, convert])
 @pytest.mark.parametrize(
     "seed", [pytest.param(n, marks=pytest.mark.slow if n > 1 else ()) for n in range(20)]
 )
-def test_after_a_power_cut_the_same_command_goes_on(command, seed, tmp_path, monkeypatch):
+def test_after_a_power_cut_the_same_command_goes_on(seed, tmp_path, monkeypatch):
     root, after, rng = tmp_path / "disk", tmp_path / "after", random.Random(seed)
     make_rooms(root)
     disk = Disk(root, tmp_path / "flushed")
     disk.settle()
     with monkeypatch.context() as patch:
         moments = Moments(patch, disk)
-        command(root)
+        convert(root)
         number = moments.number
     expected = contents(root)
     assert len(expected) > 3
@@ -105,12 +87,12 @@ def test_after_a_power_cut_the_same_command_goes_on(command, seed, tmp_path, mon
             moments.left = moment
             moments.on_cut = partial(disk.cut, after, rng)
             try:
-                command(root)
+                convert(root)
             except PowerCutError:
                 disk.restore(after)
     with monkeypatch.context() as patch:
         Moments(patch, disk)
-        command(root)
+        convert(root)
     assert contents(root) == expected
     # What a command that has ended well has written stays, whatever comes then.
     disk.cut(after, rng)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from torchrg.cli import COMMANDS, main
-from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.structures import Cloud
 
@@ -354,34 +353,20 @@ def test_columns_are_named_by_a_rule_that_is_shown_or_by_a_flag(leica, tmp_path,
         np.testing.assert_array_equal(found["intensity"], values[:, 0])
 
 
-def test_names_of_columns_are_part_of_the_work_in_tiles(tmp_path, monkeypatch, capsys):
+def test_names_of_columns_count_for_each_file_without_its_own(tmp_path, capsys):
     rng = np.random.default_rng(0)
-    flat = np.hstack([rng.random((40_000, 2)), np.zeros((40_000, 1))])
-    np.save(tmp_path / "a.npy", np.hstack([flat, rng.random((40_000, 1))]))
+    flat = np.hstack([rng.random((2_000, 2)), np.zeros((2_000, 1))])
+    np.save(tmp_path / "a.npy", np.hstack([flat, rng.random((2_000, 1))]))
     write_cloud(tmp_path / "b.ply", Cloud(flat[:100] + np.eye(3)[2], {"d": flat[:100, 0]}))
     inputs = [str(tmp_path / "a.npy"), str(tmp_path / "b.ply"), "--merge", "--preset", "classic"]
-    out = ["--out", str(tmp_path / "r.npz"), "--limit-memory", "0.542"]
-
-    def stop(*_, **__):
-        raise FormatError("stopped.")
-
-    monkeypatch.setattr("torchrg.cli.segment.write_cloud", stop)
-    assert main(["segment", *inputs, *out, "--columns", "x,z,d,y"]) == 2
-    monkeypatch.undo()
-    capsys.readouterr()
-    # What other names left behind is not gone on with.
-    (work,) = tmp_path.glob(".r*.tiles")
-    assert main(["segment", *inputs, *out, "--columns", "x,y,z,d"]) == 2
-    assert "holds the work of another cloud, of other settings" in error_line(capsys)
-    shutil.rmtree(work)
+    out = ["--out", str(tmp_path / "r.npz")]
     assert main(["segment", *inputs, *out, "--columns", "x,y,z,d"]) == 0
     shown = capsys.readouterr()
-    assert "in tiles of" in shown.out
     assert "(without its own d)" in shown.out
     assert shown.err == ""
     with np.load(tmp_path / "r.npz") as result:
-        np.testing.assert_array_equal(result["points"][:40_000], flat)
-        assert (result["labels"][:40_000] == 0).mean() > 0.9
+        np.testing.assert_array_equal(result["points"][:2_000], flat)
+        assert (result["labels"][:2_000] == 0).mean() > 0.9
         assert json.loads(str(result["provenance"]))["columns"] == "x,y,z,d"
 
 

@@ -126,7 +126,10 @@ def test_bad_points_stay_in_place(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--method", "best"], "invalid choice 'best'"),
+        (
+            ["--method", "best"],
+            "consensus, got 'best'",
+        ),
         (["--normals.k", "2"], "expected k >= 3, got 2"),
         (
             ["--orient", "viewpoint"],

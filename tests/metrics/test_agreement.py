@@ -1,24 +1,10 @@
 """Agreement of labellings against scikit-learn and against loops."""
 
-import numpy as np
 import pytest
 import torch
-from scipy.stats import entropy
-from sklearn.metrics import (
-    adjusted_rand_score,
-    mutual_info_score,
-    normalized_mutual_info_score,
-    rand_score,
-)
+from sklearn.metrics import adjusted_rand_score
 
-from torchrg.metrics import (
-    adjusted_rand_index,
-    contingency_table,
-    normalized_mutual_information,
-    rand_index,
-    segmentation_covering,
-    variation_of_information,
-)
+from torchrg.metrics import adjusted_rand_index, contingency_table, segmentation_covering
 from torchrg.metrics.contingency import ContingencyTable
 
 
@@ -33,18 +19,10 @@ def pairs_of_labels():
 
 
 @pytest.mark.parametrize(("labels", "truth"), list(pairs_of_labels()))
-def test_rand_index_and_information_are_those_of_scikit_learn(labels, truth):
+def test_adjusted_rand_index_is_that_of_scikit_learn(labels, truth):
     table = contingency_table(labels, truth)
-    ari = adjusted_rand_score(truth.numpy(), labels.numpy())
-    nmi = normalized_mutual_info_score(truth.numpy(), labels.numpy())
-    assert adjusted_rand_index(table) == pytest.approx(ari, abs=1e-12)
-    assert normalized_mutual_information(table) == pytest.approx(nmi, abs=1e-12)
-    rand = rand_score(truth.numpy(), labels.numpy())
-    assert rand_index(table) == pytest.approx(rand, abs=1e-12)
-    (_, counts), shared = np.unique(truth, return_counts=True), mutual_info_score(truth, labels)
-    entropies = entropy(counts), entropy(np.unique(labels, return_counts=True)[1])
-    bits = (sum(entropies) - 2 * shared) / np.log(2)
-    assert variation_of_information(table) == pytest.approx(bits, abs=1e-9)
+    expected = adjusted_rand_score(truth.numpy(), labels.numpy())
+    assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:The number of unique classes:UserWarning")
@@ -66,12 +44,8 @@ def test_degenerate_labellings_have_the_values_of_scikit_learn(labels, truth):
     table = contingency_table(
         torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
     )
-    ari, nmi = adjusted_rand_score(truth, labels), normalized_mutual_info_score(truth, labels)
-    assert adjusted_rand_index(table) == pytest.approx(ari, abs=1e-12)
-    assert normalized_mutual_information(table) == pytest.approx(nmi, abs=1e-12)
-    expected = rand_score(truth, labels) if len(labels) else 1
-    assert rand_index(table) == pytest.approx(expected, abs=1e-12)
-    assert variation_of_information(table) >= 0
+    expected = adjusted_rand_score(truth, labels)
+    assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-12)
 
 
 def test_rand_index_of_billions_of_points_does_not_overflow():

@@ -12,9 +12,7 @@ from torchrg.metrics import (
     METRICS,
     LabelScore,
     contingency_table,
-    count_segcomp,
     match_regions,
-    score_evops,
     score_labels,
 )
 
@@ -133,44 +131,32 @@ def test_indices_by_hand():
     assert score.share_labeled == 6 / 8
 
 
-def test_protocols_stand_under_their_names():
-    rng = torch.Generator().manual_seed(1)
-    labels, truth = torch.randint(-1, 5, (2, 60), generator=rng) // 2
-    score, table = score_labels(labels, truth)._asdict(), contingency_table(labels, truth)
-    segcomp, evops = count_segcomp(table)._asdict(), score_evops(table)._asdict()
-    assert {name: score[name] for name in segcomp} == segcomp
-    assert {name: score[f"evops_{name}"] for name in evops} == evops
-
-
 def test_the_truth_itself_scores_full_marks(rng):
     truth = torch.randint(0, 12, (400,), generator=rng)
     score = score_labels(100 - truth, truth)._asdict()
     full = {name: 100.0 if METRICS["labels"][name].unit == "%" else 1.0 for name in SHARES}
     full |= {name: 0.0 for name in SHARES if METRICS["labels"][name].higher_is_better is False}
     assert {name: score[name] for name in SHARES} == pytest.approx(full, abs=1e-12)
-    assert score["correct"] == score["pairs"] == score["regions"] == score["faces"] == 12
-    assert score["missed"] == score["noise"] == score["over_segmented"] == 0
+    assert score["pairs"] == score["regions"] == score["faces"] == 12
 
 
 @pytest.mark.parametrize(
     ("labels", "truth", "counts", "agreement"),
     [
-        pytest.param([], [], (0, 0, 0, 0, 0, 0), (1, 1), id="no point"),
-        pytest.param([-1, -1], [-1, -1], (0, 0, 0, 2, 0, 0), (1, 1), id="all unlabelled"),
-        pytest.param([-1, -1, -1], [0, 0, 1], (0, 0, 2, 3, 2, 0), (0, 0), id="no region"),
-        pytest.param([0, 0, 1], [-1, -1, -1], (0, 2, 0, 3, 0, 2), (0, 0), id="no face"),
-        pytest.param([0, -1], [-1, 0], (0, 1, 1, 2, 1, 1), (1, 1), id="nothing in common"),
+        pytest.param([], [], (0, 0, 0, 0), 1, id="no point"),
+        pytest.param([-1, -1], [-1, -1], (0, 0, 0, 2), 1, id="all unlabelled"),
+        pytest.param([-1, -1, -1], [0, 0, 1], (0, 0, 2, 3), 0, id="no region"),
+        pytest.param([0, 0, 1], [-1, -1, -1], (0, 2, 0, 3), 0, id="no face"),
+        pytest.param([0, -1], [-1, 0], (0, 1, 1, 2), 1, id="nothing in common"),
     ],
 )
 def test_means_over_nothing_are_zero_and_the_counts_tell(labels, truth, counts, agreement):
     score = score_labels(
         torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
     )
-    assert (
-        (score.pairs, score.regions, score.faces, score.points, score.missed, score.noise)
-    ) == counts
-    assert (score.ari, score.nmi) == agreement
-    zeros = {"precision", "recall", "f1", "mean_best_iou", "recall_iou50", "covering", "evops_f1"}
+    assert (score.pairs, score.regions, score.faces, score.points) == counts
+    assert score.ari == agreement
+    zeros = {"precision", "recall", "f1", "mean_best_iou", "recall_iou50", "covering"}
     assert {score._asdict()[name] for name in zeros} == {0.0}
 
 

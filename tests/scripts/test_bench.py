@@ -16,6 +16,7 @@ from benchmarks import (
     accuracy,
     breakdown,
     convert,
+    disk,
     harness,
     kernels,
     loader,
@@ -24,9 +25,9 @@ from benchmarks import (
     robust,
     steady,
     superpoints,
-    tiling,
 )
 
+from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 
 
@@ -177,18 +178,15 @@ def test_superpoints_are_scored_at_the_numbers_of_others(tmp_path):
     assert "(cut pursuit 0." in text
 
 
-def test_tiles_give_what_memory_gives(tmp_path):
-    case = tiling.Case(points=1500, work=tmp_path)
-    path = case.clouds()["1,500 points"]()
-    assert tiling.prepare_tiles(path, "classic", 500, 3.0)()["differs"] == "unknown"
-    found = tiling.prepare_memory(path, "classic")()
-    tiles = tiling.prepare_tiles(path, "classic", 500, 3.0)()
-    assert tiles["differs"] == "nowhere"
-    assert tiles["planes"] == found["planes"] > 0
-    assert tiles["peak_gb"] == max(tiles["peaks"].values())
-    wrong = tmp_path / "classic_building_1500" / "labels.npy"
-    np.save(wrong, np.load(wrong) + 1)
-    assert tiling.prepare_tiles(path, "classic", 500, 3.0)()["differs"] == "labels"
+def test_the_disk_gives_what_memory_gives(tmp_path):
+    path = disk.Case(points=1500, work=tmp_path).clouds()["1,500 points"]()
+    memory, found = (disk.prepare(path, "classic", place)() for place in ("memory", "disk"))
+    assert found["digest"] == memory["digest"]
+    assert found["planes"] == memory["planes"] > 0
+    assert found["peak_gb"] == max(found["peaks"].values())
+    seg = segment_planes(torch.from_numpy(np.load(path)), "classic")
+    assert disk.digest(seg) == found["digest"]
+    assert disk.digest(seg._replace(labels=seg.labels + 1)) != found["digest"]
 
 
 @pytest.fixture
@@ -246,9 +244,8 @@ def test_runs_of_other_processes_are_measured(tmp_path, capsys):
     sizes = ["--sizes", "1500", "--rounds", "1", "--only", "torchrg-classic"]
     assert bench.main(["peers", *sizes, "torchrg-classic-command"]) == 0
     assert capsys.readouterr().out.count("| torchrg-classic-command |") == 2
-    tiles = ["--points", "1500", "--tile-size", "500", "--work", str(tmp_path)]
-    assert bench.main(["tiling", *tiles]) == 0
-    assert "| nowhere |" in capsys.readouterr().out
+    assert bench.main(["disk", "--points", "1500", "--work", str(tmp_path)]) == 0
+    assert "| classic disk |" in capsys.readouterr().out
 
 
 def test_frames_and_rooms_are_prepared():

@@ -5,8 +5,8 @@ A source (:class:`~torchrg.batch.sources.FolderSource`, :class:`~torchrg.batch.s
 lists scans and converts one of them. :func:`~torchrg.batch.run.list_jobs` makes jobs of them,
 :func:`~torchrg.batch.run.make_plan` finds those that are not done,
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
-:func:`~torchrg.batch.run.run_plan` collects what becomes of them. To these engines a scan, a tile
-and a depth frame are a :class:`~torchrg.batch.task.Task` each, and nothing else.
+:func:`~torchrg.batch.run.run_plan` collects what becomes of them. To these engines a scan and a
+depth frame are a :class:`~torchrg.batch.task.Task` each, and nothing else.
 
 Example:
     >>> import tempfile

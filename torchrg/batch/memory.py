@@ -1,10 +1,9 @@
-"""How much memory a scan or a tile takes, and how much there is."""
+"""How much memory a scan takes, and how much there is."""
 
 import os
 from pathlib import Path
 
-from torchrg import tiles
-from torchrg.pipeline import BYTES_PER_POINT
+from torchrg.pipeline import BYTES_PER_POINT, BYTES_PER_POINT_ON_DISK
 
 PROCESS_BYTES = 500_000_000
 """What a process takes before the first point: Python, torch, scipy."""
@@ -30,25 +29,14 @@ def memory_of_scan(num_points: int) -> int:
     return PROCESS_BYTES + BYTES_PER_POINT * num_points
 
 
-def memory_of_tile(num_points: int) -> int:
-    """Return the memory that a process needs for a tile of so many points of its own, in bytes.
+def memory_on_disk(num_points: int) -> int:
+    """Return what a process needs for a cloud whose large arrays are on a disk, in bytes.
 
     Example:
-        >>> memory_of_tile(300_000)
-        1100000000
+        >>> memory_on_disk(10_000_000)
+        2000000000
     """
-    return PROCESS_BYTES + tiles.BYTES_PER_TILE_POINT * num_points
-
-
-def memory_between_tiles(num_points: int) -> int:
-    """Return the memory for the stages on a whole cloud whose other stages run in tiles, in bytes.
-
-    Example:
-        >>> memory_between_tiles(10_000_000)
-        1875000000
-    """
-    at_once = tiles.BYTES_AT_ONCE * min(num_points, tiles.POINTS_AT_ONCE)
-    return PROCESS_BYTES + tiles.BYTES_PER_POINT * num_points + at_once
+    return PROCESS_BYTES + BYTES_PER_POINT_ON_DISK * num_points
 
 
 def spare_memory() -> int:

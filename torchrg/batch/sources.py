@@ -73,6 +73,11 @@ class CloudSource:
     dataset: ClassVar[str] = "ScanNet"
     """The data set whose layouts it has; clouds without labels are written as those of ScanNet."""
 
+    @property
+    def has_superpoints(self) -> bool:
+        """Whether superpoints are made."""
+        return self.superpoint or self.layout != "pointcept"
+
     def described(self, **options: Any) -> dict[str, Any]:  # noqa: ANN401
         """Return these settings, as far as they are not the usual ones, after others."""
         described = {**options, "superpoint": self.superpoint}
@@ -117,7 +122,9 @@ class CloudSource:
     ) -> tuple[Segmentation, NDArray[np.int32] | None]:
         """Return the planes of a cloud, its normals turned, and its superpoints if wanted."""
         check_viewpoint(cloud, self.orient, "use --orient interior")
-        seg = segment_planes(cloud.points, settings, on_stage=begin)
+        seg = segment_planes(
+            cloud.points, settings, on_stage=begin, keep_neighbors=self.has_superpoints
+        )
         parts = self._part(cloud, seg, colors, begin)
         begin("orientation")
         return seg._replace(normals=orient_cloud(cloud, seg.normals, self.orient)), parts
@@ -130,7 +137,7 @@ class CloudSource:
         begin: Callable[[str], None],
     ) -> NDArray[np.int32] | None:
         """Return the superpoint of each point of a cloud, None where they are not wanted."""
-        if not self.superpoint and self.layout == "pointcept":
+        if not self.has_superpoints:
             return None
         begin("superpoints")
         found = make_superpoints(cloud.points, seg, self.partition, colors=colors)

@@ -73,7 +73,7 @@ Reports = Generator[TaskReport | None, None, None]
 
 
 class Task(Protocol):
-    """Work that any process can do: on a scan, a tile, a frame.
+    """Work that any process can do: on a scan or a frame.
 
     It travels to that process, so it holds settings and paths but no open files.
     """

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
+from torchrg.cli.arguments import parse
 from torchrg.cli.loop import run_each
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
@@ -53,10 +53,8 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
-    start = Arguments(
-        inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
-    )
-    arguments = console.parse(Arguments, argv, prog="torchrg align", default=start)
+    start = {"settings": console.PlaneSettings.asked_for(argv)}
+    arguments = parse(Arguments, argv, prog="torchrg align", default=start)
     if not any(arguments.up):
         raise ConfigError(f"expected --up to be a direction, got {arguments.up}.")
     console.use_threads(arguments.threads)

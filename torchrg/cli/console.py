@@ -1,9 +1,7 @@
-"""What the commands share: parsing through tyro, places of results, errors of one line."""
+"""What the commands share: settings, places of results, lines on a terminal."""
 
 import contextlib
 import dataclasses
-import difflib
-import io
 import os
 import re
 import warnings
@@ -11,12 +9,12 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 import torch
-import tyro
 from tqdm import tqdm
 
+from torchrg.cli.arguments import Argument
 from torchrg.cli.ending import INTERRUPTED as INTERRUPTED
 from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
 from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
@@ -24,7 +22,6 @@ from torchrg.cli.ending import fail as fail
 from torchrg.cli.ending import printable as printable
 from torchrg.cli.ending import say as say
 from torchrg.cli.ending import warn as warn
-from torchrg.cli.help import format_help, list_flags
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
 from torchrg.datasets.folder import folded_name
 from torchrg.depth.segment import prepare_depth_kernels
@@ -36,8 +33,6 @@ from torchrg.pipeline import prepare_kernels
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
 
-Arguments = TypeVar("Arguments")
-
 
 @contextlib.contextmanager
 def warnings_as_lines() -> Iterator[None]:
@@ -47,83 +42,6 @@ def warnings_as_lines() -> Iterator[None]:
         yield
     for warning in caught:
         warn(" ".join(str(warning.message).split()))
-
-
-def parse(
-    kind: type[Arguments],
-    arguments: list[str],
-    *,
-    prog: str,
-    default: Any = None,  # noqa: ANN401
-) -> Arguments:
-    """Parse arguments into a dataclass; ``--help`` prints and exits.
-
-    Raises:
-        ConfigError: If an argument is wrong, as one line.
-    """
-    if not {"-h", "--help"}.isdisjoint(arguments):
-        print(format_help(kind, prog=prog, default=default))
-        raise SystemExit(0)
-    stderr = io.StringIO()
-    options: dict[str, Any] = {} if default is None else {"default": default}
-    try:
-        with contextlib.redirect_stderr(stderr):
-            parsed: Arguments = tyro.cli(kind, args=arguments, prog=prog, **options)
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            raise
-        message = _one_line(stderr.getvalue())
-        raise ConfigError(f"{message}{_nearest(message, kind)} See {prog} --help.") from None
-    except ConfigError as error:
-        # The one setting that stands in no section.
-        text = str(error).replace("PipelineConfig: expected chunk_size", "expected --chunk-size")
-        raise ConfigError(text) from None
-    return parsed
-
-
-def _nearest(message: str, kind: type) -> str:
-    """Return a question where a message is on a flag that is none: one like it, or a file."""
-    wrong = re.search(r"^Unrecognized options: (-[^ ]+)", message)
-    if wrong is None:
-        return ""
-    # A file whose name begins as a flag does.
-    file = Path(wrong[1].rstrip("."))
-    names = [flag.name for flag in list_flags(kind)]
-    found = difflib.get_close_matches(wrong[1], names, n=1)
-    found = [f"./{file}"] if os.path.lexists(file) else found
-    return f" Did you mean {found[0]}?" if found else ""
-
-
-def _one_line(boxed: str) -> str:
-    """Return the first message of an error as one line.
-
-    It stands in a box, or below its title and a rule where the terminal has no characters for one.
-    """
-    parts: list[list[str]] = [[]]
-    for line in boxed.splitlines():
-        words = re.sub(r"^[│╭╰]\s?|\s*[│╮╯]$", "", line).strip()
-        if re.match(r"^[─-]+( .* [─-]+|$)", words):
-            parts.append([])
-        elif words:
-            parts[-1].append(words)
-    text = " ".join(parts[1] if len(parts) > 1 else parts[0])
-    text = re.sub(r"^Error parsing [\w.-]+: (?=\w+Config: )", "", text)
-    for pattern, expected in _NO_NUMBERS.items():
-        text = re.sub(rf"^Error parsing (\S+): {pattern}.*", f"expected {expected}", text)
-    return text if text.endswith((".", "!", "?")) else f"{text}."
-
-
-_NO_NUMBERS = {
-    r"invalid literal for int\(\).*: ('.*')": r"a whole number for \1, got \2",
-    r"could not convert string to float: ('.*')": r"a number for \1, got \2",
-    r"no type matching \S*INT could be instantiated from \['(.*?)'\]": (
-        r"a whole number for \1, got '\2'"
-    ),
-    r"no type matching \S*FLOAT could be instantiated from \['(.*?)'\]": (
-        r"a number for \1, got '\2'"
-    ),
-}
-"""What is said of text that is no number, and how it is said here."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +57,7 @@ class PlaneSettings:
     angle_deg: float | None = None
     """The one threshold of the paper, in degrees: that of sharp points and of growth. The flags
     --normals.sharp-angle-deg and --growing.max-angle-deg win where they are given."""
-    resolved: Annotated[PipelineConfig, tyro.conf.arg(name="")] = dataclasses.field(
+    resolved: Annotated[PipelineConfig, Argument(is_inline=True)] = dataclasses.field(
         default_factory=PipelineConfig
     )
 
@@ -169,19 +87,19 @@ class PlaneSettings:
 
 CloudsFlag = Annotated[
     tuple[Path, ...],
-    tyro.conf.Positional,
-    tyro.conf.arg(
+    Argument(
         metavar="CLOUD",
-        help=f"Clouds to read, files that end in {' '.join(FORMATS)}. For depth images, and for "
+        is_positional=True,
+        text=f"Clouds to read, files that end in {' '.join(FORMATS)}. For depth images, and for "
         "organised clouds taken as images, there is torchrg depth.",
     ),
 ]
 """Type of the argument that names clouds."""
 ColumnsFlag = Annotated[
     str | None,
-    tyro.conf.arg(
+    Argument(
         metavar="X,Y,Z,...",
-        help="Names of the columns of text and of bare .npy arrays, in their order, as "
+        text="Names of the columns of text and of bare .npy arrays, in their order, as "
         f"x,y,z,intensity,r,g,b; _ leaves one out. {COLUMNS_RULE} What was taken is printed.",
     ),
 ]
@@ -196,8 +114,8 @@ _MOST_GIGABYTES = 1_000_000
 
 CompileFlag = Annotated[
     bool,
-    tyro.conf.arg(
-        help="Whether a C++ compiler makes kernels, once for all runs on this machine. They are "
+    Argument(
+        text="Whether a C++ compiler makes kernels, once for all runs on this machine. They are "
         "faster, and equal to rounding."
     ),
 ]
@@ -206,8 +124,8 @@ CompileFlag = Annotated[
 
 OrientFlag = Annotated[
     Literal["auto", "interior", "viewpoint", "up", "none"],
-    tyro.conf.arg(
-        help="To which side normals point: to the front of the faces where the file is a mesh, "
+    Argument(
+        text="To which side normals point: to the front of the faces where the file is a mesh, "
         "else to the scanner where it names its places, as E57 does, else into the free space of "
         "rooms (auto); always into rooms (interior), to the scanner (viewpoint) or along +z (up); "
         "or to that side where the first of z, y, x that is not zero is positive (none).",
@@ -216,8 +134,8 @@ OrientFlag = Annotated[
 """Type of the argument --orient of clouds."""
 ImageOrientFlag = Annotated[
     Literal["auto", "interior", "viewpoint", "up", "none"],
-    tyro.conf.arg(
-        help="To which side normals point: to the camera (auto, viewpoint, none), into the free "
+    Argument(
+        text="To which side normals point: to the camera (auto, viewpoint, none), into the free "
         "space of rooms (interior), or along +z (up), which is the optical axis where no pose of "
         "the camera is known.",
     ),
@@ -257,7 +175,7 @@ class ColumnNames:
         return self.names if takes_columns(path) else None
 
 
-SettingsFlags = Annotated[PlaneSettings, tyro.conf.arg(name="")]
+SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]
 """Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
 
 
@@ -337,15 +255,13 @@ def use_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
-def check_engine(limit_memory: float | None, engine: str, ray_address: str | None) -> None:
-    """Refuse what is said about memory and the engine where it makes no sense."""
+def check_memory(limit_memory: float | None) -> None:
+    """Refuse a limit of memory that is none."""
     if limit_memory is not None and not 0 < limit_memory <= _MOST_GIGABYTES:
         raise ConfigError(
             f"expected --limit-memory above 0 and at most {_MOST_GIGABYTES:,} GB, got "
             f"{limit_memory}."
         )
-    if ray_address is not None and engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
 
 
 @contextlib.contextmanager

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-import tyro
 from tqdm import tqdm
 
 from torchrg._parallel import num_cores
@@ -35,6 +34,7 @@ from torchrg.batch.sources import (
 )
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
+from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
@@ -52,9 +52,9 @@ MOST_ROWS = 300
 class Arguments:
     """What every kind of data set has."""
 
-    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
+    root: Annotated[Path, Argument("ROOT", is_positional=True)]
     """Directory of the data set. It is only read."""
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    out: Annotated[Path, Argument("OUT", is_positional=True)]
     """Directory for the results, with a folder for each scan. It is made where there is none, and
     what is done there already is not done again."""
     workers: int | None = None
@@ -262,11 +262,10 @@ def run(argv: list[str]) -> int:
     kind, *rest = console.spell_counts(argv, "--superpoint")
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
-    start = KINDS[kind](root=tyro.MISSING, out=tyro.MISSING)
-    if isinstance(start, CloudArguments):
-        settings = console.PlaneSettings.asked_for(rest, start.usual_preset)
-        start = dataclasses.replace(start, settings=settings)
-    arguments = console.parse(KINDS[kind], rest, prog=f"torchrg convert {kind}", default=start)
+    chosen, start = KINDS[kind], {}
+    if issubclass(chosen, CloudArguments):
+        start["settings"] = console.PlaneSettings.asked_for(rest, chosen.usual_preset)
+    arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     arguments = arguments if arguments.dry_run else arguments.prepared()
     root, out = arguments.root.resolve(), arguments.out.resolve()
@@ -295,7 +294,9 @@ def _check(arguments: Arguments) -> None:
     """Refuse values that are out of range, or do not go together."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
-    console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
+    console.check_memory(arguments.limit_memory)
+    if arguments.ray_address is not None and arguments.engine != "ray":
+        raise ConfigError("expected --ray-address together with --engine ray.")
     if _pages_of(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):

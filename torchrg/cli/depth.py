@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 from torchrg._parallel import num_cores
@@ -20,6 +19,7 @@ from torchrg.batch.scans import Job, Scan
 from torchrg.batch.sources import RGBDSource
 from torchrg.batch.task import Converted, TaskReport, report_on
 from torchrg.cli import console
+from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.loop import finish, run_with_bar, tell_failure
 from torchrg.datasets.folder import listed
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
@@ -42,7 +42,7 @@ _ORGANISED = ".pcd"
 _COLORED_FROM = 200
 """Pixels along the longer side that tell which planes are next to each other and must differ in
 colour. Choosing colours from all pixels would take as long as finding the planes."""
-_NO_IMAGES = ("planes", "points")
+_NO_IMAGES = ("planes", "points", "neighbors")
 """Parts of a segmentation of an image that are no images."""
 _LEAST_BYTES_A_PIXEL = 300
 """Memory that labelling takes at least for each pixel."""
@@ -65,7 +65,7 @@ class Arguments:
         torchrg depth kinect.pcd --out planes.ply
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
+    inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
     """Depth images (.png of 16 bits, .npy), organised clouds (.pcd), or folders of these."""
     out: Path
     """File to write, .png for labels or a cloud by its suffix; for several inputs a directory."""
@@ -170,7 +170,7 @@ class FrameJob(Job):
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each image and write its result."""
-    arguments = console.parse(Arguments, argv, prog="torchrg depth")
+    arguments = parse(Arguments, argv, prog="torchrg depth")
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     console.use_threads(arguments.threads)

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
-from torchrg.cli.console import ColumnNames, ColumnsFlag, parse, say
+from torchrg.cli.arguments import Argument, parse
+from torchrg.cli.console import ColumnNames, ColumnsFlag, say
 from torchrg.io import read_cloud
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.structures import Cloud
@@ -26,7 +26,7 @@ class Arguments:
         torchrg info scan.txt --columns x,y,z,intensity
     """
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, Argument("FILE", is_positional=True)]
     """Cloud to read."""
     columns: ColumnsFlag = None
 

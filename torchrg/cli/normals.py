@@ -12,6 +12,7 @@ from torchrg._compile import compiled
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
+from torchrg.cli.arguments import parse
 from torchrg.cli.loop import run_each
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
@@ -62,7 +63,7 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, estimate the normals of each input and write them."""
-    arguments = console.parse(Arguments, argv, prog="torchrg normals")
+    arguments = parse(Arguments, argv, prog="torchrg normals")
     if arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
     if arguments.viewpoint is not None and arguments.orient != "viewpoint":

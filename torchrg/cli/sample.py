@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from torchrg.cli.console import parse, say
+from torchrg.cli.arguments import Argument, parse
+from torchrg.cli.console import say
 from torchrg.io import check_output, write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -21,7 +20,7 @@ class Arguments:
         torchrg sample room.ply --num-points 1000000 --noise 0.005 --seed 7
     """
 
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    out: Annotated[Path, Argument("OUT", is_positional=True)]
     """File to write, its format by suffix."""
     num_points: int = 100_000
     """Number of points."""

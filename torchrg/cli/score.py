@@ -5,20 +5,19 @@ import io
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
+from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.console import (
     ColumnNames,
     ColumnsFlag,
     check_apart,
     format_table,
-    parse,
     warn,
     warnings_as_lines,
 )
@@ -29,7 +28,6 @@ from torchrg.io.files import check_place
 from torchrg.metrics import (
     differing_rows,
     match_points,
-    planes_of_colors,
     score_labels,
     score_normals,
     score_partition,
@@ -63,10 +61,10 @@ class Arguments:
         torchrg score results truth --csv scores.csv
     """
 
-    predicted: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PREDICTED")]
+    predicted: Annotated[Path, Argument("PREDICTED", is_positional=True)]
     """Scan with labels or normals, as torchrg segment and convert write it, or a folder of
     such."""
-    truth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRUTH")]
+    truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
     """File with the true labels or normals, or a folder with such a file for each result."""
     match: Literal["rows", "nearest"] = "rows"
     """Which points are compared: those of one row, which must be the same, or each point of the
@@ -77,9 +75,6 @@ class Arguments:
     same point but for the rounding of the files, in any order."""
     superpoints: bool = False
     """Score superpoints against the true labels, as torchrg segment --superpoints writes them."""
-    plane_colors: bool = False
-    """True labels are in the colours, as in planes.ply of PlaneRCNN and AirPlanes, of which a
-    folder has one in the folder of each scan, or in annotation below."""
     ignore: int | None = None
     """True label of points that are not of any part, for superpoints. -1 always is one."""
     boundary_distance: float | None = None
@@ -108,7 +103,7 @@ def run(argv: list[str]) -> int:
         check_apart([arguments.csv], [predicted, truth])
     if of_folders:
         with warnings_as_lines():
-            pairs = _pair_scans(predicted, truth, coded=arguments.plane_colors).items()
+            pairs = _pair_scans(predicted, truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
         scores = _mean(scans)
@@ -136,18 +131,12 @@ def _holds_scans(path: Path) -> bool:
     return path.is_dir() and not is_scene(path)
 
 
-def _pair_scans(predicted: Path, truth: Path, *, coded: bool) -> dict[str, tuple[Path, Path]]:
-    """Return both places of each scan of two folders by name, in natural order.
-
-    With ``coded`` a true scan is called as the folder that its planes are in.
-    """
+def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
+    """Return both places of each scan of two folders by name, in natural order."""
     ours, theirs = (
         {scene.name: scene.path for scene in FolderOfClouds(folder).scenes}
         for folder in (predicted, truth)
     )
-    if coded:
-        parts = ("/planes", "/annotation")
-        theirs = {n.removesuffix(parts[0]).removesuffix(parts[1]): p for n, p in theirs.items()}
     for folder, missing in (
         (truth, ours.keys() - theirs.keys()),
         (predicted, theirs.keys() - ours.keys()),
@@ -173,11 +162,6 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     for cloud in (ours, theirs):
         for note in cloud.notes:
             warn(f"{cloud.source}: {note}.")
-    if arguments.plane_colors:
-        if "color" not in theirs.fields:
-            raise FormatError(f"{truth}: expected colours for --plane-colors, got none.")
-        labels = planes_of_colors(theirs.fields["color"].astype(np.uint8))
-        theirs = replace(theirs, fields={**theirs.fields, "labels": labels})
     scores: Scores = {}
     if arguments.match == "rows":
         _check_rows(predicted, truth, ours, theirs)

@@ -2,30 +2,23 @@
 
 import contextlib
 import dataclasses
+import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-import tyro
-from tqdm import tqdm
 
+from torchrg import scratch
 from torchrg.batch.lock import DirectoryLock
-from torchrg.batch.memory import PROCESS_BYTES, available_memory, memory_of_scan
+from torchrg.batch.memory import available_memory, memory_of_scan, memory_on_disk
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import Scan, check_finite, write_results
 from torchrg.batch.sources import CloudSource
-from torchrg.batch.task import Reports, Task
-from torchrg.batch.tiles import (
-    choose_tile_size,
-    choose_workers,
-    folder_of_work,
-    segmented_in_tiles,
-)
 from torchrg.cli import console
+from torchrg.cli.arguments import parse
 from torchrg.cli.loop import run_each
 from torchrg.config import SuperpointsConfig
 from torchrg.depth import find_intrinsics
@@ -40,6 +33,7 @@ from torchrg.io import (
     stream_cloud,
     write_cloud,
 )
+from torchrg.io.files import check_space
 from torchrg.io.stream import Extent
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.normals.sides import check_viewpoint, orient_cloud
@@ -50,10 +44,8 @@ from torchrg.render.gallery import (
     check_gallery,
     draw_entry,
     draw_planes,
-    memory_of_picture,
     write_index,
 )
-from torchrg.render.page import MAX_POINTS
 from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
@@ -82,7 +74,7 @@ class Arguments:
     """File to write, its format by suffix; for several inputs a directory."""
     picture: Path | None = None
     """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
-    inputs a directory of pictures. Of a cloud in tiles both show a sample of the points."""
+    inputs a directory of pictures."""
     pages: bool = False
     """Write a page for the browser beside each picture in the directory of --picture, and
     index.html, in which each picture links to its page (pip install 'torchrg[view]')."""
@@ -94,7 +86,6 @@ class Arguments:
     coarser ones as "superpoints_1" and so on. Numbers say how many there are in each, as in
     --superpoints 1000,300. Colours of the cloud play a part, and a picture shows superpoints
     instead of planes."""
-    orient: console.OrientFlag = "auto"
     level: int = 0
     """Which level of the superpoints --layout takes, 0 the finest."""
     layout: console.Layout | None = None
@@ -104,21 +95,13 @@ class Arguments:
     threads: int | None = None
     """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None
+    orient: console.OrientFlag = "auto"
     merge: bool = False
     """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
     limit_memory: float | None = None
-    """Gigabytes of memory that a cloud may take. One that would take more is segmented in tiles on
-    disk, with the same result. Default: half of what is free."""
-    workdir: Path | None = None
-    """Directory for the tiles of a cloud that is too large for memory, some 500 bytes a point. They
-    are removed when the result is written; a command that ended early goes on from them. Default:
-    the directory of the result."""
-    engine: Literal["local", "ray"] = "local"
-    """Where tiles are worked on: on this machine (local), or as tasks of a Ray cluster (ray; pip
-    install 'torchrg[ray]')."""
-    ray_address: str | None = None
-    """Address of the Ray cluster, "auto" for the one of this machine. Every node has to see the
-    working directory under the same path. Default: a cluster that is started for the command."""
+    """Gigabytes of memory that a cloud may take. Of one that would take more the largest arrays are
+    kept on the disk of OUT while it is segmented, or of TMPDIR, some 450 bytes a point, with the
+    same result. Default: half of what is free."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 
@@ -126,10 +109,8 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _refuse_images(argv)
     argv = console.spell_counts(argv, "--superpoints")
-    start = Arguments(
-        inputs=tyro.MISSING, out=tyro.MISSING, settings=console.PlaneSettings.asked_for(argv)
-    )
-    arguments = console.parse(Arguments, argv, prog="torchrg segment", default=start)
+    start = {"settings": console.PlaneSettings.asked_for(argv)}
+    arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):
         arguments = dataclasses.replace(arguments, superpoints=True)
     if not arguments.superpoints and arguments.partition != SuperpointsConfig():
@@ -140,7 +121,7 @@ def run(argv: list[str]) -> int:
     if arguments.level and arguments.layout is None:
         raise ConfigError("expected --layout with --level, as other files hold all levels.")
     console.use_threads(arguments.threads)
-    console.check_engine(arguments.limit_memory, arguments.engine, arguments.ray_address)
+    console.check_memory(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
@@ -206,170 +187,16 @@ def _refuse_images(argv: list[str]) -> None:
 def _segment(
     arguments: Arguments, sources: tuple[Path, ...], target: Path, picture: Path | None
 ) -> None:
-    """Segment a cloud of one file or of several, in tiles if it is too large for memory."""
-    given = arguments.limit_memory
-    limit = available_memory() // 2 if given is None else int(given * 1e9)
+    """Segment a cloud with a progress bar on a terminal, and one line about the result."""
+    begin, source = time.perf_counter(), _name_of(sources)
     stream = _stream(arguments, sources)
     # Of text only reading says how many points there are.
     num_points = stream.num_points or sum(map(estimate_points, sources))
-    if memory_of_scan(num_points) > limit:
-        # A header that promises more than the file holds is refused before anything is planned.
-        next(iter(stream))
-        _segment_tiles(arguments, sources, stream, target, picture, num_points, limit)
-    else:
-        _segment_whole(arguments, sources, stream, target, picture)
-
-
-def _name_of(sources: tuple[Path, ...]) -> str:
-    """Return what a cloud of some files is called in messages."""
-    return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
-
-
-def _stream(arguments: Arguments, sources: tuple[Path, ...]) -> CloudStream:
-    """Open files as one cloud, and say what they do not share."""
+    where = _arrays_of(arguments, source, target, num_points)
     names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    streams = [stream_cloud(source, columns=names.of(source)) for source in sources]
-    stream, notes = merge_streams(streams)
-    for note in notes:
-        console.warn(f"{_name_of(sources)}: {note}.")
-    return stream
-
-
-def _segment_tiles(
-    arguments: Arguments,
-    sources: tuple[Path, ...],
-    stream: CloudStream,
-    target: Path,
-    picture: Path | None,
-    num_points: int,
-    limit: int,
-) -> None:
-    """Segment a cloud in tiles, after a line that says so."""
-    begin, source, settings = time.perf_counter(), _name_of(sources), arguments.settings.resolved
-    if arguments.superpoints or arguments.layout is not None:
-        flag = "--superpoints" if arguments.layout is None else "--layout"
-        raise ConfigError(
-            f"{source}: expected no {flag} for a cloud of about {num_points:,} points, "
-            f"which takes more than {limit / 1e9:.2f} GB: whether two regions merge depends on the "
-            "merges beside them, and so on through the whole cloud, so that no tile tells it; "
-            "raise --limit-memory, or leave it out."
-        )
-    needed = PROCESS_BYTES + memory_of_picture(min(num_points, MAX_POINTS))
-    if arguments.orient not in ("auto", "none"):
-        raise ConfigError(
-            f"{source}: expected no --orient {arguments.orient} for a cloud of about "
-            f"{num_points:,} points, which takes more than {limit / 1e9:.2f} GB: no tile tells its "
-            "side; raise --limit-memory, or choose none."
-        )
-    if picture is not None and needed > limit:
-        raise ConfigError(
-            f"{source}: expected --limit-memory of at least {needed / 1e9:.2f} GB for --picture, "
-            f"got {limit / 1e9:.2f} GB; raise it, or leave out --picture."
-        )
-    try:
-        tile_size = choose_tile_size(num_points, limit)
-    except ConfigError as error:
-        raise ConfigError(f"{source}: {error}") from None
-    arguments = dataclasses.replace(arguments, orient="none")
-    fields = _check_points(arguments, source, stream, target)
-    folder = folder_of_work(target, arguments.workdir)
-    if arguments.engine == "ray":
-        folder = folder.absolute()  # Its processes are not in the folder of the command.
-    console.say(
-        f"{source}: about {num_points:,} points take {memory_of_scan(num_points) / 1e9:.2f} GB of "
-        f"memory, the limit is {limit / 1e9:.2f}: in tiles of {tile_size:,} in {folder}, from "
-        "which the same command goes on; normals keep their signs, as with --orient none"
-    )
-    with tqdm(unit="tile", leave=False, disable=None) as bar:
-
-        def show(stage: str, done: int, of: int) -> None:
-            bar.set_description_str(stage, refresh=False)
-            bar.total, bar.n = of, done
-            bar.refresh()
-
-        with segmented_in_tiles(
-            sources,
-            stream,
-            folder,
-            settings,
-            tile_size=tile_size,
-            target=target,
-            workers=choose_workers(num_points, tile_size, limit),
-            start=_engine(arguments, limit),
-            on_stage=show,
-            columns=arguments.columns,
-            voxel=arguments.voxel,
-        ) as seg:
-            write_cloud(target, stream, seg, provenance=_describe(arguments, sources))
-            if picture is not None:
-                _draw(arguments, picture, Result.of_sample(stream, seg, MAX_POINTS))
-            seconds, without = time.perf_counter() - begin, console.without(target, fields)
-            _report(source, seg, stream.extent, f"{target}{without}", seconds)
-
-
-def _check_points(
-    arguments: Arguments, source: str, cloud: Cloud | CloudStream, target: Path
-) -> tuple[str, ...]:
-    """Warn of what is not as it seems, before the work; refuse what cannot be written.
-
-    Returns the names of the fields of the cloud.
-    """
-    levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
-    parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
-    first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
-    written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
-    console.note_input(source, first, target, written)
-    for note in check_finite(cloud):
-        console.warn(f"{source}: {note}.")
-    if arguments.layout is None:
-        check_output(target, cloud)
-    return tuple(first.fields)
-
-
-def _engine(arguments: Arguments, limit: int) -> Callable[[Sequence[Task]], Reports] | None:
-    """Return what runs the tiles elsewhere, None where this machine does."""
-    if arguments.engine == "local":
-        return None
-    from torchrg.batch.ray_tasks import run_ray
-
-    return partial(run_ray, memory_limit=limit, address=arguments.ray_address)
-
-
-def _is_depth_image(cloud: Cloud) -> bool:
-    """Tell whether a cloud has a point for each pixel of a camera."""
-    if cloud.grid_shape is None:
-        return False
-    pixels = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
-    return find_intrinsics(pixels) is not None
-
-
-def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]:
-    """Return the provenance of a cloud of one file or of several."""
-    settings = arguments.settings.resolved
-    provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
-    if arguments.columns is not None:
-        provenance["columns"] = arguments.columns
-    if arguments.voxel is not None:
-        provenance["voxel"] = arguments.voxel
-    if len(sources) > 1:
-        provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
-    return provenance
-
-
-def _segment_whole(
-    arguments: Arguments,
-    sources: tuple[Path, ...],
-    stream: CloudStream,
-    target: Path,
-    picture: Path | None,
-) -> None:
-    """Segment a cloud, with a progress bar on a terminal and one line about the result."""
-    begin, source = time.perf_counter(), _name_of(sources)
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    if len(sources) == 1:
-        cloud = read_cloud(sources[0], columns=names.of(sources[0]))
-    else:
-        clouds = [read_cloud(source, columns=names.of(source)) for source in sources]
+    clouds = [read_cloud(path, columns=names.of(path)) for path in sources]
+    cloud = clouds[0]
+    if len(clouds) > 1:
         cloud = merge_streams(list(map(CloudStream.of, clouds))).stream.read()
     check_viewpoint(cloud, arguments.orient, "use --orient interior")
     _check_points(arguments, source, cloud, target)
@@ -379,8 +206,14 @@ def _segment_whole(
         )
     settings, voxel = arguments.settings.resolved, arguments.voxel
     stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
-    with console.stage_bar(sources[0].name, stages) as advance:
-        seg = segment_planes(cloud.points, settings, voxel=voxel, on_stage=advance)
+    with console.stage_bar(sources[0].name, stages) as advance, where:
+        seg = segment_planes(
+            cloud.points,
+            settings,
+            voxel=voxel,
+            keep_neighbors=arguments.superpoints,
+            on_stage=advance,
+        )
         parts, provenance = None, _describe(arguments, sources)
         if arguments.superpoints:
             advance("superpoints")
@@ -418,6 +251,80 @@ def _oriented(cloud: Cloud, seg: Segmentation, arguments: Arguments) -> Segmenta
     )
     turned = orient_cloud(few, seg.normals[rows], arguments.orient)
     return seg._replace(normals=restore_points(turned, inverse))
+
+
+def _arrays_of(
+    arguments: Arguments, source: str, target: Path, num_points: int
+) -> contextlib.AbstractContextManager[None]:
+    """Return where the large arrays of a cloud are: in memory, or on a disk that has the room."""
+    given = arguments.limit_memory
+    limit = available_memory() // 2 if given is None else int(given * 1e9)
+    needed, least = memory_of_scan(num_points), memory_on_disk(num_points)
+    if needed <= limit:
+        return contextlib.nullcontext()
+    if least > limit:
+        raise ConfigError(
+            f"{source}: expected --limit-memory of at least {least / 1e9:.2f} GB for about "
+            f"{num_points:,} points, got {limit / 1e9:.2f} GB; raise it, or split the cloud."
+        )
+    folder = Path(os.environ.get("TMPDIR") or target.parent)
+    k = max(
+        arguments.settings.resolved.normals.k, arguments.settings.resolved.normals.adaptive_k or 0
+    )
+    check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
+    console.say(
+        f"{source}: about {num_points:,} points take {needed / 1e9:.2f} GB of memory, the limit is "
+        f"{limit / 1e9:.2f}: the largest arrays are on the disk of {folder}"
+    )
+    return scratch.on_disk(folder)
+
+
+def _name_of(sources: tuple[Path, ...]) -> str:
+    """Return what a cloud of some files is called in messages."""
+    return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
+
+
+def _stream(arguments: Arguments, sources: tuple[Path, ...]) -> CloudStream:
+    """Open files as one cloud, and say what they do not share."""
+    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    streams = [stream_cloud(source, columns=names.of(source)) for source in sources]
+    stream, notes = merge_streams(streams)
+    for note in notes:
+        console.warn(f"{_name_of(sources)}: {note}.")
+    return stream
+
+
+def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
+    """Warn of what is not as it seems, before the work; refuse what cannot be written."""
+    levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
+    parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
+    written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
+    console.note_input(source, cloud, target, written)
+    for note in check_finite(cloud):
+        console.warn(f"{source}: {note}.")
+    if arguments.layout is None:
+        check_output(target, cloud)
+
+
+def _is_depth_image(cloud: Cloud) -> bool:
+    """Tell whether a cloud has a point for each pixel of a camera."""
+    if cloud.grid_shape is None:
+        return False
+    pixels = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
+    return find_intrinsics(pixels) is not None
+
+
+def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]:
+    """Return the provenance of a cloud of one file or of several."""
+    settings = arguments.settings.resolved
+    provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
+    if arguments.columns is not None:
+        provenance["columns"] = arguments.columns
+    if arguments.voxel is not None:
+        provenance["voxel"] = arguments.voxel
+    if len(sources) > 1:
+        provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
+    return provenance
 
 
 def _write_layout(

@@ -6,15 +6,14 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
+from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.console import (
     ColumnNames,
     ColumnsFlag,
     check_drawing,
     is_page,
-    parse,
     say,
     warn,
 )
@@ -54,7 +53,7 @@ class Arguments:
         torchrg view scan.ply --out normals.png --color normal --view above
     """
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, Argument("FILE", is_positional=True)]
     """Cloud or result to read."""
     out: Path
     """Picture (.png) or page (.html; pip install 'torchrg[view]') to write. A page is one file that

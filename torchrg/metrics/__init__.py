@@ -14,53 +14,31 @@ from torchrg.metrics.labels import (
     LabelScore,
     adjusted_rand_index,
     match_regions,
-    normalized_mutual_information,
-    rand_index,
     score_labels,
     segmentation_covering,
-    variation_of_information,
 )
 from torchrg.metrics.matching import differing_rows, match_points
 from torchrg.metrics.normals import NormalScore, score_normals
 from torchrg.metrics.partition import PartitionScore, score_partition
-from torchrg.metrics.protocols import (
-    EvopsScore,
-    SegCompCounts,
-    VoxelScore,
-    count_segcomp,
-    planes_of_colors,
-    score_evops,
-    score_voxels,
-)
 
 __all__ = [
     "METRICS",
     "ClusterScore",
     "ContingencyTable",
-    "EvopsScore",
     "Index",
     "LabelScore",
     "NormalScore",
     "PartitionScore",
-    "SegCompCounts",
-    "VoxelScore",
     "adjusted_rand_index",
     "contingency_table",
-    "count_segcomp",
     "differing_rows",
     "match_points",
     "match_regions",
-    "normalized_mutual_information",
-    "planes_of_colors",
-    "rand_index",
     "score_clusters",
-    "score_evops",
     "score_labels",
     "score_normals",
     "score_partition",
-    "score_voxels",
     "segmentation_covering",
-    "variation_of_information",
 ]
 
 
@@ -68,7 +46,7 @@ class Index(NamedTuple):
     """What a number means.
 
     Attributes:
-        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"bit"``, ``"count"``, or ``""`` for
+        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""`` for
             shares and ratios.
         higher_is_better: None where neither direction is better.
     """
@@ -80,13 +58,8 @@ class Index(NamedTuple):
 _LABELS = {
     Index("%", True): "precision recall f1",
     Index("count", None): "pairs regions faces points",
-    Index("count", True): "correct",
-    Index("count", False): "over_segmented under_segmented missed noise",
     Index("", True): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
-    "evops_precision evops_recall evops_f1 evops_mean_iou evops_mean_dice "
-    "share_labeled covering rand ari nmi",
-    Index("bit", False): "voi",
-    Index("", False): "evops_over_segmented evops_under_segmented evops_missed evops_noise",
+    "share_labeled covering ari",
 }
 _SUPERPOINTS = {
     Index("", True): "asa oracle_miou boundary_recall boundary_precision",

@@ -149,3 +149,8 @@ def check_one_device(caller: str, **arguments: Tensor) -> None:
     if len(set(devices)) > 1:
         names = " and ".join(arguments)
         raise ShapeError(f"{caller}: expected {names} on one device, got {' and '.join(devices)}.")
+
+
+def share(part: float, whole: float) -> float:
+    """Return ``part / whole``, and 0 where the whole is 0."""
+    return part / whole if whole else 0.0

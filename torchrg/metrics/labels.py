@@ -1,6 +1,5 @@
 """External indices: predicted plane labels against true ones."""
 
-import math
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -8,8 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import ContingencyTable, count_overlaps
-from torchrg.metrics.protocols import count_segcomp, score_evops, share
+from torchrg.metrics.contingency import ContingencyTable, count_overlaps, share
 
 
 class LabelScore(NamedTuple):
@@ -31,16 +29,9 @@ class LabelScore(NamedTuple):
         precision_iou50: Regions with a face at IoU > 0.5, of all regions.
         recall_iou50: Faces with a region at IoU > 0.5, of all faces.
         precision_iou80: The same at IoU > 0.8; so is ``recall_iou80``.
-        correct: As in :class:`torchrg.metrics.protocols.SegCompCounts` at 80 %; so are
-            ``over_segmented``, ``under_segmented``, ``missed`` and ``noise``.
-        evops_precision: As in :class:`torchrg.metrics.protocols.EvopsScore`; so are the other
-            ``evops_*``.
         share_labeled: Scored points that lie in a region.
         covering: Segmentation covering: mean best IoU weighted by the size of the face.
-        rand: Rand index, as tables of planes in images have it; see :func:`rand_index`.
-        voi: Variation of information, in bits; see :func:`variation_of_information`.
         ari: Adjusted Rand index.
-        nmi: Normalised mutual information, arithmetic mean.
     """
 
     precision: float
@@ -55,26 +46,9 @@ class LabelScore(NamedTuple):
     recall_iou50: float
     precision_iou80: float
     recall_iou80: float
-    correct: int
-    over_segmented: int
-    under_segmented: int
-    missed: int
-    noise: int
-    evops_precision: float
-    evops_recall: float
-    evops_f1: float
-    evops_mean_iou: float
-    evops_mean_dice: float
-    evops_over_segmented: float
-    evops_under_segmented: float
-    evops_missed: float
-    evops_noise: float
     share_labeled: float
     covering: float
-    rand: float
-    voi: float
     ari: float
-    nmi: float
 
 
 def score_labels(
@@ -98,9 +72,8 @@ def score_labels(
         * They belong to no region, or to no face, so none is matched, missed or noise.
         * A point of no face still counts in its region's size, and lowers its precision and IoU;
           a point of no region counts in its face's size, and lowers its recall and IoU.
-        * For ``rand``, ``voi``, ``ari`` and ``nmi`` the unlabelled points of each side are one more
-          part, as when the labels are given to scikit-learn. Pass ``ignore=-1`` to leave out the
-          points of no face altogether.
+        * For ``ari`` the unlabelled points of each side are one more part, as when the labels are
+          given to scikit-learn. Pass ``ignore=-1`` to leave out the points of no face altogether.
         * ``covering`` and ``mean_best_iou`` are over faces only.
 
     Args:
@@ -113,8 +86,7 @@ def score_labels(
 
     Returns:
         The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
-        the counts tell it from a real 0. ``rand``, ``ari`` and ``nmi`` are 1 where neither side
-        divides the points.
+        the counts tell it from a real 0. ``ari`` is 1 where neither side divides the points.
 
     Raises:
         ShapeError: If the labels are not integers, or differ in length or device.
@@ -122,10 +94,8 @@ def score_labels(
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
-        Normal Estimation, section III.B. The other indices name theirs: :func:`count_segcomp`,
-        :func:`score_evops`, :func:`rand_index`, :func:`variation_of_information`,
-        :func:`adjusted_rand_index`, :func:`normalized_mutual_information`,
-        :func:`segmentation_covering`.
+        Normal Estimation, section III.B. :func:`adjusted_rand_index` and
+        :func:`segmentation_covering` name theirs.
 
     Example:
         >>> score = score_labels(torch.tensor([8, 8, 8, 3, -1]), torch.tensor([0, 0, 1, 1, 1]))
@@ -139,7 +109,6 @@ def score_labels(
     precision, recall, num_pairs = _pair_precision_recall(table, matching)
     matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))
     best = _best_iou(table)
-    segcomp, evops = count_segcomp(table), score_evops(table)
     return LabelScore(
         precision=precision,
         recall=recall,
@@ -153,14 +122,9 @@ def score_labels(
         recall_iou50=share(matched50, num_faces),
         precision_iou80=share(matched80, num_regions),
         recall_iou80=share(matched80, num_faces),
-        **segcomp._asdict(),
-        **{f"evops_{name}": value for name, value in evops._asdict().items()},
         share_labeled=share(int(table.region_sizes.sum()), table.num_points),
         covering=segmentation_covering(table),
-        rand=rand_index(table),
-        voi=variation_of_information(table),
         ari=adjusted_rand_index(table),
-        nmi=normalized_mutual_information(table),
     )
 
 
@@ -281,101 +245,12 @@ def adjusted_rand_index(table: ContingencyTable) -> float:
     return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
 
 
-def rand_index(table: ContingencyTable) -> float:
-    r"""Return the share of pairs of points that both labellings join, or both part [1].
-
-    Convention:
-        The unlabelled points of a side are one more part of it, as in :func:`adjusted_rand_index`.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        In [0, 1]; 1 without any pair of points.
-
-    References:
-        [1] W. Rand. Objective criteria for the evaluation of clustering methods. JASA, 1971.
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([0, 0, 1]), torch.tensor([0, 1, 1]))
-        >>> round(rand_index(table), 4)
-        0.3333
-    """
-    together, predicted, true, pairs = _pairs_of_points(table)
-    return (pairs + 2 * together - predicted - true) / pairs if pairs else 1.0
-
-
-def variation_of_information(table: ContingencyTable) -> float:
-    r"""Return ``H(C | G) + H(G | C)``, what each of two labellings does not say of the other [1].
-
-    Convention:
-        In bits, as tables of planes in images have it. The unlabelled points of a side are one more
-        part of it.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        At least 0, which means equal partitions.
-
-    References:
-        [1] M. Meila. Comparing clusterings: an information based distance. J. Multivariate
-        Analysis, 2007.
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([0, 0, 0, 0]), torch.tensor([0, 0, 1, 1]))
-        >>> variation_of_information(table)
-        1.0
-    """
-    both, regions, faces = _entropies(table)
-    return max((2 * both - regions - faces) / math.log(2), 0.0)
-
-
 def _pairs_of_points(table: ContingencyTable) -> tuple[int, int, int, int]:
     """Return the pairs of points that are together in both, in regions, in faces, and all pairs."""
     together, predicted, true = (
         int((sizes * (sizes - 1) // 2).sum()) for sizes in _sizes_with_unlabeled(table)
     )
     return together, predicted, true, table.num_points * (table.num_points - 1) // 2
-
-
-def _entropies(table: ContingencyTable) -> tuple[float, float, float]:
-    """Return the entropies of overlaps, regions and faces, in nats."""
-    shares = (part.double() / table.num_points for part in _sizes_with_unlabeled(table))
-    both, regions, faces = (-float(torch.special.xlogy(part, part).sum()) for part in shares)
-    return both, regions, faces
-
-
-def normalized_mutual_information(table: ContingencyTable) -> float:
-    r"""Return ``2 I(C, G) / (H(C) + H(G))``, the information that two labellings share [1].
-
-    Convention:
-        The unlabelled points of a side are one more part of it: the value is that of
-        scikit-learn's ``normalized_mutual_info_score`` (arithmetic mean of the entropies).
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        In [0, 1]; 1 where both sides have one part only, or no point at all.
-
-    References:
-        [1] N. Vinh, J. Epps, J. Bailey. Information theoretic measures for clusterings comparison.
-        JMLR, 2010, table 2 (NMI_sum).
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]))
-        >>> normalized_mutual_information(table)
-        0.0
-    """
-    sizes = _sizes_with_unlabeled(table)
-    if len(sizes[1]) <= 1 and len(sizes[2]) <= 1:
-        return 1.0
-    both, regions, faces = _entropies(table)
-    return min(max(2 * (regions + faces - both) / (regions + faces), 0.0), 1.0)
 
 
 def segmentation_covering(table: ContingencyTable) -> float:

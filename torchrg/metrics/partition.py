@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import check_labels, contingency_table
-from torchrg.metrics.protocols import share
+from torchrg.metrics.contingency import check_labels, contingency_table, share
 from torchrg.neighbors import search_knn
 from torchrg.structures import UNLABELED
 

@@ -9,9 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import ROWS_AT_ONCE, allowed_threads, chunks_of, sequential_operations
 from torchrg.errors import ShapeError
+from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
@@ -68,7 +70,7 @@ def search_knn(
             "or Inf; leave them out first."
         )
     bounds = _cloud_bounds(offset, len(coordinates))
-    indices = np.empty((len(coordinates), k), dtype=np.int32)
+    indices = scratch.empty((len(coordinates), k), np.int32)
     outside = None if max_distance is None else np.empty(indices.shape, dtype=bool)
     for start, stop in bounds:
         if not 1 <= k <= stop - start:
@@ -78,8 +80,14 @@ def search_knn(
             )
         cloud = coordinates[start:stop]
         order = None if canonical else canonical_order(cloud).numpy()
+        cloud = cloud if order is None else cloud[order]
+        if scratch.is_active() and max_distance is None:
+            for rows, near in search_blocks(cloud, k, search_rows):
+                into = rows if order is None else order[rows]
+                indices[start:stop][into] = (near if order is None else order[near]) + start
+            continue
         _search_cloud(
-            cloud if order is None else cloud[order],
+            cloud,
             slice(0, len(cloud)),
             order,
             start,

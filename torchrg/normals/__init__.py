@@ -30,7 +30,7 @@ from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
-from torchrg.normals.consensus import constants, estimate_consensus
+from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
@@ -77,19 +77,6 @@ ESTIMATORS: dict[str, Estimator] = {
 
 WITHOUT_GRADIENT = {"consensus"}
 """Estimators that choose and smooth in so many steps that no fit is left to differentiate."""
-
-NOISE_STEPS = 3
-STEPS = dict.fromkeys(ESTIMATORS, 1) | {
-    "irls": NOISE_STEPS,
-    "paper": 2,
-    "consensus": NOISE_STEPS + 1 + 2 * constants.NUM_PASSES,
-}
-"""Steps from neighbour to neighbour within which the points lie that decide the fit of a point. It
-is 1 where only the point's own neighbourhood decides. Each step of an estimate of the noise adds
-one: the deviations of neighbourhoods, their quantile, and the quantile of these quantiles. With the
-noise of a region there are :data:`torchrg.normals.consensus.constants.REGIONAL_STEPS` more.
-``consensus`` with ``adaptive_k`` looks at the whole cloud, but only for the number of neighbours:
-see :func:`torchrg.normals.consensus.wanted_neighbors`."""
 
 
 @of_clouds

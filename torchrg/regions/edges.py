@@ -2,12 +2,11 @@
 
 A criterion is a function that tests the edges from some points, ``rows``, to their K neighbours,
 and returns which of them pass, shape ``(n, K)``, bool. A new one is a setting, a function here, and
-the line of :func:`accept_edges` that calls it. It may read the neighbours of both ends of an edge;
-one that reads more also raises :data:`EDGE_STEPS`.
+the line of :func:`accept_edges` that calls it.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._compile import kernel
 from torchrg._parallel import allowed_threads, chunks_of, map_tasks, places_of
 from torchrg.config import GrowingConfig
@@ -24,10 +24,6 @@ from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors, Rows
-
-EDGE_STEPS = 2
-"""Steps from neighbour to neighbour, from a point, to all points that decide its edges. A part of a
-cloud with those around it has the same edges: the criteria read the neighbours of both ends."""
 
 _CHUNKS_A_THREAD = 4
 """Chunks that each thread tests before their edges are stored. Threads wait for each other at that
@@ -98,12 +94,11 @@ def find_coded_edges(
 
     With late promotion these are only the edges that do make a seed. Then there is a second result:
     which neighbours a point merely claims, shape ``(N, K)``; these are most edges, and lists of
-    them would take more time and memory. ``limit`` is that of the curvature, a scalar. Chunks of
-    every size, and parts of a cloud with :data:`EDGE_STEPS` around, give the same edges.
+    them would take more time and memory. ``limit`` is that of the curvature, a scalar.
     """
     shared = _shared_neighbors(cloud, config)
     indices = cloud.neighbors.indices
-    claims = np.empty(indices.shape, dtype=bool) if promotes_late(config) else None
+    claims = scratch.empty(indices.shape, np.bool_) if promotes_late(config) else None
 
     def find(rows: slice) -> list[_Edges]:
         joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
@@ -113,7 +108,8 @@ def find_coded_edges(
             joins &= becomes_seed
         return [_pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)]
 
-    return _pack(find, cloud, None, chunk_size)[0], claims
+    whole = slice(0, len(cloud.points))
+    return _pack(find, cloud, whole, None, chunk_size)[0], claims
 
 
 def find_edges(
@@ -123,12 +119,12 @@ def find_edges(
     *,
     chunk_size: int,
     more: EdgeLists | None = None,
+    block: slice | None = None,
 ) -> tuple[EdgeLists, EdgeLists]:
     """Return the edges of points of at most the curvature limit, and those of all others.
 
     The first have the edges of ``more`` nodes behind them, the second are coded as
-    :func:`find_coded_edges` does. Chunks of every size, and parts of a cloud with
-    :data:`EDGE_STEPS` around, give the same edges.
+    :func:`find_coded_edges` does. With ``block`` they are those of these points alone.
     """
     shared = _shared_neighbors(cloud, config)
     is_seed = cloud.curvature <= limit
@@ -139,9 +135,17 @@ def find_edges(
         coded = targets.to(torch.int32) * 2
         return [_pick(targets, joins & seeds), _pick(coded, joins & ~seeds)]
 
-    edges, rest = _pack(find, cloud, more, chunk_size)
+    block = slice(0, len(cloud.points)) if block is None else block
+    edges, rest = _pack(find, cloud, block, more, chunk_size)
     targets, counts = zip(*rest, strict=True)
     return edges, EdgeLists(np.concatenate([[0], *counts]).cumsum(), np.concatenate(targets))
+
+
+def join_edges(parts: Sequence[EdgeLists]) -> EdgeLists:
+    """Return the edges of successive blocks of points as those of all of them."""
+    counts = np.concatenate([np.diff(part.starts) for part in parts])
+    starts = np.concatenate([[0], counts]).cumsum()
+    return EdgeLists(starts, np.concatenate([part.targets for part in parts]))
 
 
 def _become_seeds(
@@ -268,18 +272,24 @@ def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
 def _pack(
     find: Callable[[slice], list[_Edges]],
     cloud: GrowingCloud,
+    block: slice,
     more: EdgeLists | None,
     chunk_size: int,
 ) -> tuple[EdgeLists, list[_Edges]]:
-    """Join the first edges of successive chunks, and those of more nodes; collect what is left.
+    """Join the first edges of a block's chunks, and those of more nodes; collect what is left.
 
     The edges are found by as many threads as torch uses.
     """
-    chunks = chunks_of(len(cloud.points), chunk_size) or [slice(0, 0)]
+    num_points = block.stop - block.start
+    chunks = [
+        slice(block.start + chunk.start, block.start + chunk.stop)
+        for chunk in chunks_of(num_points, chunk_size) or [slice(0, 0)]
+    ]
     at_once = _CHUNKS_A_THREAD * allowed_threads()
     spare = 0 if more is None else len(more.targets)
     # As long as it can get: memory that is not used is not touched.
-    targets = np.empty(cloud.neighbors.indices.numel() + spare, dtype=np.int32)
+    size = num_points * cloud.neighbors.indices.shape[1] + spare
+    targets = scratch.empty((size,), np.int32)
     counts, rest, used = [], [], 0
 
     def append(edges: _Edges) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +10,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, chunks_of, sequential_operations
+from torchrg._parallel import (
+    CHUNK_SIZE,
+    ROWS_AT_ONCE,
+    chunks_of,
+    return_freed_memory,
+    sequential_operations,
+)
 from torchrg.config import GrowingConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import canonical_order
+from torchrg.neighbors import blocks, canonical_order
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import (
@@ -23,9 +30,11 @@ from torchrg.regions.edges import (
     find_coded_edges,
     find_edges,
     is_order_free,
+    join_edges,
     neighborhood_radii,
 )
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
+from torchrg.regions.reach import chain_of, condense, first_to_reach, join_condensed
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -283,32 +292,46 @@ class GrowthOrder(NamedTuple):
         return self.rows[: self.num_seeds]
 
 
-class GrowthEdges(NamedTuple):
-    """What regions grow along from some points.
-
-    Attributes:
-        coded: Edges as :func:`find_coded_edges` gives them, of all points or of those that are no
-            seeds.
-        of_seeds: Edges of the points of at most the curvature limit, where such a point is a seed
-            whoever claimed it; None where that is a matter of the edge.
-        claims: Neighbours that a point merely claims, shape ``(N, K)``, with late promotion.
-    """
-
-    coded: EdgeLists
-    of_seeds: EdgeLists | None = None
-    claims: NDArray[np.bool_] | None = None
-
-
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
 
-    The root of a region is the point it began with. Of a point that is not valid it is -1. This
-    needs the edges of the whole cloud: regions have no bounded reach.
+    The root of a region is the point it began with. Of a point that is not valid it is -1.
     """
     order = growth_order(cloud.curvature, cloud.valid, config)
-    edges = find_growth_edges(cloud, config, order, chunk_size=chunk_size)
-    roots = grow_along(edges, order, cloud.neighbors.indices.cpu().numpy(), config)
+    if is_order_free(config):
+        roots, others = reach_from_seeds(cloud, config, order, chunk_size)
+        if config.min_size <= cloud.neighbors.indices.shape[1]:
+            # Points that no seed reaches may make regions with free neighbours of their own.
+            free = roots < 0
+            left = grow_first_in_first_out(others, order.rows[free[order.rows]], free)
+            roots = np.where(free, left, roots)
+    else:
+        edges, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
+        valid, lists = cloud.valid.cpu().numpy(), cloud.neighbors.indices.cpu().numpy()
+        roots = grow_first_in_first_out(edges, order.rows, valid, claims, lists)
     return torch.from_numpy(roots).to(cloud.points.device)
+
+
+def reach_from_seeds(
+    cloud: GrowingCloud, config: GrowingConfig, order: GrowthOrder, chunk_size: int
+) -> tuple[NDArray[np.int32], EdgeLists]:
+    """Return the first of the seeds that reaches each point, and the edges of all that are none.
+
+    The edges of seeds are one graph, or on a disk the graphs of blocks, each without what reaches
+    one another in it, so that not all of them are in memory.
+    """
+    num_points = len(cloud.points)
+    if not scratch.is_active():
+        chain = chain_of(order.seeds, num_points)
+        edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, more=chain)
+        return first_to_reach(edges, num_points), others
+    parts, rest = [], []
+    for block in chunks_of(num_points, blocks.BLOCK_SIZE):
+        edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, block=block)
+        parts.append(condense(edges, block))
+        rest.append(others)
+    return_freed_memory()
+    return join_condensed(parts, order.seeds), join_edges(rest)
 
 
 def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> GrowthOrder:
@@ -320,94 +343,11 @@ def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> Gro
     return GrowthOrder(rows, int(torch.count_nonzero(growing <= limit)), limit)
 
 
-def find_growth_edges(
-    cloud: GrowingCloud,
-    config: GrowingConfig,
-    order: GrowthOrder,
-    *,
-    chunk_size: int,
-    whole: bool = True,
-) -> GrowthEdges:
-    """Return the edges that regions grow along; of a whole cloud with the chain of its seeds."""
-    if not is_order_free(config):
-        coded, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
-        return GrowthEdges(coded, claims=claims)
-    chain = chain_of(order.seeds, len(cloud.points)) if whole else None
-    edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, more=chain)
-    return GrowthEdges(others, edges)
-
-
-def grow_along(
-    edges: GrowthEdges,
-    order: GrowthOrder,
-    lists: NDArray[np.integer],
-    config: GrowingConfig,
-    reach: Callable[[NDArray[np.int32]], NDArray[np.int32]] | None = None,
-) -> NDArray[np.int32]:
-    """Return the root of each point's region.
-
-    ``lists`` ``(N, K)`` are the neighbours of the points. ``reach`` tells which of the seeds
-    reaches each point first, where the edges of seeds are elsewhere.
-    """
-    num_points, k = lists.shape
-    if reach is not None:
-        roots = reach(order.seeds)
-    elif edges.of_seeds is not None:
-        roots = first_to_reach(edges.of_seeds, num_points)
-    else:
-        valid = np.zeros(num_points, dtype=bool)
-        valid[order.rows] = True
-        return grow_first_in_first_out(edges.coded, order.rows, valid, edges.claims, lists)
-    if config.min_size > k:
-        return roots
-    # Points that no seed reaches may make regions with free neighbours of their own.
-    free = roots < 0
-    left = grow_first_in_first_out(edges.coded, order.rows[free[order.rows]], free)
-    return np.where(free, left, roots)
-
-
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
     """Return the lower quantile of curvatures ``(n,)``, one of the values; 0 where n is 0."""
     if len(curvature) == 0:
         return curvature.new_zeros(())
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
-
-
-def chain_of(seeds: NDArray[np.int32], num_points: int) -> EdgeLists:
-    """Return the edges of a chain of nodes behind those of a graph of so many points.
-
-    Each node leads to one of the seeds, then to the next node.
-    """
-    targets = np.empty(max(2 * len(seeds) - 1, 0), dtype=np.int32)
-    targets[::2] = seeds
-    targets[1::2] = np.arange(num_points + 1, num_points + len(seeds))
-    starts = np.minimum(2 * np.arange(len(seeds) + 1, dtype=np.int32), len(targets))
-    return EdgeLists(starts, targets)
-
-
-def first_to_reach(edges: EdgeLists, num_points: int) -> NDArray[np.int32]:
-    """Return for each point the first of the seeds that reaches it along edges, -1 for none.
-
-    This is what growing one region after the other, from each seed that is still free, comes to,
-    if it does not matter for what a point reaches who claimed it: the first seed that reaches a
-    point finds all of its way free. One depth-first search does it: behind the edges of the points
-    are those of the :func:`chain_of` the seeds, where it begins.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import depth_first_order
-
-    roots = np.full(num_points, -1, dtype=np.int32)
-    num_nodes = len(edges.starts) - 1
-    if num_nodes == num_points:
-        return roots
-    # The search reads no weights; an array of one repeated value takes no memory.
-    weights = np.broadcast_to(np.float64(1), len(edges.targets))
-    graph = csr_array((weights, edges.targets, edges.starts), shape=(num_nodes, num_nodes))
-    visited, parents = depth_first_order(graph, num_points, directed=True)
-    visited = visited[visited < num_points]
-    is_root = parents[visited] >= num_points
-    roots[visited] = visited[is_root][np.cumsum(is_root) - 1]
-    return roots
 
 
 def grow_first_in_first_out(

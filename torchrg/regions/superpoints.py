@@ -68,6 +68,7 @@ def partition_points(
     config: SuperpointsConfig,
     colors: Tensor | None = None,
     faces: Tensor | None = None,
+    neighbors: Neighbors | None = None,
 ) -> Superpoints:
     r"""Partition a cloud; see :func:`torchrg.make_superpoints`.
 
@@ -89,7 +90,8 @@ def partition_points(
     order of visits.
 
     ``labels`` ``(N,)`` are those of planes, negative for none. Of a mesh with ``faces`` ``(F, 3)``
-    contacts are its edges, else those of a point to the 8 nearest.
+    contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the finite
+    points in canonical order are searched unless they are given, and no two points are equal.
 
     References:
         [1] H. Knutsson. Representing local structure using tensors. SCIA, 1989.
@@ -114,6 +116,8 @@ def partition_points(
     edges = None
     if faces is not None:
         edges = _mesh_edges(faces.cpu(), restore_rows(place, rows, len(points), fill=-1).cpu())
+    if neighbors is not None and not bool(is_first.all()):
+        neighbors = None
     partitions = _partition_places(
         ordered[is_first].cpu(),
         normals[distinct].detach().cpu(),
@@ -121,6 +125,7 @@ def partition_points(
         config,
         None if colors is None else _unit_colors(colors[distinct]).cpu(),
         edges,
+        neighbors,
     )
     levels = tuple(
         restore_rows(level.to(place.device)[place], rows, len(points), fill=UNLABELED)
@@ -136,11 +141,15 @@ def _partition_places(
     config: SuperpointsConfig,
     colors: Tensor | None,
     edges: Tensor | None,
+    neighbors: Neighbors | None,
 ) -> list[Tensor]:
     """Return the region of each of distinct points ``(n,)`` in canonical order, level by level."""
     if len(places) == 0:
         return [torch.zeros(0, dtype=torch.int64) for _ in range(config.num_levels)]
-    neighbors = search_knn(places, min(_NUM_NEIGHBORS, len(places)), canonical=True)
+    k = min(_NUM_NEIGHBORS, len(places))
+    if neighbors is None or neighbors.indices.shape[1] < k:
+        neighbors = search_knn(places, k, canonical=True)
+    neighbors = Neighbors(neighbors.indices[:, :k].cpu())
     spacing = _median_spacing(places, neighbors)
     if colors is not None:
         colors = math.sqrt(config.color_weight) * colors

@@ -108,29 +108,11 @@ def _share_of_noise(survey: Survey) -> Tensor:
     return torch.where(known, survey.noise / survey.radius, torch.nan)
 
 
-@torch.no_grad()
-def share_of_noise(points: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
-    """Return the noise by the radius of each neighbourhood, shape ``(N,)``; NaN where unknown.
-
-    It is that of the fits with which :func:`estimate_consensus` begins.
-
-    Example:
-        >>> floor = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
-        >>> bool((share_of_noise(floor, search_knn(floor, 30), 256) < 1e-5).all())
-        True
-    """
-    if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
-        return torch.full_like(points[:, 0], torch.nan)
-    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
-    size = min(chunk_size, ROWS_IN_CACHE)
-    return _share_of_noise(survey_noise(points, neighbors, fit, chunk_size=size))
-
-
 def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
     """Return the number of neighbours with which noise is a small share of the radius.
 
     Args:
-        shares: Those of all points with ``count`` neighbours, as of :func:`share_of_noise`.
+        shares: Noise by radius of all points with ``count`` neighbours, NaN where unknown.
         count: Number of neighbours.
         config: ``adaptive_k`` is the most there may be.
 

@@ -4,15 +4,10 @@ from itertools import product
 
 import pytest
 import torch
+from benchmarks.protocols import SegCompCounts, count_segcomp, score_evops, score_voxels
 
 from torchrg.errors import ConfigError
-from torchrg.metrics import (
-    SegCompCounts,
-    contingency_table,
-    count_segcomp,
-    score_evops,
-    score_voxels,
-)
+from torchrg.metrics import contingency_table
 
 
 def sets_of(labels):

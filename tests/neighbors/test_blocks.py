@@ -1,15 +1,14 @@
-"""Neighbours of tiles and the boxes they are found by, against all distances."""
+"""Neighbours of blocks and the boxes they are found by, against all distances."""
 
 import itertools
-import tracemalloc
 
 import numpy as np
 import pytest
 import torch
 
 from torchrg.neighbors import finite_rows
-from torchrg.neighbors.octree import farthest_neighbor, find_boxes, near_boxes
-from torchrg.neighbors.tiles import cut_part, search_tile
+from torchrg.neighbors.blocks import farthest_neighbor, find_boxes, near_boxes, search_block
+from torchrg.neighbors.knn import search_rows
 
 
 def lattice(rng):
@@ -47,7 +46,7 @@ def nearest(points, k):
     return np.argsort(distances, axis=1, kind="stable")[:, :k]
 
 
-def tiles_of(boxes, size):
+def blocks_of(boxes, size):
     """Ranges of about so many rows that end where boxes do."""
     ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, boxes.starts[-1], size))]
     bounds = np.unique(np.append(ends, boxes.starts[-1])).tolist()
@@ -56,11 +55,14 @@ def tiles_of(boxes, size):
 
 @pytest.mark.parametrize("make", CLOUDS)
 @pytest.mark.parametrize(("size", "most"), [(5, None), (60, None), (100, 130), (100, 1)])
-def test_neighbors_of_tiles_are_the_nearest_of_all(make, size, most):
+def test_neighbors_of_blocks_are_the_nearest_of_all(make, size, most):
     points = in_order(make)
     boxes = find_boxes(points, 8)
     for k in (1, 12):
-        found = [search_tile(points, boxes, tile, k, most) for tile in tiles_of(boxes, size)]
+        found = [
+            search_block(points, boxes, block, k, search_rows, most)
+            for block in blocks_of(boxes, size)
+        ]
         np.testing.assert_array_equal(np.concatenate(found), nearest(points, k))
 
 
@@ -98,27 +100,3 @@ def test_the_bound_of_a_box_holds_for_all_its_points():
     distances = np.linalg.norm(last - points, axis=1)
     for box, (start, stop) in enumerate(itertools.pairwise(boxes.starts)):
         assert distances[start:stop].max() <= farthest_neighbor(boxes, box, 12)
-
-
-def test_a_part_has_all_points_within_so_many_steps():
-    lists = torch.from_numpy(np.random.default_rng(0).integers(0, 400, (400, 3)))
-    lists[:, 0] = torch.arange(400)
-    reached = set(range(100, 120))
-    for steps in range(4):
-        part = cut_part(lists, slice(100, 120), steps)
-        assert part.rows.tolist() == sorted(reached)
-        assert part.rows[part.own].tolist() == list(range(100, 120))
-        for row, near in zip(part.rows.tolist(), part.neighbors.indices.tolist(), strict=True):
-            wanted = [other if other in reached else row for other in lists[row].tolist()]
-            assert part.rows[torch.tensor(near)].tolist() == wanted
-        reached |= {other for row in reached for other in lists[row].tolist()}
-
-
-def test_a_part_takes_the_memory_of_its_own_points_not_of_the_cloud():
-    chain = torch.arange(10**6, dtype=torch.int32)[:, None].clamp(max=10**6 - 2) + torch.arange(2)
-    tracemalloc.start()
-    part = cut_part(chain, slice(500_000, 500_100), 3)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert part.rows.tolist() == list(range(500_000, 500_103))
-    assert peak < 10**5

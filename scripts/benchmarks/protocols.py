@@ -9,35 +9,13 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import ContingencyTable, check_labels, count_overlaps
+from torchrg.metrics.contingency import ContingencyTable, check_labels, count_overlaps, share
 from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
 
 _MATCH_IOU, _PART_IOU = 0.75, 0.2
 """Least IoU of a match, and of a partial overlap, as in the EVOPS benchmark. Above 0.5 a match is
 one to one."""
-
-
-_COLOR_STEP = 100
-"""Planes next to each other in number are so far apart in the code of their colours."""
-
-
-def planes_of_colors(color: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Return the planes that colours stand for in ``planes.ply`` of PlaneRCNN and AirPlanes.
-
-    Args:
-        color: Red, green and blue, shape ``(N, 3)``, uint8.
-
-    Returns:
-        Plane of each point, shape ``(N,)``, -1 for none.
-
-    Example:
-        >>> planes_of_colors(np.array([[0, 0, 0], [0, 0, 100], [0, 1, 44], [1, 0, 0]], np.uint8))
-        array([ -1,   0,   2, 654])
-    """
-    code = color.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
-    planes: NDArray[np.int64] = code // _COLOR_STEP - 1
-    return planes
 
 
 class SegCompCounts(NamedTuple):
@@ -314,8 +292,3 @@ def score_evops(table: ContingencyTable) -> EvopsScore:
         missed=share(missed, num_faces),
         noise=share(noise, num_regions),
     )
-
-
-def share(part: float, whole: float) -> float:
-    """Return ``part / whole``, and 0 where the whole is 0."""
-    return part / whole if whole else 0.0

@@ -4,12 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-import torch
 
-from torchrg.neighbors.tiles import Part
-from torchrg.regions.condensed import condense, join_condensed
 from torchrg.regions.edges import EdgeLists
-from torchrg.structures import Neighbors
+from torchrg.regions.reach import condense, join_condensed
 
 
 def first_to_reach(targets, seeds):
@@ -25,17 +22,11 @@ def first_to_reach(targets, seeds):
     return heads
 
 
-def part_of(targets, tile):
-    """A tile with all points its edges lead to, and these edges."""
-    around = {other for row in range(tile.start, tile.stop) for other in targets[row]}
-    rows = np.array(sorted(around | set(range(tile.start, tile.stop))))
-    first = int(np.searchsorted(rows, tile.start))
-    own = slice(first, first + tile.stop - tile.start)
-    lists = [np.searchsorted(rows, targets[row]).tolist() for row in rows[own]]
-    lists = [[]] * first + lists + [[]] * (len(rows) - own.stop)
+def edges_of(targets, block):
+    """The edges of the points of a block."""
+    lists = targets[block]
     starts = np.cumsum([0, *map(len, lists)])
-    edges = EdgeLists(starts, np.array(list(itertools.chain(*lists)), dtype=np.int32))
-    return edges, Part(torch.from_numpy(rows), own, Neighbors(torch.zeros(len(rows), 1)))
+    return EdgeLists(starts, np.array(list(itertools.chain(*lists)), dtype=np.int32))
 
 
 @pytest.mark.parametrize("mean_degree", [0.5, 1.2, 3.0])
@@ -48,15 +39,15 @@ def test_condensed_growth_is_growth_seed_by_seed(mean_degree, size):
         for row in range(200)
     ]
     seeds = rng.permutation(200)[:60].astype(np.int32)
-    tiles = [slice(start, min(start + size, 200)) for start in range(0, 200, size)]
-    found = join_condensed([condense(*part_of(targets, tile)) for tile in tiles], seeds)
+    blocks = [slice(start, min(start + size, 200)) for start in range(0, 200, size)]
+    found = join_condensed([condense(edges_of(targets, some), some) for some in blocks], seeds)
     np.testing.assert_array_equal(found, first_to_reach(targets, seeds))
 
 
 def test_condensed_edges_are_fewer():
     ring = [[(row + 1) % 50, (row - 1) % 50] for row in range(50)]
-    whole = condense(*part_of(ring, slice(0, 50)))
+    whole = condense(edges_of(ring, slice(0, 50)), slice(0, 50))
     assert len(whole.sources) == 0
     assert whole.components.tolist() == [0] * 50
-    half = condense(*part_of(ring, slice(0, 25)))
+    half = condense(edges_of(ring, slice(0, 25)), slice(0, 25))
     assert half.targets.tolist() == [25, 49]

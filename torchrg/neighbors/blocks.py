@@ -1,0 +1,255 @@
+"""Nearest neighbours of a large cloud block by block, within little memory.
+
+A block is a range of rows in canonical order. How far away neighbours can be is known from a few of
+its points; among all points within that distance of its boxes the search is that of a whole cloud.
+Candidates stay in canonical order, so ties come out as they do there.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg.neighbors.order import MORTON_BITS, morton_codes
+
+BLOCK_SIZE = 300_000
+"""Points of a block. Smaller ones search more points around them in vain, larger ones leave the
+cache of freed memory."""
+_LEAST_CANDIDATES = 65536
+_CANDIDATES = 2
+"""Rows searched at a time at most: as many as two blocks have, and so many that a small block is
+not searched in crumbs."""
+
+SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
+"""Points in canonical order, rows that are asked for, and k -> their neighbours, ``(n, k)``."""
+POINTS_PER_BOX = 256
+"""Points. A box of surface is then as wide as two neighbourhoods of 50: few rows are read in vain,
+and the boxes take a hundredth of the memory of the points."""
+
+_ROUNDING = 1 + 1e-9
+"""Factor by which distances are taken larger, so that rounding leaves no point out."""
+
+_BOXES_AT_ONCE = 64
+"""Boxes, near to one another as they follow one another: the box about them all leaves few others
+to compare with each."""
+
+
+class Boxes(NamedTuple):
+    """The cells of an octree that hold few points each; in canonical order each is one run of rows.
+
+    Attributes:
+        starts: First row of each, and the number of points, shape ``(B + 1,)``.
+        low: Lower corner of the points, shape ``(B, 3)``, float64.
+        high: Upper corner, shape ``(B, 3)``, float64.
+    """
+
+    starts: NDArray[np.int64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+
+def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxes:
+    """Return the boxes of at most so many points ``(N, 3)`` in canonical order.
+
+    Only a cell of the finest level may hold more: nearly equal points.
+
+    Example:
+        >>> find_boxes(np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1]]), 2).starts.tolist()
+        [0, 2, 3]
+    """
+    codes = morton_codes(points)
+    is_start = np.zeros(len(points) + 1, dtype=bool)
+    is_start[[0, -1]] = True
+    for level in range(MORTON_BITS - 1, -1, -1):
+        starts = np.flatnonzero(is_start)
+        counts = np.diff(starts)
+        full = counts > most
+        if not full.any():
+            break
+        changes = codes >> (3 * level)
+        is_start[1:-1] |= (changes[1:] != changes[:-1]) & np.repeat(full, counts)[1:]
+    starts = np.flatnonzero(is_start)
+    low, high = (how.reduceat(points, starts[:-1], axis=0) for how in (np.minimum, np.maximum))
+    return Boxes(starts, low.astype(np.float64), high.astype(np.float64))
+
+
+def near_boxes(
+    boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
+) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.bool_]]]:
+    """Yield which boxes are within the reach ``(n,)`` of the chosen ones ``(n,)``.
+
+    For some of the chosen ones at a time: which these are, the numbers of boxes near them, and who
+    is near whom, shape ``(chosen, near)``.
+    """
+    about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
+    all_low, all_high = boxes.low[about], boxes.high[about]
+    for some in chunks_of(len(chosen), _BOXES_AT_ONCE):
+        low, high = boxes.low[chosen[some]], boxes.high[chosen[some]]
+        near = _about(all_low, all_high, low, high, reach[some])
+        gap = _gaps(all_low[near], all_high[near], low, high)
+        yield some, about[near], gap <= reach[some, None] * _ROUNDING
+
+
+def _about(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    own_low: NDArray[np.float64],
+    own_high: NDArray[np.float64],
+    reach: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Return which boxes are within the largest reach of the box about some."""
+    far = reach.max() * _ROUNDING
+    inside = (low <= own_high.max(axis=0) + far) & (high >= own_low.min(axis=0) - far)
+    return np.flatnonzero(inside.all(axis=1))
+
+
+def farthest_neighbor(boxes: Boxes, box: int, k: int) -> float:
+    """Return a distance within which each point of a box has k points, itself included."""
+    low, high = boxes.low[box], boxes.high[box]
+    far = np.maximum(high - boxes.low, boxes.high - low)
+    distances = np.sqrt((far * far).sum(axis=1))
+    order = np.argsort(distances)
+    enough = np.searchsorted(np.cumsum(np.diff(boxes.starts)[order]), k)
+    return float(distances[order[enough]])
+
+
+def _gaps(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    own_low: NDArray[np.float64],
+    own_high: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the distances between some boxes and others, shape ``(own, others)``."""
+    gap = np.maximum(low - own_high[:, None], own_low[:, None] - high).clip(min=0)
+    distance: NDArray[np.float64] = np.sqrt((gap * gap).sum(axis=2))
+    return distance
+
+
+def search_blocks(
+    points: NDArray[np.floating], k: int, search: SearchRows
+) -> Iterator[tuple[slice, NDArray[np.int32]]]:
+    """Yield blocks of rows, and the rows of the ``k`` nearest points of theirs, shape ``(n, k)``.
+
+    They are those of :func:`torchrg.search_knn` for the whole cloud, exactly.
+
+    Args:
+        points: Points in canonical order, shape ``(N, 3)``.
+        k: Number of neighbours, at most N.
+        search: What answers for some rows of a smaller cloud.
+
+    Example:
+        >>> from torchrg.neighbors.knn import search_rows
+        >>> points = np.arange(4.0)[:, None] * [1, 0, 0]
+        >>> for block, near in search_blocks(points, 2, search_rows):
+        ...     print(block, near.tolist())
+        slice(0, 4, None) [[0, 1], [1, 0], [2, 1], [3, 2]]
+    """
+    boxes = find_boxes(points)
+    ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, len(points), BLOCK_SIZE))]
+    for start, stop in itertools.pairwise(np.unique(np.append(ends, len(points))).tolist()):
+        block = slice(start, stop)
+        yield block, search_block(points, boxes, block, k, search)
+
+
+def search_block(
+    points: NDArray[np.floating],
+    boxes: Boxes,
+    block: slice,
+    k: int,
+    search: SearchRows,
+    most: int | None = None,
+) -> NDArray[np.int32]:
+    """Return the rows of the ``k`` nearest points of those of a block, shape ``(n, k)``.
+
+    The block begins and ends where ``boxes`` do; at most ``most`` rows are searched at a time.
+    """
+    first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
+    reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
+    found = np.empty((block.stop - block.start, k), dtype=np.int32)
+    most = max(_CANDIDATES * len(found), _LEAST_CANDIDATES) if most is None else most
+    waiting = [slice(first, last)]
+    while waiting:
+        some = waiting.pop()
+        numbers = np.arange(some.start, some.stop)
+        rows = _rows_near(boxes, numbers, reach[numbers - first])
+        if len(rows) > most and len(numbers) > 1:
+            middle = (some.start + some.stop) // 2
+            waiting += [slice(some.start, middle), slice(middle, some.stop)]
+            continue
+        if len(rows) > most:
+            bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, some.start, k))
+            rows = _rows_near(boxes, numbers, bound)
+        asked = slice(boxes.starts[some.start], boxes.starts[some.stop])
+        into = found[asked.start - block.start : asked.stop - block.start]
+        if len(rows) > most:
+            into[:] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
+            continue
+        start = int(np.searchsorted(rows, asked.start))
+        local = slice(start, start + asked.stop - asked.start)
+        np.take(rows.astype(np.int32), search(points[rows], local, k), out=into, mode="clip")
+    return found
+
+
+def _reach_of_boxes(
+    own: NDArray[np.floating], boxes: Boxes, numbers: slice, k: int
+) -> NDArray[np.float64]:
+    """Return distances within which all points of each box of a block have ``k`` neighbours."""
+    from scipy.spatial import cKDTree
+
+    if len(own) < k:
+        return np.array(
+            [farthest_neighbor(boxes, i, k) for i in range(numbers.start, numbers.stop)]
+        )
+    firsts = own[boxes.starts[numbers] - boxes.starts[numbers.start]]
+    tree = cKDTree(own, balanced_tree=False, compact_nodes=False)
+    sides = boxes.high[numbers] - boxes.low[numbers]
+    # Any other point of the box is at most its diagonal away from the first.
+    reach: NDArray[np.float64] = tree.query(firsts, [k])[0][:, 0] + np.linalg.norm(sides, axis=1)
+    return reach
+
+
+def _rows_of(boxes: Boxes, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the rows of some boxes."""
+    starts, counts = boxes.starts[numbers], np.diff(boxes.starts)[numbers]
+    ends = np.cumsum(counts)
+    return np.repeat(starts - ends + counts, counts) + np.arange(ends[-1])
+
+
+def _rows_near(
+    boxes: Boxes, numbers: NDArray[np.int64], reach: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the rows of all boxes within reach of some."""
+    found = np.zeros(len(boxes.low), dtype=bool)
+    for _, near, within in near_boxes(boxes, numbers, reach):
+        found[near[within.any(axis=0)]] = True
+    return _rows_of(boxes, np.flatnonzero(found))
+
+
+def _search_each(
+    points: NDArray[np.floating],
+    rows: NDArray[np.int64],
+    asked: NDArray[np.int64],
+    k: int,
+) -> NDArray[np.int64]:
+    """Return the nearest of many candidates for a few points, as far outliers have them."""
+    places = points[asked].astype(np.float64)
+    nearest = [np.empty(0, dtype=np.int64)] * len(asked)
+    keys = [np.empty(0)] * len(asked)
+    for chunk in chunks_of(len(rows), ROWS_AT_ONCE):
+        some = rows[chunk]
+        candidates = points[some].astype(np.float64)
+        for i, (own, place) in enumerate(zip(asked, places, strict=True)):
+            away = candidates - place
+            sq_distances = away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2
+            # The point itself stands first.
+            distances = np.where(some == own, -1.0, np.sqrt(sq_distances))
+            limit = keys[i][-1] if len(keys[i]) == k else np.inf
+            kept = distances <= limit
+            joined = np.append(nearest[i], some[kept])
+            distances = np.append(keys[i], distances[kept])
+            order = np.lexsort((joined, distances))[:k]
+            nearest[i], keys[i] = joined[order], distances[order]
+    return np.stack(nearest)

@@ -1,0 +1,140 @@
+"""Which of the seeds reaches a point first, along the edges of one graph or of many blocks.
+
+Where growth is free of order, the first seed that reaches a point has it. Points that reach one
+another have the same: within a block such components shrink to one node each, and what is left of
+the graph fits into memory.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrg._parallel import ROWS_IN_CACHE, chunks_of
+from torchrg.regions.edges import EdgeLists
+
+
+def chain_of(seeds: NDArray[np.int32], num_points: int) -> EdgeLists:
+    """Return the edges of a chain of nodes behind those of a graph of so many points.
+
+    Each node leads to one of the seeds, then to the next node.
+    """
+    targets = np.empty(max(2 * len(seeds) - 1, 0), dtype=np.int32)
+    targets[::2] = seeds
+    targets[1::2] = np.arange(num_points + 1, num_points + len(seeds))
+    starts = np.minimum(2 * np.arange(len(seeds) + 1, dtype=np.int32), len(targets))
+    return EdgeLists(starts, targets)
+
+
+def first_to_reach(edges: EdgeLists, num_points: int) -> NDArray[np.int32]:
+    """Return for each point the first of the seeds that reaches it along edges, -1 for none.
+
+    This is what growing one region after the other, from each seed that is still free, comes to,
+    if it does not matter for what a point reaches who claimed it: the first seed that reaches a
+    point finds all of its way free. One depth-first search does it: behind the edges of the points
+    are those of the :func:`chain_of` the seeds, where it begins.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import depth_first_order
+
+    roots = np.full(num_points, -1, dtype=np.int32)
+    num_nodes = len(edges.starts) - 1
+    if num_nodes == num_points:
+        return roots
+    # The search reads no weights; an array of one repeated value takes no memory.
+    weights = np.broadcast_to(np.float64(1), len(edges.targets))
+    graph = csr_array((weights, edges.targets, edges.starts), shape=(num_nodes, num_nodes))
+    visited, parents = depth_first_order(graph, num_points, directed=True)
+    visited = visited[visited < num_points]
+    is_root = parents[visited] >= num_points
+    roots[visited] = visited[is_root][np.cumsum(is_root) - 1]
+    return roots
+
+
+class Condensed(NamedTuple):
+    """The edges of a block without those between points that reach one another.
+
+    Attributes:
+        components: Component of each point, 0 to C-1, shape ``(n,)``, int32.
+        sources: Component that each edge leaves, shape ``(E,)``, int32.
+        targets: Row in the whole cloud that it leads to, shape ``(E,)``, int32.
+    """
+
+    components: NDArray[np.int32]
+    sources: NDArray[np.int32]
+    targets: NDArray[np.int32]
+
+
+def condense(edges: EdgeLists, block: slice) -> Condensed:
+    """Shrink points of a block that reach one another to one node.
+
+    The edges are those of the points of the block, none of them twice (SciPy would search without
+    end); those that leave it stay, one for all between two components.
+
+    Example:
+        >>> edges = EdgeLists(np.array([0, 1, 3]), np.array([11, 10, 17], dtype=np.int32))
+        >>> found = condense(edges, slice(10, 12))
+        >>> found.components.tolist(), found.sources.tolist(), found.targets.tolist()
+        ([0, 0], [0], [17])
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    starts, num_points = edges.starts, block.stop - block.start
+    inner = np.empty(len(edges.targets), dtype=np.int32)
+    chunks = chunks_of(num_points, ROWS_IN_CACHE)
+
+    def edges_of(rows: slice) -> tuple[slice, NDArray[np.signedinteger], NDArray[np.int32]]:
+        """Return the places of the edges of some points, how many each has, and their targets."""
+        places = slice(starts[rows.start], starts[rows.stop])
+        counts = np.diff(starts[rows.start : rows.stop + 1])
+        return places, counts, edges.targets[places] - np.int32(block.start)
+
+    for rows in chunks:
+        places, counts, targets = edges_of(rows)
+        # An edge to itself changes nothing.
+        itself = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int32), counts)
+        inner[places] = np.where((targets >= 0) & (targets < num_points), targets, itself)
+    weights = np.broadcast_to(np.float64(1), len(inner))
+    graph = csr_array((weights, inner, starts), shape=(num_points, num_points))
+    number, components = connected_components(graph, directed=True, connection="strong")
+    # All points of a component do as target: the last one serves for all.
+    last = np.zeros(number, dtype=np.int32)
+    last[components] = np.arange(num_points)
+    found = []
+    for rows in chunks:
+        places, counts, targets = edges_of(rows)
+        sources = np.repeat(components[rows], counts)
+        leaves = np.flatnonzero((targets != inner[places]) | (sources != components[inner[places]]))
+        sources, targets = sources[leaves], targets[leaves]
+        is_inner = (targets >= 0) & (targets < num_points)
+        targets[is_inner] = last[components[targets[is_inner]]]
+        # The source above the target, which is at most 2^31, in one number to sort.
+        found.append(sources.astype(np.int64) << 32 | targets + np.int64(block.start))
+    keys = np.unique(np.concatenate(found))
+    return Condensed(components, (keys >> 32).astype(np.int32), keys.astype(np.int32))
+
+
+def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return for each point of all blocks the first of the seeds that reaches it, -1 for none."""
+    counts = [int(part.components.max(initial=-1)) + 1 for part in parts]
+    offsets = np.cumsum([0, *counts])
+    node_of = np.concatenate(
+        [part.components + np.int32(start) for part, start in zip(parts, offsets, strict=False)]
+    )
+    sources = np.concatenate(
+        [part.sources + np.int32(start) for part, start in zip(parts, offsets, strict=False)]
+    )
+    targets = node_of[np.concatenate([part.targets for part in parts])]
+    first_seeds, places = np.unique(node_of[seeds], return_index=True)
+    by_seed = np.argsort(places)
+    nodes, places = first_seeds[by_seed], places[by_seed]
+    starts = np.zeros(int(offsets[-1]) + 1, dtype=np.int32)
+    np.cumsum(np.bincount(sources, minlength=int(offsets[-1])), out=starts[1:])
+    # The edges of each block are in the order of their components.
+    edges = EdgeLists(starts, targets).append(chain_of(nodes, len(starts) - 1))
+    roots = first_to_reach(edges, len(starts) - 1)
+    seed_of = np.full(int(offsets[-1]) + 1, -1, dtype=np.int32)
+    seed_of[nodes] = seeds[places]
+    found: NDArray[np.int32] = seed_of[roots][node_of]
+    return found
