@@ -91,20 +91,8 @@ EVERYTHING |= {
         plain()[0].normals, plain()[0].labels, sample_size=50
     ),
     "score_normals": lambda: metrics.score_normals(plain()[0].normals, POINTS, plain()[0].sharp),
-    "score_voxels": lambda: metrics.score_voxels(
-        POINTS, plain()[0].labels, plain()[1], voxel_size=0.3
-    ),
-    "score_evops": lambda: metrics.score_evops(table()),
-    "count_segcomp": lambda: metrics.count_segcomp(table()),
     "indices": lambda: [
-        index(table())
-        for index in (
-            metrics.rand_index,
-            metrics.adjusted_rand_index,
-            metrics.normalized_mutual_information,
-            metrics.variation_of_information,
-            metrics.segmentation_covering,
-        )
+        index(table()) for index in (metrics.adjusted_rand_index, metrics.segmentation_covering)
     ],
     "matching": lambda: metrics.match_points(Cloud(POINTS.numpy()), Cloud(POINTS[::2].numpy())),
     "result": lambda: Result.of(Cloud(POINTS.numpy()), plain()[0]).fields,

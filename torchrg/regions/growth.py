@@ -27,14 +27,16 @@ from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import (
     EdgeLists,
     GrowingCloud,
+    chain_of,
     find_coded_edges,
     find_edges,
+    first_to_reach,
     is_order_free,
     join_edges,
     neighborhood_radii,
 )
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
-from torchrg.regions.reach import chain_of, condense, first_to_reach, join_condensed
+from torchrg.regions.reach import condense, join_condensed
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -120,7 +122,8 @@ def grow_regions(
         >>> found.unique()
         tensor([0])
     """
-    config = settings_of("grow_regions", GrowingConfig, config)
+    if not isinstance(config, GrowingConfig):
+        config = settings_of("grow_regions", GrowingConfig, config)
     cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:

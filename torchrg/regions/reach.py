@@ -1,4 +1,4 @@
-"""Which of the seeds reaches a point first, along the edges of one graph or of many blocks.
+"""Which of the seeds reaches a point first, along edges that are in many blocks.
 
 Where growth is free of order, the first seed that reaches a point has it. Points that reach one
 another have the same: within a block such components shrink to one node each, and what is left of
@@ -11,44 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
-from torchrg.regions.edges import EdgeLists
-
-
-def chain_of(seeds: NDArray[np.int32], num_points: int) -> EdgeLists:
-    """Return the edges of a chain of nodes behind those of a graph of so many points.
-
-    Each node leads to one of the seeds, then to the next node.
-    """
-    targets = np.empty(max(2 * len(seeds) - 1, 0), dtype=np.int32)
-    targets[::2] = seeds
-    targets[1::2] = np.arange(num_points + 1, num_points + len(seeds))
-    starts = np.minimum(2 * np.arange(len(seeds) + 1, dtype=np.int32), len(targets))
-    return EdgeLists(starts, targets)
-
-
-def first_to_reach(edges: EdgeLists, num_points: int) -> NDArray[np.int32]:
-    """Return for each point the first of the seeds that reaches it along edges, -1 for none.
-
-    This is what growing one region after the other, from each seed that is still free, comes to,
-    if it does not matter for what a point reaches who claimed it: the first seed that reaches a
-    point finds all of its way free. One depth-first search does it: behind the edges of the points
-    are those of the :func:`chain_of` the seeds, where it begins.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import depth_first_order
-
-    roots = np.full(num_points, -1, dtype=np.int32)
-    num_nodes = len(edges.starts) - 1
-    if num_nodes == num_points:
-        return roots
-    # The search reads no weights; an array of one repeated value takes no memory.
-    weights = np.broadcast_to(np.float64(1), len(edges.targets))
-    graph = csr_array((weights, edges.targets, edges.starts), shape=(num_nodes, num_nodes))
-    visited, parents = depth_first_order(graph, num_points, directed=True)
-    visited = visited[visited < num_points]
-    is_root = parents[visited] >= num_points
-    roots[visited] = visited[is_root][np.cumsum(is_root) - 1]
-    return roots
+from torchrg.regions.edges import EdgeLists, chain_of, first_to_reach
 
 
 class Condensed(NamedTuple):
