@@ -94,7 +94,9 @@ EVERYTHING |= {
     "indices": lambda: [
         index(table()) for index in (metrics.adjusted_rand_index, metrics.segmentation_covering)
     ],
-    "matching": lambda: metrics.match_points(Cloud(POINTS.numpy()), Cloud(POINTS[::2].numpy())),
+    "matching": lambda: metrics.match_points(
+        Cloud(POINTS.numpy()), Cloud(POINTS[::2].numpy()), 0.1
+    ),
     "result": lambda: Result.of(Cloud(POINTS.numpy()), plain()[0]).fields,
 }
 EVERYTHING |= {

@@ -154,7 +154,10 @@ def _measure(shape: str, noise: float, num_points: int, seed: int, variant: str)
     begin = time.perf_counter()
     fit = estimate_normals(scene.points, config=VARIANTS[variant])
     seconds = time.perf_counter() - begin
-    score = score_normals(fit.normals, scene.normals, at_edges, valid=fit.valid)
+    score = score_normals(fit.normals, scene.normals, valid=fit.valid)._asdict()
+    for name, chosen in (("sharp", at_edges), ("regular", ~at_edges)):
+        errors = score_normals(fit.normals[chosen], scene.normals[chosen], valid=fit.valid[chosen])
+        score |= {f"{name}_{index}": value for index, value in errors._asdict().items()}
     return {
         "shape": shape,
         "noise_percent": noise,
@@ -163,7 +166,7 @@ def _measure(shape: str, noise: float, num_points: int, seed: int, variant: str)
         "variant": variant,
         "config": dataclasses.asdict(VARIANTS[variant]),
         "seconds": seconds,
-        "score": score._asdict(),
+        "score": score,
     }
 
 

@@ -1,11 +1,11 @@
-"""``torchrg score`` of folders: the right pairs, their mean, JSON and CSV."""
+"""``torchrg score`` of folders: the right pairs, their mean, a table and JSON."""
 
-import csv
 import json
 
 import numpy as np
 import pytest
 
+from torchrg import Cloud, read_cloud, write_cloud
 from torchrg.cli import main
 from torchrg.metrics import score_labels, score_normals
 
@@ -19,28 +19,16 @@ def folders(tmp_path):
     points = [rng.normal(size=(60 + n, 3)).astype(np.float32) for n in range(len(NAMES))]
     for kind, suffix in (("ours", ".npz"), ("truth", ".ply")):
         for number, name in enumerate(NAMES):
-            arrays = {
-                "points": points[number],
-                "labels": rng.integers(0, 4, 60 + number),
-            }
+            fields = {"labels": rng.integers(0, 4, 60 + number)}
             if name != "scan9":
-                arrays["normals"] = rng.normal(size=(60 + number, 3)).astype(np.float32)
+                fields["normals"] = rng.normal(size=(60 + number, 3)).astype(np.float32)
             path = tmp_path / kind / f"{name}{suffix if number == 0 else '.npz'}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_scan(path, arrays)
+            write_cloud(path, Cloud(points[number], fields))
     return tmp_path / "ours", tmp_path / "truth"
 
 
-def write_scan(path, arrays):
-    from torchrg import Cloud, write_cloud
-
-    fields = {name: values for name, values in arrays.items() if name != "points"}
-    write_cloud(path, Cloud(arrays["points"], fields))
-
-
 def read_scan(folder, name):
-    from torchrg import read_cloud
-
     (path,) = (folder / name).parent.glob(f"{(folder / name).name}.*")
     return read_cloud(path).fields
 
@@ -84,30 +72,6 @@ def test_table_of_scans_ends_with_the_mean(folders, capsys):
     assert "mean of 3 scans" in lines
 
 
-def test_csv_has_every_index_of_every_scan_and_the_mean_last(folders, tmp_path, capsys):
-    target = tmp_path / "scores.csv"
-    assert run_score(*folders, "--csv", target, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    with target.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [row["scan"] for row in rows] == ["hall/scan1", "scan9", "scan10", "mean"]
-    for row in rows:
-        scores = found["mean"] if row["scan"] == "mean" else found["scans"][row["scan"]]
-        for part, values in scores.items():
-            for index, value in values.items():
-                shown = row[f"{part}.{index}"]
-                assert (float(shown) if shown else None) == value, (row["scan"], part, index)
-    assert rows[1]["normals.msae"] == ""
-
-
-def test_two_files_give_one_row_of_csv(folders, tmp_path, capsys):
-    files = [folder / "scan9.npz" for folder in folders]
-    assert run_score(*files, "--csv", tmp_path / "one.csv") == 0
-    assert capsys.readouterr().out.startswith("labels\n")
-    with (tmp_path / "one.csv").open(newline="") as stream:
-        assert [row["scan"] for row in csv.DictReader(stream)] == ["scan9"]
-
-
 @pytest.mark.parametrize("side", [0, 1])
 def test_missing_counterparts_are_named(folders, capsys, side):
     for name in ("scan9.npz", "hall/scan1.npz"):
@@ -138,7 +102,6 @@ def test_mistakes_are_one_line(folders, tmp_path, capsys):
         (ours, truth / "scan9.npz"): "scan9.npz: expected a folder",
         (truth / "scan9.npz", ours): "scan9.npz: expected a folder",
         (ours, truth): "got scan9.npz and scan9.pcd",
-        (ours, ours, "--csv", tmp_path / "no" / "a.csv"): "there is no folder",
     }
     capsys.readouterr()
     for arguments, message in cases.items():

@@ -53,16 +53,19 @@ def refused(capsys, *arguments):
 ORDER = np.random.default_rng(1).permutation(SIZE)
 
 
+NEAR = ("--match-distance", "0.0001")
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".xyz", ".ply"])
 def test_another_order_is_refused_and_nearest_points_score_as_rows_do(room, capsys, suffix):
     shuffled = changed(room, f"shuffled{suffix}", ORDER)
     line = refused(capsys, shuffled, room / "truth.npz")
     num_moved = int((np.arange(SIZE) != ORDER).sum())
-    assert f"got another order ({num_moved:,} of 3,000 rows, the first 0: " in line
-    assert line.endswith("; add --match nearest.\n")
+    assert f"got others ({num_moved:,} of 3,000 rows, the first 0: " in line
+    assert line.endswith("; add --match-distance D to take the nearest points within D.\n")
     flags = ["--superpoints"] if suffix == ".npz" else []
     expected = scores_of(capsys, room / "ours.npz", room / "truth.npz", *flags)
-    found = scores_of(capsys, shuffled, room / "truth.npz", "--match", "nearest", *flags)
+    found = scores_of(capsys, shuffled, room / "truth.npz", *NEAR, *flags)
     assert found.pop("match") == {"points": SIZE, "unmatched": 0, "unused": 0}
     for part, values in expected.items():
         assert found[part] == pytest.approx(values, rel=1e-6), part
@@ -73,8 +76,7 @@ def test_another_order_is_refused_and_nearest_points_score_as_rows_do(room, caps
 def test_another_place_is_refused(room, capsys, flags):
     line = refused(capsys, changed(room, "moved.npz", shift=1.0), room / "truth.npz", *flags)
     assert "got others (3,000 of 3,000 rows, the first 0: " in line
-    assert "--match nearest --match-distance D" in line
-    line = refused(capsys, room / "moved.npz", room / "truth.npz", "--match", "nearest")
+    line = refused(capsys, room / "moved.npz", room / "truth.npz", *NEAR)
     assert "expected points near those of" in line
 
 
@@ -92,7 +94,7 @@ def test_points_without_a_match_are_told_and_count_as_unlabelled(room, capsys):
     kept = np.sort(ORDER[: SIZE // 2])
     part = changed(room, "part.npz", kept, shift=0.0004)
     assert "expected as many points as" in refused(capsys, part, room / "truth.npz")
-    flags = ["--match", "nearest", "--match-distance", "0.001", "--superpoints", "--json"]
+    flags = ["--match-distance", "0.001", "--superpoints", "--json"]
     assert main(["score", str(part), str(room / "truth.npz"), *flags]) == 0
     captured = capsys.readouterr()
     lost = np.ones(SIZE, dtype=bool)
@@ -117,18 +119,16 @@ def test_every_true_point_counts_once_and_predicted_ones_beyond_nowhere(room, ca
     cloud, truth = read_cloud(room / "truth.npz"), room / "half.npz"
     fields = {name: values[:1000] for name, values in cloud.fields.items()}
     write_cloud(truth, Cloud(cloud.coordinates[:1000], fields))
-    found = scores_of(capsys, room / "ours.npz", truth, "--match", "nearest")
+    found = scores_of(capsys, room / "ours.npz", truth, *NEAR)
     assert found["match"] == {"points": 1000, "unmatched": 0, "unused": 2000}
     ours = read_cloud(room / "ours.npz").fields["labels"][:1000]
     assert found["labels"] == score_labels(ours, fields["labels"])._asdict()
 
 
-@pytest.mark.parametrize(
-    "flags", [["--match-distance", "1"], ["--match", "nearest", "--match-distance", "0"]]
-)
-def test_a_distance_goes_with_nearest_and_is_positive(room, capsys, flags):
-    line = refused(capsys, room / "ours.npz", room / "truth.npz", *flags)
-    assert "expected --match-distance > 0 with --match nearest" in line
+@pytest.mark.parametrize("distance", ["0", "-1", "nan"])
+def test_a_distance_is_positive(room, capsys, distance):
+    line = refused(capsys, room / "ours.npz", room / "truth.npz", "--match-distance", distance)
+    assert f"expected --match-distance > 0, got {float(distance)}" in line
 
 
 def test_points_that_are_not_finite_agree_with_each_other(room, capsys):
@@ -177,8 +177,8 @@ def test_folders_are_refused_for_one_scan_in_another_order(converted, tmp_path, 
         write_cloud(tmp_path / name, Cloud(cloud.coordinates[rows], fields))
     line = refused(capsys, converted / "out", tmp_path)
     assert line.startswith(f"torchrg: {converted / 'out' / 'hall'}: expected the points of")
-    assert "add --match nearest" in line
+    assert "add --match-distance D" in line
     expected = scores_of(capsys, converted / "out", converted / "truth")
-    found = scores_of(capsys, converted / "out", tmp_path, "--match", "nearest")
+    found = scores_of(capsys, converted / "out", tmp_path, *NEAR)
     assert found["mean"].pop("match") == {"scans": 2, "points": 2000, "unmatched": 0, "unused": 0}
     assert found["mean"]["labels"] == pytest.approx(expected["mean"]["labels"])

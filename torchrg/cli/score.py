@@ -1,30 +1,19 @@
 """``torchrg score``: labels, normals, superpoints against a truth, of one scan or of folders."""
 
-import csv
-import io
 import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.console import (
-    ColumnNames,
-    ColumnsFlag,
-    check_apart,
-    format_table,
-    warn,
-    warnings_as_lines,
-)
+from torchrg.cli.console import ColumnNames, ColumnsFlag, format_table, warn, warnings_as_lines
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import atomic_path
-from torchrg.io.files import check_place
 from torchrg.metrics import (
     differing_rows,
     match_points,
@@ -35,7 +24,7 @@ from torchrg.metrics import (
 from torchrg.result import read_result
 from torchrg.structures import UNLABELED, Cloud
 
-Scores: TypeAlias = dict[str, dict[str, Any]]
+Scores: TypeAlias = dict[str, dict[str, float | None]]
 """Indices by part (``labels``, ``normals``, ``superpoints``) and name."""
 
 _SHOWN = {
@@ -43,7 +32,7 @@ _SHOWN = {
     "normals": ("rms", "mean", "under_10_deg"),
     "superpoints": ("count", "asa", "oracle_miou", "boundary_recall"),
 }
-"""What a table of scans shows of each; the mean, --json and --csv have everything."""
+"""What a table of scans shows of each; the mean and --json have everything."""
 _MOST_NAMED = 5
 """Scans that an error names, so that it stays one line."""
 
@@ -57,8 +46,8 @@ class Arguments:
 
     Examples:
         torchrg score planes.npz room.npz
-        torchrg score planes.npz truth.ply --match nearest --json
-        torchrg score results truth --csv scores.csv
+        torchrg score planes.npz truth.ply --match-distance 0.001 --json
+        torchrg score results truth
     """
 
     predicted: Annotated[Path, Argument("PREDICTED", is_positional=True)]
@@ -66,13 +55,11 @@ class Arguments:
     such."""
     truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
     """File with the true labels or normals, or a folder with such a file for each result."""
-    match: Literal["rows", "nearest"] = "rows"
-    """Which points are compared: those of one row, which must be the same, or each point of the
-    truth with the nearest one of the prediction. Every point of the truth counts once. One without
-    a match counts as unlabelled, and predicted points that are nearest to none count nowhere."""
     match_distance: float | None = None
-    """How far the nearest point may be to match, in the unit of the cloud. Default: it must be the
-    same point but for the rounding of the files, in any order."""
+    """Compare each point of the truth with the nearest one of the prediction, at most this far
+    away in the unit of the cloud. Every point of the truth counts once. One without a match counts
+    as unlabelled, and predicted points that are nearest to none count nowhere. Default: points of
+    one row are compared, and must be the same."""
     superpoints: bool = False
     """Score superpoints against the true labels, as torchrg segment --superpoints writes them."""
     ignore: int | None = None
@@ -82,40 +69,29 @@ class Arguments:
     cloud. Default: the median distance to the 8th nearest neighbour."""
     json: bool = False
     """Print one JSON object instead of a table; for folders with the keys "scans" and "mean"."""
-    csv: Path | None = None
-    """Also write a CSV file: a row for each scan in natural order, for folders the mean last."""
     columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, score what both sides have, and print it."""
     arguments = parse(Arguments, argv, prog="torchrg score")
-    distance = arguments.match_distance
-    if distance is not None and (arguments.match != "nearest" or not distance > 0):
-        raise ConfigError(f"expected --match-distance > 0 with --match nearest, got {distance}.")
+    if arguments.match_distance is not None and not arguments.match_distance > 0:
+        raise ConfigError(f"expected --match-distance > 0, got {arguments.match_distance}.")
     predicted, truth = arguments.predicted, arguments.truth
     of_folders = _holds_scans(predicted)
     if of_folders != _holds_scans(truth):
         file, folder = (truth, predicted) if of_folders else (predicted, truth)
         raise FormatError(f"{file}: expected a folder, as {folder} is one; or give two files.")
-    if arguments.csv is not None:
-        check_place(arguments.csv)
-        check_apart([arguments.csv], [predicted, truth])
     if of_folders:
         with warnings_as_lines():
             pairs = _pair_scans(predicted, truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
         scores = _mean(scans)
-        rows, printed = {**scans, "mean": scores}, {"scans": scans, "mean": scores}
     else:
-        scores = _score_files(arguments, predicted, truth)
-        rows, printed = {predicted.stem: scores}, scores
-    if arguments.csv is not None:
-        with atomic_path(arguments.csv) as path:
-            path.write_text(_as_csv(rows), encoding="utf-8", errors="surrogateescape")
+        scans, scores = {}, _score_files(arguments, predicted, truth)
     if arguments.json:
-        print(json.dumps(printed))
+        print(json.dumps({"scans": scans, "mean": scores} if of_folders else scores))
         return 0
     if of_folders:
         _print_scans(scans)
@@ -163,11 +139,12 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
         for note in cloud.notes:
             warn(f"{cloud.source}: {note}.")
     scores: Scores = {}
-    if arguments.match == "rows":
+    if arguments.match_distance is None:
         _check_rows(predicted, truth, ours, theirs)
     else:
-        ours, matched = _nearest(arguments, predicted, truth, ours, theirs)
-        scores = {"match": matched}
+        ours, scores["match"] = _nearest(
+            predicted, truth, ours, theirs, distance=arguments.match_distance
+        )
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _known(score(ours.fields[part], theirs.fields[part])._asdict())
@@ -194,36 +171,24 @@ def _check_rows(predicted: Path, truth: Path, ours: Cloud, theirs: Cloud) -> Non
     if len(ours) != len(theirs):
         raise FormatError(
             f"{predicted}: expected as many points as {truth} ({len(theirs):,}), got "
-            f"{len(ours):,}; --match nearest compares each point with the nearest."
+            f"{len(ours):,}; --match-distance D compares each point with the nearest within D."
         )
     rows = differing_rows(ours, theirs)
-    if len(rows) == 0:
-        return
-    got, expected = (
-        " ".join(f"{value:.9g}" for value in cloud.coordinates[rows[0]]) for cloud in (ours, theirs)
-    )
-    where = f"{len(rows):,} of {len(ours):,} rows, the first {rows[0]}: {got} for {expected}"
-    if _are_same(ours, theirs) and _are_same(theirs, ours):
+    if len(rows):
+        points = (cloud.coordinates[rows[0]] for cloud in (ours, theirs))
+        got, expected = (" ".join(f"{value:.9g}" for value in point) for point in points)
         raise FormatError(
-            f"{predicted}: expected the points of {truth} in their order, got another order "
-            f"({where}); add --match nearest."
+            f"{predicted}: expected the points of {truth}, each in its row, got others "
+            f"({len(rows):,} of {len(ours):,} rows, the first {rows[0]}: {got} for {expected}); "
+            "add --match-distance D to take the nearest points within D."
         )
-    raise FormatError(
-        f"{predicted}: expected the points of {truth}, got others ({where}); check the file, or "
-        "add --match nearest --match-distance D to take the nearest points within D."
-    )
-
-
-def _are_same(ours: Cloud, theirs: Cloud) -> bool:
-    """Return whether each of their points is one of ours."""
-    return bool(((match_points(ours, theirs) >= 0) | ~theirs.finite).all())
 
 
 def _nearest(
-    arguments: Arguments, predicted: Path, truth: Path, ours: Cloud, theirs: Cloud
-) -> tuple[Cloud, dict[str, Any]]:
+    predicted: Path, truth: Path, ours: Cloud, theirs: Cloud, *, distance: float
+) -> tuple[Cloud, dict[str, float | None]]:
     """Return the results of ours at their points, and how many of these have none."""
-    rows = match_points(ours, theirs, arguments.match_distance)
+    rows = match_points(ours, theirs, distance)
     found = rows >= 0
     num_lost = int(np.count_nonzero(~found))
     if num_lost == len(rows):
@@ -246,13 +211,13 @@ def _nearest(
             fields[name][found] = values[rows[found]]
     num_used = len(np.unique(rows[found]))
     matched = {"points": len(rows), "unmatched": num_lost, "unused": len(ours) - num_used}
-    return Cloud(theirs.coordinates, fields, source=ours.source), matched
+    return Cloud(theirs.coordinates, fields, source=ours.source), {**matched}
 
 
-def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+def _known(values: Mapping[str, float | None]) -> dict[str, float | None]:
     """Return the scores that were asked for; JSON knows null, but no NaN."""
     return {
-        name: None if isinstance(value, float) and math.isnan(value) else value
+        name: None if math.isnan(value) else value
         for name, value in values.items()
         if value is not None
     }
@@ -268,28 +233,9 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
         rows = [scores[part] for scores in scans.values() if part in scores]
         means[part] = {"scans": len(rows)}
         for name in dict.fromkeys(name for row in rows for name in row):
-            known = [row[name] for row in rows if row.get(name) is not None]
+            known = [value for row in rows if (value := row.get(name)) is not None]
             means[part][name] = math.fsum(known) / len(known) if known else None
     return means
-
-
-def _as_csv(rows: dict[str, Scores]) -> str:
-    """Return scores as CSV, one row for each name; numbers in full."""
-    flat = [
-        {"scan": scan}
-        | {
-            f"{part}.{name}": value
-            for part, values in scores.items()
-            for name, value in values.items()
-        }
-        for scan, scores in rows.items()
-    ]
-    text = io.StringIO()
-    columns = dict.fromkeys(column for row in flat for column in row)
-    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue()
 
 
 def _print_scans(scans: dict[str, Scores]) -> None:

@@ -82,14 +82,12 @@ _NORMALS = {
     Index("count", None): "points",
     Index("count", False): "invalid",
 }
-"""The indices of normals; those of sharp and of regular points have the same meaning."""
 
 
 def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str, Index]:
     """Return the index of each field."""
     found = {name: index for index, names in meanings.items() for name in names.split()}
-    plain = (name.removeprefix("sharp_").removeprefix("regular_") for name in fields)
-    return MappingProxyType(dict(zip(fields, map(found.__getitem__, plain), strict=True)))
+    return MappingProxyType({name: found[name] for name in fields})
 
 
 METRICS: Mapping[str, Mapping[str, Index]] = MappingProxyType(

@@ -1,12 +1,11 @@
 """External indices: predicted plane labels against true ones."""
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import ContingencyTable, count_overlaps, share
 
 
@@ -57,7 +56,6 @@ def score_labels(
     *,
     min_size: int = 1,
     ignore: int | None = None,
-    matching: Literal["largest", "second"] = "largest",
 ) -> LabelScore:
     """Score predicted plane labels against true ones.
 
@@ -82,7 +80,6 @@ def score_labels(
         min_size: Regions of fewer points count as unlabelled (the paper draws those of 50 and
             more). Faces of any size count.
         ignore: Points with this true label are left out of everything. Default: none is.
-        matching: Which pairs precision, recall and F1 are of; see :func:`match_regions`.
 
     Returns:
         The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
@@ -106,9 +103,8 @@ def score_labels(
     """
     table = count_overlaps("score_labels", labels, truth, min_size, ignore)
     num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
-    precision, recall, num_pairs = _pair_precision_recall(table, matching)
+    precision, recall, num_pairs = paired_precision_recall(table)
     matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))
-    best = _best_iou(table)
     return LabelScore(
         precision=precision,
         recall=recall,
@@ -117,7 +113,7 @@ def score_labels(
         regions=num_regions,
         faces=num_faces,
         points=table.num_points,
-        mean_best_iou=share(float(best.sum()), num_faces),
+        mean_best_iou=share(float(_best_iou(table).sum()), num_faces),
         precision_iou50=share(matched50, num_regions),
         recall_iou50=share(matched50, num_faces),
         precision_iou80=share(matched80, num_regions),
@@ -128,15 +124,28 @@ def score_labels(
     )
 
 
-def _pair_precision_recall(
-    table: ContingencyTable, matching: Literal["largest", "second"]
-) -> tuple[float, float, int]:
-    """Return mean precision and recall of the pairs, in percent, and how many there are.
+def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
+    """Return mean precision and recall of the pairs, in percent, and how many pairs there are [1].
 
-    Section III.B of the paper: ``P = 100 TP / (TP + FP)``, ``R = 100 TP / (TP + FN)`` with TP the
-    points that region and face share. 0 where there is no pair.
+    ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` of each pair of :func:`match_regions`.
+
+    Args:
+        table: Overlaps of regions and faces.
+
+    Returns:
+        Both in [0, 100]; 0 where there is no pair.
+
+    References:
+        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
+        Normal Estimation, section III.B.
+
+    Example:
+        >>> from torchrg.metrics.contingency import contingency_table
+        >>> table = contingency_table(torch.tensor([4, 4, 4, 5]), torch.tensor([0, 0, 1, 1]))
+        >>> paired_precision_recall(table)
+        (83.33333333333334, 75.0, 2)
     """
-    pairs = match_regions(table, matching)
+    pairs = match_regions(table)
     shared = 100 * table.overlaps[pairs].double()
     precision = shared / table.region_sizes[table.regions[pairs]]
     recall = shared / table.face_sizes[table.faces[pairs]]
@@ -144,30 +153,20 @@ def _pair_precision_recall(
     return share(float(precision.sum()), count), share(float(recall.sum()), count), count
 
 
-def match_regions(
-    table: ContingencyTable, matching: Literal["largest", "second"] = "largest"
-) -> Tensor:
-    """Pair each region with the face that it overlaps most and that it is overlapped most by.
-
-    A region and a face correspond when each is the other's largest overlap, in points [1]. The
-    paper also says "the maximum or second maximum overlap", and not how the second enters. With
-    ``matching="second"`` those that are left without a partner correspond when each is the other's
-    largest overlap among what is left, and one of its two largest among all.
+def match_regions(table: ContingencyTable) -> Tensor:
+    """Pair each region with the face that it overlaps most and that it is overlapped most by [1].
 
     Convention:
-        Equal overlaps are decided by the larger intersection over union, that is the smaller
-        partner; then by the lower label. The order of the points plays no part.
+        Equal overlaps, in points, are decided by the larger intersection over union, that is the
+        smaller partner; then by the lower label. The order of the points plays no part. (The paper
+        also says "the maximum or second maximum overlap", and not how the second enters.)
 
     Args:
         table: Overlaps of regions and faces.
-        matching: Whether the second largest overlap may make a pair too.
 
     Returns:
-        The rows of the table's overlaps that are pairs, shape ``(P,)``, int64; no region and no
-        face occurs twice. Empty if nothing overlaps.
-
-    Raises:
-        ConfigError: If there is no such matching.
+        The rows of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64; no region
+        and no face occurs twice. Empty if nothing overlaps.
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
@@ -182,38 +181,21 @@ def match_regions(
         >>> table.face_labels[table.faces[pairs]].tolist()
         [0, 1]
     """
-    if matching not in ("largest", "second"):
-        raise ConfigError(
-            f"match_regions: expected matching to be largest or second, got {matching!r}."
-        )
-    most = 1 if matching == "largest" else 2
-    left = (torch.stack(_ranks(table, slice(None))) < most).all(dim=0).nonzero().squeeze(1)
-    pairs = left[:0]
-    while len(left):
-        found = left[(torch.stack(_ranks(table, left)) == 0).all(dim=0)]
-        pairs = torch.cat([pairs, found])
-        taken = torch.isin(table.regions[left], table.regions[found])
-        left = left[~(taken | torch.isin(table.faces[left], table.faces[found]))]
-    return pairs.sort().values
+    regions, faces, fewest = table.regions, table.faces, -table.overlaps
+    of_region = _is_first(regions, fewest, table.face_sizes[faces], faces)
+    of_face = _is_first(faces, fewest, table.region_sizes[regions], regions)
+    return (of_region & of_face).nonzero().squeeze(1)
 
 
-def _ranks(table: ContingencyTable, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
-    """Return how many of some overlaps are larger, of the same region and of the same face."""
-    regions, faces, overlaps = table.regions[rows], table.faces[rows], table.overlaps[rows]
-    of_region = _ranks_of_each(regions, (-overlaps, table.face_sizes[faces], faces))
-    return of_region, _ranks_of_each(faces, (-overlaps, table.region_sizes[regions], regions))
-
-
-def _ranks_of_each(groups: Tensor, keys: tuple[Tensor, ...]) -> Tensor:
-    """Return the place of each entry in its group, ordered by the keys, shape ``(E,)``."""
-    places = torch.arange(len(groups), device=groups.device)
-    order = places
+def _is_first(groups: Tensor, *keys: Tensor) -> Tensor:
+    """Return whether each row is the first of its group, ordered by the keys, shape ``(E,)``."""
+    order = torch.arange(len(groups), device=groups.device)
     for key in (*reversed(keys), groups):
         order = order[key[order].argsort(stable=True)]
     ordered = groups[order]
-    begins = places.clone()
-    begins[1:] *= ordered[1:] != ordered[:-1]
-    return torch.empty_like(order).index_put((order,), places - begins.cummax(dim=0).values)
+    begins = torch.ones_like(ordered, dtype=torch.bool)
+    begins[1:] = ordered[1:] != ordered[:-1]
+    return torch.empty_like(begins).index_put((order,), begins)
 
 
 def adjusted_rand_index(table: ContingencyTable) -> float:
@@ -240,17 +222,12 @@ def adjusted_rand_index(table: ContingencyTable) -> float:
         1.0
     """
     # Python's integers: products of two counts of pairs exceed 64 bits beyond 50,000 points.
-    together, predicted, true, pairs = _pairs_of_points(table)
-    scale = pairs * (predicted + true) - 2 * predicted * true
-    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
-
-
-def _pairs_of_points(table: ContingencyTable) -> tuple[int, int, int, int]:
-    """Return the pairs of points that are together in both, in regions, in faces, and all pairs."""
     together, predicted, true = (
         int((sizes * (sizes - 1) // 2).sum()) for sizes in _sizes_with_unlabeled(table)
     )
-    return together, predicted, true, table.num_points * (table.num_points - 1) // 2
+    pairs = table.num_points * (table.num_points - 1) // 2
+    scale = pairs * (predicted + true) - 2 * predicted * true
+    return 2 * (pairs * together - predicted * true) / scale if scale else 1.0
 
 
 def segmentation_covering(table: ContingencyTable) -> float:

@@ -99,9 +99,8 @@ class PlaneMetric(Metric):
         """Add the score of one scan, given the tensors that the function of the part takes.
 
         Labels: predicted and true label of each point, both ``(N,)``. Superpoints: the same, then,
-        for borders, points ``(N, 3)``. Clusters: normals ``(N, 3)``
-        and the cluster of each, ``(N,)``. Normals: estimated and true normals ``(N, 3)``; then, if
-        there are, sharp points and ``valid``, both ``(N,)``.
+        for borders, points ``(N, 3)``. Clusters: normals ``(N, 3)`` and the cluster of each,
+        ``(N,)``. Normals: estimated and true normals ``(N, 3)``, and ``valid=`` of ``(N,)``.
         """
         score = _SCORES[self.part](*tensors, **named, **self.settings)._asdict()
         values = (math.nan if score[name] is None else score[name] for name in METRICS[self.part])

@@ -32,9 +32,6 @@ class NormalScore(NamedTuple):
         under_20_deg: The same below 20 degrees.
         points: Points that were scored.
         invalid: Points with a true normal and no estimated one; in none of the indices.
-        sharp_msae: As ``msae``, over sharp points; so are the other ``sharp_*``. None if no split
-            was asked for.
-        regular_msae: As ``msae``, over the other points; so are the other ``regular_*``.
     """
 
     msae: float
@@ -46,28 +43,11 @@ class NormalScore(NamedTuple):
     under_20_deg: float
     points: int
     invalid: int
-    sharp_msae: float | None = None
-    sharp_rms: float | None = None
-    sharp_mean: float | None = None
-    sharp_median: float | None = None
-    sharp_under_5_deg: float | None = None
-    sharp_under_10_deg: float | None = None
-    sharp_under_20_deg: float | None = None
-    sharp_points: int | None = None
-    regular_msae: float | None = None
-    regular_rms: float | None = None
-    regular_mean: float | None = None
-    regular_median: float | None = None
-    regular_under_5_deg: float | None = None
-    regular_under_10_deg: float | None = None
-    regular_under_20_deg: float | None = None
-    regular_points: int | None = None
 
 
 def score_normals(
     normals: Tensor | NDArray[Any],
     truth: Tensor | NDArray[Any],
-    sharp: Tensor | NDArray[Any] | None = None,
     *,
     valid: Tensor | NDArray[Any] | None = None,
 ) -> NormalScore:
@@ -85,7 +65,6 @@ def score_normals(
     Args:
         normals: Estimated normals, shape ``(*, 3)``, floating point.
         truth: True normals, shape ``(*, 3)``, floating point.
-        sharp: Points to report apart, shape ``(*)``, bool. Default: no split.
         valid: Points whose normal counts as estimated, shape ``(*)``, bool. Default: all.
 
     Returns:
@@ -102,33 +81,33 @@ def score_normals(
     """
     normals = as_tensor("score_normals", "normals", normals)
     truth = as_tensor("score_normals", "truth", truth)
-    given = {"sharp": sharp, "valid": valid}
-    masks = {
-        name: as_tensor("score_normals", name, mask)
-        for name, mask in given.items()
-        if mask is not None
-    }
     check_floating("score_normals", normals=normals)
     check_floating("score_normals", truth=truth)
-    vectors = {"normals": (normals, "* 3"), "truth": (truth, "* 3")}
-    check_shapes("score_normals", **vectors, **{name: (m, "*") for name, m in masks.items()})
-    for name, mask in masks.items():
-        if mask.dtype != torch.bool:
-            dtype = str(mask.dtype).removeprefix("torch.")
-            raise ShapeError(f"score_normals: expected {name} of bool, got {dtype}.")
-    check_one_device("score_normals", normals=normals, truth=truth, **masks)
-
+    mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if valid is None else valid
+    mask = as_tensor("score_normals", "valid", mask)
+    check_shapes("score_normals", normals=(normals, "* 3"), truth=(truth, "* 3"), valid=(mask, "*"))
+    if mask.dtype != torch.bool:
+        dtype = str(mask.dtype).removeprefix("torch.")
+        raise ShapeError(f"score_normals: expected valid of bool, got {dtype}.")
+    check_one_device("score_normals", normals=normals, truth=truth, valid=mask)
     errors, scored, has_truth = _angle_errors(normals.reshape(-1, 3), truth.reshape(-1, 3))
-    if "valid" in masks:
-        scored = scored & masks["valid"].reshape(-1)
-    invalid = int((has_truth & ~scored).sum())
-    split: dict[str, Any] = {}
-    if "sharp" in masks:
-        edges = masks["sharp"].reshape(-1)
-        for name, part in (("sharp", edges), ("regular", ~edges)):
-            values = _summarize(errors[scored & part])
-            split |= {f"{name}_{index}": value for index, value in values.items()}
-    return NormalScore(invalid=invalid, **_summarize(errors[scored]), **split)
+    scored &= mask.reshape(-1)
+    invalid, errors = int((has_truth & ~scored).sum()), errors[scored]
+    count = len(errors)
+    msae = float(errors.square().mean())
+    middle = errors.sort().values[(count - 1) // 2 : count // 2 + 1] if count else errors
+    under_5, under_10, under_20 = (float((errors < limit).double().mean()) for limit in _LIMITS_DEG)
+    return NormalScore(
+        msae=msae,
+        rms=math.sqrt(msae),
+        mean=float(errors.mean()),
+        median=float(middle.mean()),
+        under_5_deg=under_5,
+        under_10_deg=under_10,
+        under_20_deg=under_20,
+        points=count,
+        invalid=invalid,
+    )
 
 
 def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -142,22 +121,3 @@ def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tenso
         found.append((unsigned_angle_deg(estimated, true), has_estimate & has_truth, has_truth))
     errors, scored, has_truth = (torch.cat(parts) for parts in zip(*found, strict=True))
     return errors, scored, has_truth
-
-
-def _summarize(errors: Tensor) -> dict[str, Any]:
-    """Return the indices of angle errors in degrees, by field of :class:`NormalScore`."""
-    count = len(errors)
-    msae = float(errors.square().mean())
-    ordered = errors.sort().values
-    middle = ordered[(count - 1) // 2 : count // 2 + 1] if count else ordered
-    shares = {
-        f"under_{limit}_deg": float((errors < limit).double().mean()) for limit in _LIMITS_DEG
-    }
-    return {
-        "msae": msae,
-        "rms": math.sqrt(msae),
-        "mean": float(errors.mean()),
-        "median": float(middle.mean()),
-        **shares,
-        "points": count,
-    }
