@@ -90,7 +90,7 @@ EVERYTHING |= {
     "score_clusters of few": lambda: metrics.score_clusters(
         plain()[0].normals, plain()[0].labels, sample_size=50
     ),
-    "score_normals": lambda: metrics.score_normals(plain()[0].normals, POINTS, plain()[0].sharp),
+    "score_normals": lambda: metrics.score_normals(plain()[0].normals, POINTS),
     "indices": lambda: [
         index(table()) for index in (metrics.adjusted_rand_index, metrics.segmentation_covering)
     ],

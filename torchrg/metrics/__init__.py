@@ -71,9 +71,9 @@ _CLUSTERS = {
     Index("rad", True): "sp",
     Index("", False): "dbi",
     Index("", True): "dvi",
-    Index("count", None): "clusters points sample_size sampled_clusters",
+    Index("count", None): "clusters points sampled_clusters",
     Index("count", False): "invalid",
-    Index("", None): "seed dvi_exact",
+    Index("", None): "dvi_exact",
 }
 _NORMALS = {
     Index("deg^2", False): "msae",

@@ -46,9 +46,7 @@ class ClusterScore(NamedTuple):
         clusters: Number of clusters, after merging if that was asked for.
         points: Labelled points with a normal.
         invalid: Labelled points without a normal; they are left out.
-        sample_size: Most points of a cluster whose pairs were all taken.
-        seed: Seed of the subsample of larger clusters.
-        sampled_clusters: Clusters whose term of ``dbi`` comes from such a subsample.
+        sampled_clusters: Clusters whose term of ``dbi`` comes from a subsample.
         dvi_exact: Whether no subsample entered ``dvi``.
     """
 
@@ -59,8 +57,6 @@ class ClusterScore(NamedTuple):
     clusters: int
     points: int
     invalid: int
-    sample_size: int
-    seed: int
     sampled_clusters: int
     dvi_exact: bool
 
@@ -161,8 +157,6 @@ def score_clusters(
         clusters=num_clusters,
         points=len(clusters),
         invalid=invalid,
-        sample_size=sample_size,
-        seed=seed,
         sampled_clusters=num_sampled,
         dvi_exact=exact,
     )
