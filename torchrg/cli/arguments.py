@@ -20,41 +20,25 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, NoReturn, TypeVar
+from typing import Any, Literal, NamedTuple, NoReturn, TypeVar
 
 from torchrg.errors import ConfigError
 
 Command = TypeVar("Command")
-FieldPath = tuple[str, ...]
-"""Names of the fields that lead to a value."""
 
-OFTEN = frozenset(
-    {
-        "--normals.method",
-        "--normals.k",
-        "--growing.max-angle-deg",
-        "--growing.min-size",
-        "--growing.max-distance",
-        "--planes.up",
-        "--depth.noise",
-        "--depth.max-depth",
-        "--depth.min-size",
-    }
+OFTEN = (
+    *("--normals.method", "--normals.k"),
+    *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--planes.up"),
+    *("--depth.noise", "--depth.max-depth", "--depth.min-size"),
 )
 """Settings of parts that are often changed; the others come after everything else."""
 RESOURCES = (
-    "--workers",
-    "--threads",
-    "--limit-memory",
-    "--chunk-size",
-    "--engine",
-    "--ray-address",
+    *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """What decides where and how fast a command runs, never what it finds."""
 _RUNNING = "how it runs, without effect on what is found"
 _EXAMPLES = "\n\nExamples:\n"
 _WIDEST = 100
-_INDENT = " " * 6
 _WORDS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 _NUMBERS = {int: "a whole number", float: "a number"}
 _NONE = "None"
@@ -79,12 +63,11 @@ class Argument:
     is_inline: bool = False
 
 
-@dataclass(frozen=True)
-class Flag:
+class Flag(NamedTuple):
     """An argument of a command.
 
     Attributes:
-        path: The fields that lead to its value.
+        path: The fields that lead to its value, with dots between them.
         name: How it is called: ``--part.field``, or a word for what has no flag.
         spelling: How it is written, with what stands for its value.
         text: What it does.
@@ -93,12 +76,12 @@ class Flag:
         is_needed: Whether it has to be given.
     """
 
-    path: FieldPath
+    path: str
     name: str
     spelling: str
     text: str
     part: str
-    hint: Any
+    hint: object
     is_needed: bool
 
     @property
@@ -112,7 +95,7 @@ def parse(
     arguments: Sequence[str],
     *,
     prog: str,
-    default: Mapping[str, Any] | None = None,
+    default: Mapping[str, object] | None = None,
 ) -> Command:
     """Parse arguments into a dataclass; ``--help`` prints and exits.
 
@@ -135,19 +118,11 @@ def parse(
         print(format_help(kind, flags, prog=prog))
         raise SystemExit(0)
     try:
-        given = _read(flags, arguments, prog)
-        return typing.cast(Command, _build(kind, default, given))
-    except _UsageError as error:
-        raise ConfigError(f"{error} See {prog} --help.") from None
+        return typing.cast(Command, _build(kind, default, _read(flags, arguments, prog)))
     except ConfigError as error:
         # The one setting that stands in no section.
         text = str(error).replace("PipelineConfig: expected chunk_size", "expected --chunk-size")
-        where = "" if "--" in text else f" See {prog} --help."
-        raise ConfigError(f"{text}{where}") from None
-
-
-class _UsageError(Exception):
-    """What is wrong with some arguments, in a sentence."""
+        raise ConfigError(f"{text} See {prog} --help.") from None
 
 
 class _Parser(argparse.ArgumentParser):
@@ -161,28 +136,36 @@ class _Parser(argparse.ArgumentParser):
             (r"the following arguments are required: ", f"Missing from {self.prog}: "),
         ):
             message = re.sub(pattern, text, message)
-        raise _UsageError(f"{message}.")
+        raise ConfigError(f"{message}.")
 
 
-def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[FieldPath, Any]:
-    """Return the values that are given."""
+def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[str, object]:
+    """Return the values that are given, by path."""
     parser = _Parser(prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
-    for number, flag in enumerate(flags):
-        dest, nargs = str(number), "*" if _has_words(flag.hint) else None
+    for flag in flags:
+        nargs = "*" if any(typing.get_origin(kind) is tuple for kind in _kinds(flag.hint)) else None
         if flag.is_positional:
-            parser.add_argument(dest, nargs=nargs, metavar=flag.name)
-        elif flag.hint is bool:
-            for name, value in zip(_switches(flag.name), (True, False), strict=True):
-                names = _spellings(name)
-                parser.add_argument(*names, dest=dest, action="store_const", const=value)
-        else:
-            needed = flag.is_needed
-            parser.add_argument(*_spellings(flag.name), dest=dest, nargs=nargs, required=needed)
+            parser.add_argument(flag.path, nargs=nargs, metavar=flag.name)
+            continue
+        switches = zip(_switches(flag.name), (True, False), strict=True)
+        for name, const in switches if flag.hint is bool else [(flag.name, None)]:
+            # Fields are written with underscores too.
+            spellings = dict.fromkeys((name, f"--{name[2:].replace('-', '_')}"))
+            if const is None:
+                needed = flag.is_needed
+                parser.add_argument(*spellings, dest=flag.path, nargs=nargs, required=needed)
+            else:
+                parser.add_argument(*spellings, dest=flag.path, action="store_const", const=const)
     given, left = parser.parse_known_args(arguments)
     if left:
-        raise _UsageError(f"Unrecognized options: {', '.join(left)}.{_nearest(left[0], flags)}")
-    values = {flags[int(number)]: value for number, value in vars(given).items()}
-    return {flag.path: _value_of(flag, value) for flag, value in values.items()}
+        names = [flag.name for flag in flags] if left[0].startswith("--") else []
+        near = difflib.get_close_matches(left[0], names, n=1)
+        if os.path.lexists(left[0]):  # A file whose name begins as a flag does.
+            near = [f"./{left[0]}"]
+        question = f" Did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"Unrecognized options: {', '.join(left)}.{question}")
+    values = vars(given)
+    return {flag.path: _value_of(flag, values[flag.path]) for flag in flags if flag.path in values}
 
 
 def _switches(name: str) -> tuple[str, str]:
@@ -196,75 +179,48 @@ def _switches(name: str) -> tuple[str, str]:
     return name, f"--{section}{dot}no-{last}"
 
 
-def _spellings(name: str) -> list[str]:
-    """Return a flag with hyphens, and with the underscores of its field."""
-    return list(dict.fromkeys((name, f"--{name[2:].replace('-', '_')}")))
-
-
-def _nearest(wrong: str, flags: Sequence[Flag]) -> str:
-    """Return a question where something that is no flag is much like one, or is a file."""
-    names = [flag.name for flag in flags] if wrong.startswith("--") else []
-    found = difflib.get_close_matches(wrong, names, n=1)
-    if os.path.lexists(wrong):  # A file whose name begins as a flag does.
-        found = [f"./{wrong}"]
-    return f" Did you mean {found[0]}?" if found else ""
-
-
-def _kinds_of(hint: Any) -> list[Any]:  # noqa: ANN401
+def _kinds(hint: object) -> list[Any]:
     """Return the types that a value may have; None is not among them."""
     kinds = typing.get_args(hint)
     is_union = typing.get_origin(hint) not in (None, tuple, Literal)
     return [kind for kind in kinds if kind is not NoneType] if is_union else [hint]
 
 
-def _has_words(hint: Any) -> bool:  # noqa: ANN401
-    """Return whether a value of a type may be several words."""
-    return any(typing.get_origin(kind) is tuple for kind in _kinds_of(hint))
-
-
-def _value_of(flag: Flag, given: bool | str | list[str]) -> Any:  # noqa: ANN401
+def _value_of(flag: Flag, given: bool | str | list[str]) -> object:
     """Return the value that is written for a flag."""
     if isinstance(given, bool):
         return given
     words = [given] if isinstance(given, str) else given
     if words == [_NONE] and NoneType in typing.get_args(flag.hint):
         return None
-    kinds = _kinds_of(flag.hint)
-    choices = [c for kind in kinds for c in typing.get_args(kind) if isinstance(c, str)]
-    if choices:
+    kind, *others = _kinds(flag.hint)
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        choices = [*parts, *(choice for other in others for choice in typing.get_args(other))]
         if words[0] not in choices:
-            known = ", ".join(choices)
-            raise _UsageError(f"expected {flag.name} to be one of {known}, got {words[0]!r}.")
+            raise ConfigError(
+                f"expected {flag.name} to be one of {', '.join(choices)}, got {words[0]!r}."
+            )
         return words[0]
-    if typing.get_origin(kinds[0]) is not tuple:
-        return _converted(flag, kinds[0], words[0])
-    parts = typing.get_args(kinds[0])
-    if Ellipsis not in parts and len(words) != len(parts):
-        raise _UsageError(f"expected {len(parts)} values for {flag.name}, got {len(words)}.")
-    return tuple(_converted(flag, parts[0], word) for word in words)
+    if parts and ... not in parts and len(words) != len(parts):
+        raise ConfigError(f"expected {len(parts)} values for {flag.name}, got {len(words)}.")
+    kind, values = parts[0] if parts else kind, []
+    for word in words:
+        try:
+            values.append(kind(word))
+        except ValueError:
+            raise ConfigError(f"expected {_NUMBERS[kind]} for {flag.name}, got {word!r}.") from None
+    return tuple(values) if parts else values[0]
 
 
-def _converted(flag: Flag, kind: Any, word: str) -> Any:  # noqa: ANN401
-    """Return a word as a value of a type."""
-    try:
-        return kind(word)
-    except ValueError:
-        message = f"expected {_NUMBERS[kind]} for {flag.name}, got {word!r}."
-        raise _UsageError(message) from None
-
-
-def _build(kind: Any, default: Any, given: Mapping[FieldPath, Any]) -> Any:  # noqa: ANN401
+def _build(kind: Any, default: Any, given: Mapping[str, object], prefix: str = "") -> Any:  # noqa: ANN401
     """Return a dataclass with the values that are given, and otherwise those that it has."""
-    values: dict[str, Any] = {}
-    hints = typing.get_type_hints(kind)
+    values, hints = {}, typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
-        value = _default_of(field, default)
-        below = {path[1:]: found for path, found in given.items() if path[0] == field.name}
-        if dataclasses.is_dataclass(hints[field.name]):
-            value = _build(hints[field.name], value, below) if below else value
-        elif () in below:
-            value = below[()]
-        values[field.name] = () if value is dataclasses.MISSING else value
+        value, path = _default_of(field, default), f"{prefix}{field.name}"
+        if any(name.startswith(f"{path}.") for name in given):
+            value = _build(hints[field.name], value, given, f"{path}.")
+        values[field.name] = given.get(path, () if value is dataclasses.MISSING else value)
     return kind(**values)
 
 
@@ -292,7 +248,7 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str) -> str:
     blocks = [usage, *(_wrap(paragraph) for paragraph in plain(description).split("\n\n"))]
     for title, members in groups.items():
         if members:
-            entries = [f"  {f.spelling}\n{_wrap(f.text, _INDENT)}" for f in members]
+            entries = [f"  {f.spelling}\n{_wrap(f.text, indent=6)}" for f in members]
             blocks.append("\n".join([f"{title}:", *entries]))
     if examples:
         blocks.append("\n".join(["examples:", *(f"  {line}" for line in example_lines(kind))]))
@@ -307,43 +263,43 @@ def example_lines(kind: type) -> list[str]:
 
 def list_flags(
     kind: Any,  # noqa: ANN401
-    default: Any = None,  # noqa: ANN401
-    path: FieldPath = (),
-    prefix: str = "",
+    default: object = None,
+    path: str = "",
+    prefix: str = "--",
     part: str = "",
 ) -> Iterator[Flag]:
     """Yield the arguments that the fields of a dataclass become, in their order.
 
-    Args:
-        kind: The dataclass; fields that are dataclasses are parts.
-        default: An instance, or values of fields by name, in place of the defaults of the class.
-        path: The fields that lead to the dataclass.
-        prefix: What stands before the names of flags.
-        part: What the flags are about, empty for the command itself.
+    ``default`` is an instance, or values of fields by name, in place of the defaults of the class.
+    Fields that are dataclasses are parts: of these ``path`` leads to the part, ``prefix`` stands
+    before the names of its flags, and ``part`` says what they are about.
     """
     texts, hints = _texts(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint, argument = hints[field.name], Argument()
         if typing.get_origin(hint) is typing.Annotated:
             hint, argument = typing.get_args(hint)
-        value, own = _default_of(field, default), (*path, field.name)
+        value, own = _default_of(field, default), f"{path}{field.name}"
         if dataclasses.is_dataclass(hint):
-            inner = prefix if argument.is_inline else f"{prefix}{field.name}."
-            about = part if argument.is_inline else _first_line(hint)
-            yield from list_flags(hint, value, own, inner, about)
+            inner = (prefix, part)
+            if not argument.is_inline:
+                inner = (f"{prefix}{field.name}.", _first_line(hint))
+            yield from list_flags(hint, value, f"{own}.", *inner)
             continue
         text = plain(argument.text or texts.get(field.name, ""))
         if "Default:" not in text:
-            text = f"{text} {_said(value, is_setting=bool(prefix))}".strip()
+            text = f"{text} {_said(value, is_setting=prefix != '--')}".strip()
+        name = f"{prefix}{field.name}".replace("_", "-")
         if argument.is_positional:
             name = argument.metavar or field.name.upper()
-            dots = "..." if typing.get_origin(hint) is tuple else ""
-            yield Flag(own, name, f"{name}{dots}", text, part, hint, is_needed=True)
+            spelling = name + "..." * (typing.get_origin(hint) is tuple)
+        elif hint is bool:
+            # Only settings may be on from the start, and are turned off.
+            spelling = ", ".join(_switches(name)) if value or part else name
         else:
-            name = f"--{prefix}{field.name}".replace("_", "-")
-            spelling = _spelled(name, hint, argument.metavar, value)
-            needed = value is dataclasses.MISSING
-            yield Flag(own, name, spelling, text, part, hint, is_needed=needed)
+            spelling = f"{name} {argument.metavar or _words(hint)}"
+        needed = argument.is_positional or value is dataclasses.MISSING
+        yield Flag(own, name, spelling, text, part, hint, needed)
 
 
 def plain(text: str) -> str:
@@ -369,7 +325,7 @@ def _texts(kind: type) -> dict[str, str]:
     return texts
 
 
-def _default_of(field: "dataclasses.Field[Any]", default: Any) -> Any:  # noqa: ANN401
+def _default_of(field: "dataclasses.Field[Any]", default: object) -> object:
     """Return what a field is where no flag says otherwise."""
     if isinstance(default, Mapping) and field.name in default:
         return default[field.name]
@@ -379,7 +335,7 @@ def _default_of(field: "dataclasses.Field[Any]", default: Any) -> Any:  # noqa: 
     return field.default if made is dataclasses.MISSING else made()
 
 
-def _said(value: Any, *, is_setting: bool) -> str:  # noqa: ANN401
+def _said(value: object, *, is_setting: bool) -> str:
     """Return the sentence on a default; flags of the command have none for what is off."""
     is_off = value is None or value is False or value == ()
     if value is dataclasses.MISSING or (is_off and not is_setting):
@@ -390,37 +346,30 @@ def _said(value: Any, *, is_setting: bool) -> str:  # noqa: ANN401
     return f"Default: {' '.join(words)}."
 
 
-def _spelled(name: str, hint: Any, metavar: str | None, value: Any) -> str:  # noqa: ANN401
-    """Return a flag as one writes it."""
-    if hint is not bool:
-        return f"{name} {metavar or _words(hint)}"
-    return name if value is False and "." not in name else ", ".join(_switches(name))
-
-
-def _words(hint: Any) -> str:  # noqa: ANN401
+def _words(hint: object) -> str:
     """Return what stands for a value of a type; that None may be given is left to the text."""
     choices = [choice for choice in typing.get_args(hint) if choice not in (NoneType, None)]
     if typing.get_origin(hint) is Literal:
         return "{" + ",".join(map(str, choices)) + "}"
     if typing.get_origin(hint) is tuple:
         return f"{_words(choices[0])}..." if ... in choices else " ".join(map(_words, choices))
-    return _WORDS[hint] if hint in _WORDS else " or ".join(map(_words, choices))
+    return " or ".join(map(_words, choices)) if choices else _WORDS[typing.cast(type, hint)]
 
 
-def _first_line(kind: Any) -> str:  # noqa: ANN401
+def _first_line(kind: object) -> str:
     """Return the first sentence of a docstring, to stand within one."""
     first = re.split(r"[.;] |\.$", plain(inspect.getdoc(kind) or ""))[0].replace("\n", " ")
     return first[:1].lower() + first[1:]
 
 
-def _wrap(text: str, indent: str = "") -> str:
+def _wrap(text: str, *, indent: int = 0) -> str:
     """Return a paragraph in lines that fit the terminal."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     return textwrap.fill(
         " ".join(text.split()),
         width,
-        initial_indent=indent,
-        subsequent_indent=indent,
+        initial_indent=" " * indent,
+        subsequent_indent=" " * indent,
         break_on_hyphens=False,
         break_long_words=False,
     )

@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,10 +15,7 @@ import torch
 from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument
-from torchrg.cli.ending import INTERRUPTED as INTERRUPTED
-from torchrg.cli.ending import SOME_FAILED as SOME_FAILED
 from torchrg.cli.ending import USAGE_ERROR as USAGE_ERROR
-from torchrg.cli.ending import fail as fail
 from torchrg.cli.ending import printable as printable
 from torchrg.cli.ending import say as say
 from torchrg.cli.ending import warn as warn
@@ -72,7 +69,7 @@ class PlaneSettings:
             'pca'
         """
         values = {"--preset": preset, "--config": "", "--angle-deg": ""}
-        for argument, following in zip_longest(argv, argv[1:], fillvalue=""):
+        for argument, following in pairwise((*argv, "")):
             name, equals, value = argument.partition("=")
             name = name.replace("_", "-")
             if name in values:
@@ -249,10 +246,11 @@ def prepared_for_depth(wanted: bool) -> bool:
 
 def use_threads(threads: int | None) -> None:
     """Let torch use so many threads; None leaves it to torch."""
-    if threads is not None and not 1 <= threads <= _MOST_THREADS:
+    if threads is None:
+        return
+    if not 1 <= threads <= _MOST_THREADS:
         raise ConfigError(f"expected --threads from 1 to {_MOST_THREADS:,}, got {threads}.")
-    if threads is not None:
-        torch.set_num_threads(threads)
+    torch.set_num_threads(threads)
 
 
 def check_memory(limit_memory: float | None) -> None:
@@ -287,19 +285,12 @@ def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         hall     1,000
         office      20
     """
-    table = [list(map(printable, row)) for row in (head, *rows)]
-    widths = [max(len(row[column]) for row in table) for column in range(len(head))]
-    numeric = [
-        all(row[column][:1].isdigit() or row[column] == "" for row in table[1:])
-        for column in range(len(head))
-    ]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(row, widths, numeric, strict=True)
-        ).rstrip()
-        for row in table
-    )
+    columns = []
+    for cells in zip(*(map(printable, row) for row in (head, *rows)), strict=True):
+        width = max(map(len, cells))
+        numeric = all(cell[:1].isdigit() or not cell for cell in cells[1:])
+        columns.append([cell.rjust(width) if numeric else cell.ljust(width) for cell in cells])
+    return "\n".join("  ".join(row).rstrip() for row in zip(*columns, strict=True))
 
 
 def output_paths(inputs: tuple[Path, ...], out: Path, *, suffix: str = ".npz") -> list[Path]:
@@ -365,22 +356,23 @@ DRAWINGS = (".png", ".html")
 
 def picture_paths(
     results: Sequence[Path], picture: Path | None, *, suffixes: Sequence[str] = DRAWINGS
-) -> list[Path | None]:
+) -> Sequence[Path | None]:
     """Return where the picture of each result goes, by the rules of :func:`output_paths`."""
     if picture is None:
         return [None] * len(results)
-    if len(results) == 1 and not picture.is_dir() and picture.suffix:
-        check_drawing(picture, suffixes=suffixes)
-        return [picture]
-    if picture.suffix.lower() in suffixes and not picture.is_dir():
-        raise FormatError(
-            f"{picture}: expected a directory for {len(results)} pictures, got a file name."
-        )
+    if not picture.is_dir():
+        if len(results) == 1 and picture.suffix:
+            check_drawing(picture, suffixes=suffixes)
+            return [picture]
+        if picture.suffix.lower() in suffixes:
+            raise FormatError(
+                f"{picture}: expected a directory for {len(results)} pictures, got a file name."
+            )
     make_folder(picture)
     pictures = [picture / f"{path.stem}.png" for path in results]
     for path in pictures:
         check_place(path)
-    return [*pictures]
+    return pictures
 
 
 def check_drawing(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.console import ColumnNames, ColumnsFlag, format_table, warn, warnings_as_lines
+from torchrg.cli.console import ColumnNames, ColumnsFlag, warn, warnings_as_lines
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.metrics import (
@@ -27,12 +27,6 @@ from torchrg.structures import UNLABELED, Cloud
 Scores: TypeAlias = dict[str, dict[str, float | None]]
 """Indices by part (``labels``, ``normals``, ``superpoints``) and name."""
 
-_SHOWN = {
-    "labels": ("f1", "precision", "recall", "regions", "faces", "recall_iou50", "mean_best_iou"),
-    "normals": ("rms", "mean", "under_10_deg"),
-    "superpoints": ("count", "asa", "oracle_miou", "boundary_recall"),
-}
-"""What a table of scans shows of each; the mean and --json have everything."""
 _MOST_NAMED = 5
 """Scans that an error names, so that it stays one line."""
 
@@ -42,7 +36,7 @@ class Arguments:
     """Score labels and normals against a truth of the same points.
 
     Two scans, or two folders: then scans of the same name are compared, and the mean over them is
-    printed below. A scan is a file, or a folder as torchrg convert writes it.
+    printed. A scan is a file, or a folder as torchrg convert writes it.
 
     Examples:
         torchrg score planes.npz room.npz
@@ -68,7 +62,8 @@ class Arguments:
     """How far apart borders of superpoints and true ones may be and still agree, in the unit of the
     cloud. Default: the median distance to the 8th nearest neighbour."""
     json: bool = False
-    """Print one JSON object instead of a table; for folders with the keys "scans" and "mean"."""
+    """Print one JSON object instead of lines; for folders with the keys "scans", which holds the
+    scores of each, and "mean"."""
     columns: ColumnsFlag = None
 
 
@@ -94,7 +89,7 @@ def run(argv: list[str]) -> int:
         print(json.dumps({"scans": scans, "mean": scores} if of_folders else scores))
         return 0
     if of_folders:
-        _print_scans(scans)
+        print(f"mean of {len(scans):,} scans")
     for part, values in scores.items():
         print(part)
         for name, value in values.items():
@@ -236,22 +231,6 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
             known = [value for row in rows if (value := row.get(name)) is not None]
             means[part][name] = math.fsum(known) / len(known) if known else None
     return means
-
-
-def _print_scans(scans: dict[str, Scores]) -> None:
-    """Print a line for each scan."""
-    columns = [
-        (part, name)
-        for part, names in _SHOWN.items()
-        for name in names
-        if any(part in scores for scores in scans.values())
-    ]
-    rows = [
-        [scan, *(_spelled(scores.get(part, {}).get(name)) for part, name in columns)]
-        for scan, scores in scans.items()
-    ]
-    print(format_table(["scan", *(name for _, name in columns)], rows))
-    print(f"\nmean of {len(scans):,} scans")
 
 
 def _spelled(value: float | None) -> str:
