@@ -119,6 +119,7 @@ def test_fields_become_what_is_written(line, changes):
     [
         ("", "Missing from f: FILE, --out. See f --help."),
         ("a --out", "expected a value for --out. See"),
+        ("a --out b --part.size wide", "expected a number for --part.size, got 'wide'. See"),
         ("a --out b --place 1 2", "expected 3 values for --place, got 2. See"),
         ("a --out b --part.counts 1 x", "expected a whole number for --part.counts, got 'x'. See"),
         ("a --out b --kind none", "expected --kind to be one of one, other, got 'none'. See"),
@@ -157,20 +158,6 @@ def test_what_is_needed_has_names(capsys):
     assert help_of("torchrg convert s3dis", capsys).startswith(
         "usage: torchrg convert s3dis ROOT OUT [options]\n"
     )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--normals.k", "two"], "expected a whole number for --normals.k, got 'two'. See"),
-        (["--voxel", "wide"], "expected a number for --voxel, got 'wide'. See"),
-        (["--growing.min-sise", "3"], "Did you mean --growing.min-size? See torchrg segment"),
-        (["--quite-another", "3"], "Unrecognized options: --quite-another, 3. See"),
-    ],
-)
-def test_a_wrong_flag_is_told_in_plain_words(arguments, message, capsys):
-    assert main(["segment", "a.ply", "--out", "b.npz", *arguments]) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_settings_of_the_preset_are_shown(capsys):

@@ -46,11 +46,6 @@ def test_several_pictures_go_to_a_directory_under_the_names_of_the_inputs(rooms,
     assert all(path.read_bytes().startswith(PNG) for path in found)
 
 
-def test_no_picture_unless_asked_for(rooms, tmp_path):
-    assert segment(rooms / "room1.npz", "--out", tmp_path / "seg.npz") == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["seg.npz"]
-
-
 @pytest.mark.parametrize(
     ("inputs", "place", "message"),
     [

@@ -9,6 +9,7 @@ import argparse
 import ast
 import dataclasses
 import difflib
+import functools
 import inspect
 import os
 import re
@@ -312,6 +313,7 @@ def plain(text: str) -> str:
     return _ROLE.sub(r"\1", text).replace("`", "")
 
 
+@functools.cache
 def _texts(kind: type) -> dict[str, str]:
     """Return the docstrings below the fields of a dataclass and of its bases."""
     texts: dict[str, str] = {}
