@@ -13,9 +13,8 @@ from torchrg.metrics.contingency import ContingencyTable, check_labels, count_ov
 from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
 
-_MATCH_IOU, _PART_IOU = 0.75, 0.2
-"""Least IoU of a match, and of a partial overlap, as in the EVOPS benchmark. Above 0.5 a match is
-one to one."""
+_MATCH_IOU = 0.75
+"""Least IoU of a match in the EVOPS benchmark. Above 0.5 a match is one to one."""
 
 
 class SegCompCounts(NamedTuple):
@@ -37,29 +36,17 @@ class SegCompCounts(NamedTuple):
 
 
 class EvopsScore(NamedTuple):
-    """The indices of the EVOPS benchmark, shares in [0, 1].
+    """Indices of the EVOPS benchmark, shares in [0, 1].
 
     Attributes:
         precision: Regions that match a face, of all regions.
         recall: Faces that match a region, of all faces.
-        f1: Harmonic mean of precision and recall.
         mean_iou: Mean IoU of the matches.
-        mean_dice: Mean Dice coefficient of the matches.
-        over_segmented: Faces that overlap several regions in part, of all faces.
-        under_segmented: Regions that overlap several faces in part, of all regions.
-        missed: Faces without a counterpart, of all faces.
-        noise: Regions without a counterpart, of all regions.
     """
 
     precision: float
     recall: float
-    f1: float
     mean_iou: float
-    mean_dice: float
-    over_segmented: float
-    under_segmented: float
-    missed: float
-    noise: float
 
 
 class VoxelScore(NamedTuple):
@@ -243,16 +230,9 @@ def _wholes(
 
 
 def score_evops(table: ContingencyTable) -> EvopsScore:
-    """Score regions against faces by the EVOPS protocol [1].
+    """Score regions against faces that they match, at an IoU of at least 0.75, as EVOPS does [1].
 
-    A region and a face *match* at an IoU of 0.75 and overlap *in part* at 0.2. A region that
-    overlaps several faces in part is under-segmented, a face that overlaps several regions in part
-    over-segmented. A region is noise, and a face missed, if it overlaps nothing in part, or exactly
-    one partner that it does not match and that has no other partner.
-
-    Convention:
-        Both bounds are included ("at least"), as in the benchmark. A point of no face counts in
-        its region's size, a point of no region in its face's.
+    A point of no face counts in its region's size, a point of no region in its face's.
 
     Args:
         table: Overlaps of regions and faces.
@@ -267,28 +247,12 @@ def score_evops(table: ContingencyTable) -> EvopsScore:
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
         >>> table = contingency_table(torch.tensor([1, 1, 3, 3]), torch.tensor([2, 2, -1, 3]))
-        >>> score_evops(table).precision, score_evops(table).recall
-        (0.5, 0.5)
+        >>> score_evops(table)
+        EvopsScore(precision=0.5, recall=0.5, mean_iou=1.0)
     """
-    full, part = table.iou >= _MATCH_IOU, table.iou >= _PART_IOU
-    matched = table.iou[full]
-    num_matched = len(matched)
-    num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
-    faces_of = torch.bincount(table.regions[part], minlength=num_regions)
-    regions_of = torch.bincount(table.faces[part], minlength=num_faces)
-
-    # A lone partner in part that is no match leaves both sides without a counterpart.
-    lone = part & ~full & (faces_of[table.regions] == 1) & (regions_of[table.faces] == 1)
-    noise = int((faces_of == 0).sum()) + int(lone.sum())
-    missed = int((regions_of == 0).sum()) + int(lone.sum())
+    matched = table.iou[table.iou >= _MATCH_IOU]
     return EvopsScore(
-        precision=share(num_matched, num_regions),
-        recall=share(num_matched, num_faces),
-        f1=share(2 * num_matched, num_regions + num_faces),
-        mean_iou=share(float(matched.sum()), num_matched),
-        mean_dice=share(float((2 * matched / (1 + matched)).sum()), num_matched),
-        over_segmented=share(int((regions_of > 1).sum()), num_faces),
-        under_segmented=share(int((faces_of > 1).sum()), num_regions),
-        missed=share(missed, num_faces),
-        noise=share(noise, num_regions),
+        precision=share(len(matched), len(table.region_sizes)),
+        recall=share(len(matched), len(table.face_sizes)),
+        mean_iou=share(float(matched.sum()), len(matched)),
     )

