@@ -121,7 +121,6 @@ def test_interrupts_that_the_shell_lets_ignore_stay_ignored():
 COMMANDS = {
     "segment": ["segment", "IN", "--out", "OUT/x.npz", "--preset", "classic"],
     "view": ["view", "IN", "--out", "OUT/x.png", "--width", "100"],
-    "score": ["score", "IN", "IN"],
     "sample": ["sample", "OUT/x.ply", "--num-points", "3000"],
 }
 

@@ -165,20 +165,3 @@ def test_results_of_convert_are_scored_as_files_are(converted, tmp_path, capsys)
     assert set(found["mean"]) == {"labels", "normals", "superpoints"}
     one = scores_of(capsys, converted / "out" / "hall", converted / "truth" / "hall.npz")
     assert one["labels"] == found["scans"]["hall"]["labels"]
-
-
-def test_folders_are_refused_for_one_scan_in_another_order(converted, tmp_path, capsys):
-    capsys.readouterr()
-    (tmp_path / "east").mkdir()
-    for name in ("hall.npz", "east/office.ply"):
-        cloud = read_cloud(converted / "truth" / name)
-        rows = slice(None, None, -1 if name == "hall.npz" else 1)
-        fields = {field: values[rows] for field, values in cloud.fields.items()}
-        write_cloud(tmp_path / name, Cloud(cloud.coordinates[rows], fields))
-    line = refused(capsys, converted / "out", tmp_path)
-    assert line.startswith(f"torchrg: {converted / 'out' / 'hall'}: expected the points of")
-    assert "add --match-distance D" in line
-    expected = scores_of(capsys, converted / "out", converted / "truth")
-    found = scores_of(capsys, converted / "out", tmp_path, *NEAR)
-    assert found["mean"].pop("match") == {"scans": 2, "points": 2000, "unmatched": 0, "unused": 0}
-    assert found["mean"]["labels"] == pytest.approx(expected["mean"]["labels"])
