@@ -27,8 +27,8 @@ _LEAST_BYTES = 2**24
 """Bytes of the smallest array that goes to the disk; all smaller ones together are few."""
 BYTES_PER_NEIGHBOR = 9
 """Bytes that a neighbour of a point takes at most: four in its list, and an edge with a mark."""
-_RELEASE_SECONDS = 0.05
-"""How often pages go back to the system. In that time some 100 MB of an array are read."""
+_RELEASE_SECONDS = 0.01
+"""How often pages go back to the system. In that time some 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
 """What reserves a disk where the system has no call for that, as on macOS."""
 
@@ -43,8 +43,8 @@ _lock = threading.Lock()
 def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep large arrays on the disk of a folder: results are the same, and memory is bounded.
 
-    Segmenting a cloud then takes about 150 bytes of memory a point, and five bytes of disk for each
-    neighbour of each point. Inside a result there is no such array, so it can be used afterwards.
+    Segmenting a cloud then takes about 150 bytes of memory a point, beside pages of the files that
+    the system has not yet taken back, and up to nine bytes of disk for each neighbour of a point. Inside a result there is no such array, so it can be used afterwards.
 
     Args:
         folder: Where the files without a name are; one on a disk, as some ``/tmp`` is not.

@@ -42,7 +42,7 @@ def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, monke
     monkeypatch.setattr(scratch, "_LEAST_BYTES", 1)
     monkeypatch.setattr(blocks, "BLOCK_SIZE", 10_000)
     name = "out" if "--layout" in flags else "out.npz"
-    files = (rooms / "a.npz", "--preset", "classic", "--orient", "none", *flags)
+    files = (rooms / "a.npz", "--preset", "classic", *flags)
     if "--layout" in flags:
         files = (rooms / "b.npz", *files[1:])  # without missing points, which layouts refuse
     for folder, limit, said in (("whole", "9", False), ("disk", LIMIT, True)):
@@ -55,14 +55,6 @@ def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, monke
         for files in [[p for p in (tmp_path / folder).rglob("[!.]*") if p.is_file()]]
     )
     assert whole == disk
-
-
-def test_rooms_are_looked_for_in_memory_only(rooms, tmp_path, capsys):
-    files = (rooms / "b.npz", "--preset", "classic", "--limit-memory", LIMIT, "--out")
-    assert run(*files, tmp_path / "auto.npz") == 0
-    assert "normals keep their signs, as with --orient none" in capsys.readouterr().out
-    assert run(*files, tmp_path / "none.npz", "--orient", "none") == 0
-    assert (tmp_path / "auto.npz").read_bytes() == (tmp_path / "none.npz").read_bytes()
 
 
 def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
@@ -87,10 +79,6 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
         (
             ("--limit-memory", "-1"),
             "expected --limit-memory above 0 and at most 1,000,000 GB, got -1",
-        ),
-        (
-            ("--limit-memory", LIMIT, "--orient", "interior"),
-            "expected --limit-memory of at least .* for --orient interior, got .* choose none",
         ),
     ],
 )

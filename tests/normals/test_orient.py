@@ -9,7 +9,7 @@ import torch
 from tests.made import make_shape
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
-from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals import estimate_normals, orient, orient_normals
 from torchrg.normals.orient import propagate_signs, vote_free_side
 from torchrg.scenes import make_room
 
@@ -181,6 +181,23 @@ def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng)
     normals = torch.cat([inwards, torch.tensor([0.0, 0, 1]).expand(400, 3)])
     oriented = orient_normals(torch.cat([points, shelf]), shuffled_signs(normals))
     assert torch.equal(oriented[few], inwards[few])
+
+
+def test_points_between_those_over_which_signs_spread_follow_them(room, monkeypatch):
+    scene, normals = room
+    whole = orient_normals(scene.points, normals)
+    monkeypatch.setattr(orient, "_MOST_SPREADING", 15_000)
+    half = orient_normals(scene.points, normals)
+    assert share_right(half, scene.normals) > share_right(whole, scene.normals) - 0.01
+    order = torch.randperm(len(normals), generator=torch.Generator().manual_seed(3))
+    assert torch.equal(orient_normals(scene.points[order], -normals[order]), half[order])
+
+
+def test_points_that_follow_look_to_their_own_side_of_a_plate(rng, monkeypatch):
+    scene = make_shape("thin_plate", 30_000, 0.0)
+    monkeypatch.setattr(orient, "_MOST_SPREADING", 15_000)
+    oriented = orient_normals(scene.points, shuffled_signs(scene.normals), towards="consistent")
+    assert share_right(oriented, scene.normals) > 0.999
 
 
 @pytest.mark.parametrize("towards", ["consistent", "interior"])

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -101,8 +101,7 @@ class Arguments:
     limit_memory: float | None = None
     """Gigabytes of memory that a cloud may take. Of one that would take more the largest arrays are
     kept on the disk of OUT while it is segmented, or of TMPDIR, some 450 bytes a point, with the
-    same result, but for signs of normals that --orient would find by free space. Default: half of
-    what is free."""
+    same result. Default: half of what is free."""
     settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
 
 
@@ -201,8 +200,6 @@ def _segment(
     if len(clouds) > 1:
         cloud = merge_streams(list(map(CloudStream.of, clouds))).stream.read()
     check_viewpoint(cloud, arguments.orient, "use --orient interior")
-    towards = _side_of(arguments, source, cloud, memory_of_scan(num_points), limit)
-    arguments = dataclasses.replace(arguments, orient=towards)
     _check_points(arguments, source, cloud, target)
     if _is_depth_image(cloud):
         console.warn(
@@ -261,25 +258,6 @@ def _limit_of(arguments: Arguments) -> int:
     """Return how many bytes of memory a cloud may take."""
     given = arguments.limit_memory
     return available_memory() // 2 if given is None else int(given * 1e9)
-
-
-def _side_of(
-    arguments: Arguments, source: str, cloud: Cloud, needed: int, limit: int
-) -> Literal["auto", "interior", "viewpoint", "up", "none"]:
-    """Return to which side normals point: the free space of rooms is found in memory only."""
-    towards = arguments.orient
-    looks_for_rooms = towards == "interior" or (towards == "auto" and cloud.front is None)
-    if not looks_for_rooms or needed <= limit:
-        return towards
-    if towards == "interior":
-        raise ConfigError(
-            f"{source}: expected --limit-memory of at least {needed / 1e9:.2f} GB for --orient "
-            f"interior, got {limit / 1e9:.2f} GB; raise it, or choose none."
-        )
-    console.say(
-        f"{source}: normals keep their signs, as with --orient none: rooms are found in memory only"
-    )
-    return "none"
 
 
 def _arrays_of(

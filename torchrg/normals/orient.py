@@ -25,6 +25,13 @@ _NUM_LINKS = 12
 """Nearest neighbours over which signs spread. So many reach from one face of a thin plate to the
 other."""
 
+_MOST_SPREADING = 2**19
+"""Points over which signs spread. Of larger clouds so many stand for all, which takes a kilobyte
+each, and the others follow those near to them."""
+
+_SPREADING_SHARE = 1 / 16
+"""Share of the points that stand for all of clouds so large that it is more: whole buildings."""
+
 _PATCH_BEND = 0.05
 """Largest bend within a smooth patch, that between normals 18 degrees apart."""
 
@@ -153,10 +160,43 @@ def orient_normals(
     rows = rows[(upright[rows] != 0).any(dim=-1)]
     if len(rows) == 0:
         return upright
-    kept, units = cloud[rows], upright[rows]
+    spreading = rows[_evenly_spread(len(rows))]
+    kept, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
     near = search_knn(kept, min(_NUM_NEIGHBORS, len(kept)), canonical=True)
-    signs = turn(kept, units.detach().to(cloud.dtype), near)[:, None].to(given.dtype)
-    return upright.index_copy(0, rows, units * signs)
+    signs = turn(kept, units, near)
+    if len(spreading) < len(rows):
+        signs = _follow(cloud, upright, rows, kept, units * signs[:, None])
+    return upright.index_copy(0, rows, upright[rows] * signs[:, None].to(given.dtype))
+
+
+def _evenly_spread(num_points: int) -> Tensor:
+    """Return which points in canonical order stand for all: every so many along the curve."""
+    count = min(num_points, max(_MOST_SPREADING, int(_SPREADING_SHARE * num_points)))
+    return torch.arange(count) * num_points // count
+
+
+def _follow(
+    points: Tensor, normals: Tensor, rows: Tensor, nearest: Tensor, oriented: Tensor
+) -> Tensor:
+    """Return signs of rows ``(n,)`` that agree with oriented normals of points near to them.
+
+    Of the nearest of these ``(M, 3)`` that is followed over whose link the surface bends least, as
+    along the tree of :func:`propagate_signs`: the other face of a plate may be nearer.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(nearest.cpu().numpy(), balanced_tree=False, compact_nodes=False)
+
+    def follow(chunk: slice) -> Tensor:
+        own = rows[chunk]
+        _, found = tree.query(points[own].cpu().numpy(), min(_NUM_LINKS, tree.n))
+        near = torch.from_numpy(found).to(points.device)
+        arms = nearest[near] - points[own, None]
+        cosine, slope = _agreement(arms, normals[own, None].to(points.dtype), oriented[near])
+        least = (1 - cosine.abs() + slope).argmin(dim=1, keepdim=True)
+        return torch.where(cosine.gather(1, least)[:, 0] < 0, -1.0, 1.0).to(points.dtype)
+
+    return torch.cat(map_chunks(follow, len(rows), CHUNK_SIZE, points.device))
 
 
 def turn_towards(normals: Tensor, directions: Tensor) -> Tensor:
@@ -335,17 +375,15 @@ def _find_links(points: Tensor, normals: Tensor, neighbors: Neighbors) -> _Links
     keys = torch.minimum(here, there) * len(points) + torch.maximum(here, there)
     keys = torch.unique(keys)
     low, high = keys // len(points), keys % len(points)
-    cosine, slope = _agreement(points, normals, low, high)
+    cosine, slope = _agreement(points[high] - points[low], normals[low], normals[high])
     return _Links(low, high, (1 - cosine.abs() + slope).clamp(min=0), cosine)
 
 
-def _agreement(points: Tensor, normals: Tensor, i: Tensor, j: Tensor) -> tuple[Tensor, Tensor]:
+def _agreement(links: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cosine between a mirrored normal and the other, and how steep the link is."""
-    link = points[j] - points[i]
-    sq_length = (link * link).sum(dim=-1)
+    sq_length = (links * links).sum(dim=-1)
     sq_length = torch.where(sq_length > 0, sq_length, 1.0)
-    a, b = normals[i], normals[j]
-    along_a, along_b = (link * a).sum(dim=-1), (link * b).sum(dim=-1)
+    along_a, along_b = (links * a).sum(dim=-1), (links * b).sum(dim=-1)
     cosine = (a * b).sum(dim=-1) - 2 * along_a * along_b / sq_length
     return cosine, (along_a * along_a + along_b * along_b) / sq_length
 
@@ -353,7 +391,7 @@ def _agreement(points: Tensor, normals: Tensor, i: Tensor, j: Tensor) -> tuple[T
 def _signs_to_root(points: Tensor, normals: Tensor, parents: Tensor) -> Tensor:
     """Multiply signs along the way to each root, doubling the stride of the way each time."""
     own = torch.arange(len(points), device=points.device)
-    cosine, _ = _agreement(points, normals, own, parents)
+    cosine, _ = _agreement(points[parents] - points, normals, normals[parents])
     signs = torch.where(cosine < 0, -1.0, 1.0).to(normals.dtype)
     signs[parents == own] = 1.0
     while True:
