@@ -4,15 +4,16 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from torchrg.batch.lock import LOCK
-from torchrg.batch.records import describe_versions, read_record, reason_to_convert
+import filelock
+
+from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
 from torchrg.batch.scans import Job, Scan, Source
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.datasets.folder import folded_name
@@ -22,8 +23,49 @@ from torchrg.io.files import check_space
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
+LOCK = ".torchrg.lock"
+"""Name of the file in the output directory that is locked; it stays there, empty."""
+PATIENCE_SECONDS = 5.0
+"""Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
 _STAGES = ("hash", "read", "neighbors", "normals", "regions", "planes", "write", "record")
 """Stages in the order in which a report tells them, before those that only some sources have."""
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Have the right to write into a directory, which one command has at a time.
+
+    The lock is the operating system's own, which goes with the process however that ends; the
+    workers of a command end with it. Over a network it holds where the file system passes it on:
+    see the package filelock.
+
+    Args:
+        folder: The directory; it exists.
+
+    Raises:
+        FormatError: If another command has the right, or the file of the lock cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, lock_folder(Path(folder)):
+        ...     print("nobody else writes here")
+        nobody else writes here
+    """
+    lock = filelock.FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=PATIENCE_SECONDS)
+    except filelock.Timeout:
+        raise FormatError(
+            f"{folder}: another torchrg command writes here; wait for it, stop it, or choose "
+            "another directory."
+        ) from None
+    except (OSError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FormatError(f"{folder / LOCK}: cannot be locked: {reason}.") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class Plan(NamedTuple):
@@ -194,7 +236,7 @@ class BatchReport:
         """Points converted now."""
         return sum(scan.num_points for scan in self.with_status("converted"))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Record:
         """Return the report as JSON can hold it."""
         points, stages = self.num_points, self.stage_seconds
         return {
@@ -220,12 +262,13 @@ class BatchReport:
 
 def _kept_report(job: Job) -> TaskReport:
     """Return the report of a task that an earlier run has done, from its record."""
-    record = read_record(job) or {}
+    record = read_record(job.folder) or {}
     return TaskReport(
         job.name,
         "kept",
         num_points=record.get("points", 0),
         num_regions=record.get("regions", 0),
+        files=tuple(record.get("outputs", ())),
         repairs=tuple(record.get("repairs", ())),
         warnings=tuple(record.get("warnings", ())),
         attempts=0,

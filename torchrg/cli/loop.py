@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from torchrg.batch.run import BatchReport, Plan, run_plan, run_tasks
-from torchrg.batch.task import Converted, Reports, TaskReport, report_on
+from torchrg.batch.task import Begin, Reports, TaskReport, report_on
 from torchrg.cli.ending import INTERRUPTED, SOME_FAILED, fail
 
 
@@ -30,11 +30,11 @@ def run_each(
     def reports() -> Reports:
         for name, row in zip(names, rows, strict=True):
 
-            def convert(begin: Callable[[str], None], row: Any = row) -> Converted:  # noqa: ANN401
+            def work(begin: Begin, name: str = name, row: Sequence[Any] = row) -> TaskReport:
                 write(arguments, *row)
-                return Converted(0, 0, ())
+                return TaskReport(name, "converted")
 
-            yield report_on(name, convert)
+            yield report_on(name, work)
 
     report = run_tasks(names, reports(), on_report=tell_failure)
     if report.interrupted:
