@@ -27,8 +27,6 @@ LOCK = ".torchrg.lock"
 """Name of the file in the output directory that is locked; it stays there, empty."""
 PATIENCE_SECONDS = 5.0
 """Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
-_STAGES = ("hash", "read", "neighbors", "normals", "regions", "planes", "write", "record")
-"""Stages in the order in which a report tells them, before those that only some sources have."""
 
 
 @contextlib.contextmanager
@@ -227,9 +225,7 @@ class BatchReport:
         for scan in self.with_status("converted"):
             for stage, seconds in scan.seconds.items():
                 total[stage] = total.get(stage, 0.0) + seconds
-        return {
-            stage: total[stage] for stage in dict.fromkeys((*_STAGES, *total)) if stage in total
-        }
+        return total
 
     @property
     def num_points(self) -> int:
@@ -275,45 +271,6 @@ def _kept_report(job: Job) -> TaskReport:
     )
 
 
-def run_tasks(
-    names: Sequence[str],
-    reports: Reports,
-    *,
-    engine: str = "local",
-    workers: int | None = 1,
-    kept: Sequence[TaskReport] = (),
-    on_report: Callable[[TaskReport | None], None] = lambda report: None,
-) -> BatchReport:
-    """Run tasks on an engine until all have ended: the loop of every command with several inputs.
-
-    A full disk ends it, as every further task would fail after its work; so does an interrupt.
-
-    Args:
-        names: Those of all tasks, in the order of the report.
-        reports: Those of the engine at work, as tasks end, None in between.
-        engine: Which one, to be noted in the report.
-        workers: And how many tasks it runs at a time.
-        kept: Reports of the tasks that need not run.
-        on_report: Called with each report.
-    """
-    started, begin = time.time(), time.perf_counter()
-    found = {report.name: report for report in kept}
-    interrupted = False
-    try:
-        with contextlib.closing(reports):
-            for report in reports:
-                on_report(report)
-                if report is not None:
-                    found[report.name] = report
-                    if report.disk_full:
-                        break
-    except KeyboardInterrupt:
-        interrupted = True
-    scans = [found.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
-    seconds = time.perf_counter() - begin
-    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
-
-
 def run_plan(
     plan: Plan,
     reports: Reports,
@@ -322,13 +279,35 @@ def run_plan(
     workers: int | None,
     on_report: Callable[[TaskReport | None], None] = lambda report: None,
 ) -> BatchReport:
-    """Convert the scans of a plan that are not done; see :func:`run_tasks`.
+    """Convert the scans of a plan that are not done on an engine.
 
-    What is complete when it ends early stays, and the next run goes on from there.
+    A full disk ends it, as every further scan would fail after its work; so does an interrupt. What
+    is complete then stays, and the next run goes on from there.
+
+    Args:
+        plan: The plan.
+        reports: Those of the engine at work, as scans end, None in between.
+        engine: The name of the engine, to be noted in the report.
+        workers: How many scans it converts at a time.
+        on_report: Called with each report.
     """
-    kept = [_kept_report(job) for job in plan.done]
+    started, begin = time.time(), time.perf_counter()
+    by_name = {job.name: _kept_report(job) for job in plan.done}
+    interrupted = False
+    try:
+        with contextlib.closing(reports):
+            for report in reports:
+                on_report(report)
+                if report is not None:
+                    by_name[report.name] = report
+                    if report.disk_full:
+                        break
+    except KeyboardInterrupt:
+        interrupted = True
     names = [job.name for job in plan.jobs]
-    return run_tasks(names, reports, engine=engine, workers=workers, kept=kept, on_report=on_report)
+    scans = [by_name.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
+    seconds = time.perf_counter() - begin
+    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
 
 
 def write_report(out: Path, report: BatchReport) -> None:

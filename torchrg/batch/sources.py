@@ -9,7 +9,7 @@ import json
 from collections.abc import Collection
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -84,6 +84,8 @@ class CloudSource:
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 104
     """What the largest of the layouts takes."""
+    kind: ClassVar[str]
+    """The name of the kind of source."""
     dataset: ClassVar[str] = "ScanNet"
     """The data set whose layouts it has; clouds without labels are written as those of ScanNet."""
 
@@ -91,10 +93,6 @@ class CloudSource:
     def in_place(self) -> bool:
         """Whether results go into the folders of the clouds."""
         return False
-
-    def list_scans(self) -> list[Scan]:
-        """Return the scans in natural order."""
-        raise NotImplementedError
 
     def read(self, scan: Scan) -> Reading:
         """Return what is read of a scan."""
@@ -126,16 +124,17 @@ class CloudSource:
             (*notes, *reading.notes),
         )
 
-    def changed_settings(self, **options: str) -> Record:
-        """Return the settings that differ from their defaults, after the given options."""
-        changed: Record = {**options, "superpoint": self.superpoint}
+    def describe(self) -> Record:
+        """Return the kind of the source, and the settings that differ from their defaults."""
+        changed: Record = {"kind": self.kind, "superpoint": self.superpoint}
         if self.orient != "none":
             changed["orient"] = self.orient
         if self.layout != "pointcept":
             changed |= {"layout": self.layout, "version": layouts.VERSION}
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
-            changed |= {"partition": dataclasses.asdict(self.partition), "level": self.level}
-        return cast(Record, json.loads(json.dumps(changed)))
+            partition = json.loads(json.dumps(dataclasses.asdict(self.partition)))
+            changed |= {"partition": partition, "level": self.level}
+        return changed
 
     def checked(self, scans: list[Scan]) -> list[Scan]:
         """Return scans if none of them would write into the files of another."""
@@ -176,6 +175,7 @@ class FolderSource(CloudSource):
     out: Path
     columns: tuple[str, ...] | None = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
+    kind: ClassVar[str] = "folder"
 
     @property
     def in_place(self) -> bool:
@@ -184,8 +184,8 @@ class FolderSource(CloudSource):
 
     def describe(self) -> Record:
         """Return the kind and what else decides results."""
-        described = self.changed_settings(kind="folder")
-        return described if self.columns is None else described | {"columns": list(self.columns)}
+        columns = {} if self.columns is None else {"columns": list(self.columns)}
+        return super().describe() | columns
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
@@ -254,11 +254,12 @@ class S3DISSource(CloudSource):
 
     areas: tuple[int, ...]
     class_order: str = "pointcept"
+    kind: ClassVar[str] = "s3dis"
     dataset: ClassVar[str] = "S3DIS"
 
     def describe(self) -> Record:
         """Return the kind and what else decides results."""
-        return self.changed_settings(kind="s3dis", class_order=self.class_order)
+        return super().describe() | {"class_order": self.class_order}
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -298,9 +299,7 @@ class ScanNetSource(CloudSource):
     :func:`torchrg.datasets.write_pointcept_scene` does.
     """
 
-    def describe(self) -> Record:
-        """Return the kind and what else decides results."""
-        return self.changed_settings(kind="scannet")
+    kind: ClassVar[str] = "scannet"
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""

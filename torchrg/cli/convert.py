@@ -19,6 +19,7 @@ from torchrg.batch.run import (
     list_jobs,
     lock_folder,
     make_plan,
+    run_plan,
     write_report,
 )
 from torchrg.batch.scans import Job, Source, mark_of
@@ -33,7 +34,7 @@ from torchrg.batch.sources import (
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.loop import finish, run_with_bar, tell_failure
+from torchrg.cli.loop import Progress, tell_failure
 from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
@@ -345,9 +346,13 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
         from torchrg.batch.ray_tasks import run_ray
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
-    report = run_with_bar(
-        plan, reports, engine=arguments.engine, workers=workers, unit=arguments.unit
-    )
+    by_frames = arguments.unit == "frame"
+    sizes = {job.name: 1 if by_frames else job.scan.num_points for job in jobs}
+    bar_unit, total = "frame" if by_frames else "pt", sum(sizes.values())
+    # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
+    with tqdm(total=total, unit=bar_unit, unit_scale=True, smoothing=0, disable=None) as bar:
+        shown = Progress(bar, sizes, unit=arguments.unit)
+        report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     code = _finish(report, out, unit=arguments.unit)
     if isinstance(source := plan.jobs[0].source, CloudSource) and not report.disk_full:
         source.write_lists(out, mark_of(REPORT))
@@ -387,11 +392,17 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
             raise
         console.warn(str(error))
     state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
-    more = f"{state}, {out / REPORT} says more."
-    code = finish(report, out, unit="scan", failed=more)
-    if code == 0:
-        console.say(f"{state} -> {out}")
-    return code
+    again = "The same command goes on from here."
+    if report.disk_full:
+        told = f"{out}: the disk is full; {state}. Make room. {again}"
+        return console.fail(told, code=console.SOME_FAILED)
+    if report.interrupted:
+        return console.fail(f"interrupted; {state}. {again}", code=console.INTERRUPTED)
+    if len(report.complete) < len(report.scans):
+        told = f"{state}, {out / REPORT} says more."
+        return console.fail(told, code=console.SOME_FAILED)
+    console.say(f"{state} -> {out}")
+    return 0
 
 
 def format_plan(plan: Plan) -> str:

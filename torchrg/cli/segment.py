@@ -80,8 +80,8 @@ class Arguments:
     """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
     inputs a directory of pictures."""
     pages: bool = False
-    """Write a page for the browser beside each picture in the directory of --picture, and
-    index.html, in which each picture links to its page (pip install 'torchrg[view]')."""
+    """Write a page for the browser beside each picture, and index.html, in which each picture links
+    to its page; --picture is a directory then (pip install 'torchrg[view]')."""
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
