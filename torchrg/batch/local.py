@@ -11,7 +11,6 @@ from pathlib import Path
 from threading import Thread
 
 from torchrg._parallel import CHILD_ENVIRONMENT
-from torchrg.batch.memory import spare_memory
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
@@ -23,7 +22,7 @@ _LONGEST_CAUSE = 300
 """Characters, some lines of a terminal, that a report shows of what a process said last."""
 
 
-def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int | None = None) -> Reports:
+def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Reports:
     """Convert scans in processes of this machine, those that take most memory first.
 
     A scan starts when a worker is free and all that run stay within the limit; one that takes more
@@ -34,14 +33,12 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int | None = N
     Args:
         jobs: The scans to convert.
         workers: Most processes at a time.
-        memory_limit: Bytes that the scans that run may take together. Default: a share of what is
-            free, see :func:`torchrg.batch.memory.spare_memory`.
+        memory_limit: Bytes that the scans that run may take together.
 
     Yields:
         A report of each scan when it ends, and None while there is none, so that progress can be
         shown. Closing the iterator stops the workers.
     """
-    limit = spare_memory() if memory_limit is None else memory_limit
     waiting = sorted(jobs, key=lambda job: -job.memory)
     lost: list[Job] = []
     idle: list[_Worker] = []
@@ -55,7 +52,7 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int | None = N
     try:
         while waiting or lost or busy:
             while len(busy) < workers:
-                free = limit - sum(worker.job.memory for worker in busy.values())
+                free = memory_limit - sum(worker.job.memory for worker in busy.values())
                 fitting = (job for job in waiting if job.memory <= free or not busy)
                 job = next(fitting, None)
                 if job is None:
