@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchrg.batch.scans import Job, Scan
-from torchrg.batch.task import Converted
+from torchrg.batch.task import TaskReport
 from torchrg.config import PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
@@ -47,7 +47,8 @@ class FaultySource:
                 time.sleep(60)
         with (self.root.parent / "log").open("a") as log:
             log.write(f"{scan.name} done\n")
-        return Converted(scan.num_points, 1, ("result.txt",), warnings=(f"was {behavior}",))
+        notes, files = (f"was {behavior}",), ("result.txt",)
+        return TaskReport(scan.name, "converted", scan.num_points, 1, files, warnings=notes)
 
 
 def act(behavior, once):

@@ -1,13 +1,11 @@
 """Every scan has a place of its own for its results, or the command ends before it begins."""
 
 import unicodedata
-from functools import partial
 
 import numpy as np
 import pytest
 
-from torchrg.batch.lock import DirectoryLock
-from torchrg.batch.run import list_jobs
+from torchrg.batch.run import list_jobs, lock_folder
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource
 from torchrg.cli import main
@@ -126,9 +124,9 @@ def test_a_second_command_does_not_write_into_the_files_of_a_layout(
     root, tmp_path, capsys, monkeypatch
 ):
     save(root, "hall.npy")
-    monkeypatch.setattr("torchrg.cli.segment.DirectoryLock", partial(DirectoryLock, patience=0))
+    monkeypatch.setattr("torchrg.batch.run.PATIENCE_SECONDS", 0)
     command = ["segment", str(root / "hall.npy"), "--out", str(tmp_path), "--preset", "classic"]
-    with DirectoryLock(tmp_path):
+    with lock_folder(tmp_path):
         assert main([*command, "--layout", "npy"]) == 2
         assert "another torchrg command" in capsys.readouterr().err
         assert not (tmp_path / "superpoints").exists()

@@ -3,15 +3,13 @@
 import os
 import random
 import shutil
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
 from tests.batch.power import Disk, PowerCutError
-from torchrg.batch.lock import DirectoryLock
-from torchrg.batch.run import list_jobs, make_plan
+from torchrg.batch.run import list_jobs, lock_folder, make_plan
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
@@ -26,8 +24,8 @@ def convert(root):
     out = root / "out"
     out.mkdir(exist_ok=True)
     jobs = list_jobs(FolderSource(root / "rooms", load_config("classic"), out), out)
-    with DirectoryLock(out) as lock:
-        for job in make_plan([replace(job, mark=lock.mark) for job in jobs]).to_convert:
+    with lock_folder(out):
+        for job in make_plan(jobs).to_convert:
             assert convert_scan(job).status == "converted"
     (out / ".torchrg.lock").unlink()
 

@@ -1,16 +1,8 @@
 """``torchrg depth``: planes of depth images and of organised clouds."""
 
-import contextlib
-import hashlib
 import json
-import os
-import random
-import re
-import signal
+import shutil
 import struct
-import subprocess
-import sys
-import time
 
 import kornia_rs
 import numpy as np
@@ -18,10 +10,7 @@ import pytest
 import torch
 
 from torchrg import _compile
-from torchrg.batch.lock import DirectoryLock
-from torchrg.batch.scans import Scan
 from torchrg.cli import main
-from torchrg.cli.depth import FrameJob
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
@@ -138,162 +127,49 @@ def test_several_images_go_into_a_folder(tmp_path, frame):
     assert sorted(path.name for path in out.iterdir()) == names
 
 
-@pytest.fixture
-def sequence(tmp_path, depth):
-    """A folder of four frames that differ, the third of them damaged, and a file that is none."""
-    folder = tmp_path / "sequence"
+def test_a_damaged_image_stops_no_other(tmp_path, frame, depth, capsys):
+    folder, out = tmp_path / "images", tmp_path / "out"
     folder.mkdir()
-    for number in (1, 2, 3, 10):
-        write_png(folder / f"{number}.png", (depth * (1000 + number)).round().int())
-    damaged = (folder / "3.png").read_bytes()
-    (folder / "3.png").write_bytes(damaged[: len(damaged) // 2])
-    (folder / "notes.txt").write_text("a desk")
-    return folder
+    for name in ("1.png", "3.png"):
+        (folder / name).write_bytes(frame.read_bytes())
+    (folder / "2.png").write_bytes(frame.read_bytes()[:90])
+    inputs = [str(folder / f"{number}.png") for number in (1, 2, 3)]
+    assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 3
+    told = capsys.readouterr()
+    damaged, sums = told.err.splitlines()
+    assert damaged.startswith(f"torchrg: {inputs[1]}: ")
+    assert damaged.count("2.png") == 1
+    assert sums == "torchrg: 1 of 3 inputs failed, the others are written."
+    assert told.out.count(" 2 planes, ") == 2
+    assert len(contents(out)) == 4
 
 
 def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_damaged_frame_of_a_sequence_stops_no_other(tmp_path, sequence, capsys):
-    out = tmp_path / "out"
-    assert main(["depth", str(sequence), *CAMERA, "--out", str(out)]) == 3
-    told = capsys.readouterr()
-    damaged, sums = told.err.splitlines()
-    assert damaged.startswith(f"torchrg: {sequence / '3.png'}: ")
-    assert damaged.count("3.png") == 1
-    assert sums == "torchrg: 1 of 4 inputs failed, the others are written."
-    speed = r"[\d.]+ s, [\d.]+ frames a second"
-    assert re.fullmatch(rf"3 of 4 frames, 6 planes, {speed} -> {out}\n", told.out)
-    for number in (1, 2, 10):
-        alone = tmp_path / "alone.png"
-        assert main(["depth", str(sequence / f"{number}.png"), *CAMERA, "--out", str(alone)]) == 0
-        assert contents(out)[f"{number}.png"] == alone.read_bytes()
-    assert len(contents(out)) == 6
+def test_a_folder_is_refused_with_the_command_for_it(tmp_path, frame, capsys):
+    assert main(["depth", str(tmp_path), *CAMERA, "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"got a folder; use: torchrg convert rgbd {tmp_path} OUT --intrinsics" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]
 
 
-@pytest.mark.slow
-def test_processes_side_by_side_write_the_same_bytes(tmp_path, sequence):
-    results = []
-    for workers in ("1", "2", "3"):
-        out = tmp_path / workers
-        command = [sys.executable, "-m", "torchrg", "depth", str(sequence), *CAMERA, "--out", out]
-        ended = subprocess.run([*command, "--workers", workers], check=False, capture_output=True)
-        assert ended.returncode == 3
-        assert ended.stderr.count(b"\n") == 2
-        results.append(contents(out))
-    assert len(results[0]) == 6
-    assert results[0] == results[1] == results[2]
-
-
-def written(folder):
-    """Return when each file was written."""
-    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
-
-
-def test_frames_that_are_done_are_not_done_again(tmp_path, sequence, frame, capsys):
-    out = tmp_path / "out"
-    command = ["depth", str(sequence), *CAMERA, "--out", str(out)]
-    assert main(command) == 3
-    before = written(out)
-    (sequence / "3.png").write_bytes(frame.read_bytes())
-    assert main(command) == 0
-    assert "4 of 4 frames, 8 planes" in capsys.readouterr().out
-    after = written(out)
-    assert after.keys() - before.keys() == {"3.png", "3_planes.png"}
-    assert before.items() <= after.items()
-    # An input, a result, a picture and a setting that are others than the labels say.
-    first = contents(out)
-    (sequence / "1.png").write_bytes(frame.read_bytes())
-    pixels = kornia_rs.io.read_image_png_u16(str(out / "2.png"), "mono")
-    kornia_rs.io.write_image_png_u16(str(out / "2.png"), pixels, "mono")
-    (out / "10_planes.png").unlink()
-    before = written(out)
-    assert main(command) == 0
-    changed = dict(written(out).items() - before.items())
-    assert {name.partition(".")[0].removesuffix("_planes") for name in changed} == {"1", "2", "10"}
-    assert contents(out).items() - first.items() == {("1.png", contents(out)["1.png"])}
-    assert main([*command, "--depth.min-size", "99"]) == 0
-    assert not written(out).items() & before.items()
-
-
-def test_labels_hold_what_they_were_made_from_and_stay_an_image(tmp_path, frame, depth):
-    images = pytest.importorskip("PIL.Image")
-    out = tmp_path / "labels.png"
-    assert main(["depth", str(frame), *CAMERA, "--out", str(out)]) == 0
-    with images.open(out) as image:
-        image.load()
-        record = json.loads(image.text["torchrg"])
-        labels = np.asarray(image).astype(int) - 1
-    np.testing.assert_array_equal(labels, segment_depth(depth, INTRINSICS).labels)
-    assert record["inputs"][0]["name"] == "frame.png"
-    assert record["inputs"][0]["sha256"] == hashlib.sha256(frame.read_bytes()).hexdigest()
-    assert record["config"]["min_size"] == 100
-    assert record["source"]["intrinsics"] == [50, 50, 39.5, 29.5]
-    assert str(tmp_path) not in json.dumps(record)
-
-
-@pytest.mark.slow
-def test_a_killed_sequence_goes_on_and_leaves_nothing_unfinished(tmp_path, depth):
-    folder, out, chance = tmp_path / "in", tmp_path / "out", random.Random(0)
-    folder.mkdir()
-    for number in range(40):
-        write_png(folder / f"{number}.png", (depth * (1000 + number)).round().int())
-    command = [sys.executable, "-m", "torchrg", "depth", str(folder), *CAMERA, "--workers", "2"]
-    begin = time.monotonic()
-    subprocess.run([*command, "--out", str(tmp_path / "whole")], check=True)
-    seconds, expected = time.monotonic() - begin, contents(tmp_path / "whole")
-    for _ in range(3):
-        process = subprocess.Popen([*command, "--out", str(out)], start_new_session=True)
-        time.sleep(chance.uniform(0.3, 1) * seconds)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        if out.is_dir():
-            found = {name: what for name, what in contents(out).items() if name[0] != "."}
-            assert {name: expected[name] for name in found}.keys() == found.keys()
-    subprocess.run([*command, "--out", str(out)], check=True)
-    assert contents(out) == expected
-
-
-def test_results_that_would_replace_an_image_are_refused(tmp_path, sequence, frame, capsys):
-    write_png(sequence / "1_planes.png", torch.ones(4, 4).int())
-    before = contents(sequence)
-    empty = tmp_path / "empty"
-    empty.mkdir()
+def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, capsys):
+    other = tmp_path / "frame_planes.png"
+    other.write_bytes(frame.read_bytes())
+    before = contents(tmp_path)
     for inputs, out, message in (
-        (sequence, sequence, "expected a place of its own for each result"),
-        (sequence, tmp_path / "out", "1_planes.png: expected a place of its own"),
-        (frame, frame, "frame.png: expected a place of its own"),
-        (empty, tmp_path / "out", "expected images (.png .npy .pcd) in the folder, got none"),
+        ([frame, other], tmp_path, "expected a place of its own for each result"),
+        ([frame], frame, "frame.png: expected a place of its own"),
+        ([frame, other], tmp_path / "out", "frame_planes.png: expected a place of its own"),
     ):
-        assert main(["depth", str(inputs), *CAMERA, "--out", str(out)]) == 2
+        assert main(["depth", *map(str, inputs), *CAMERA, "--out", str(out)]) == 2
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
-    assert contents(sequence) == before
-
-
-def test_what_a_killed_process_was_writing_goes_and_nothing_else(tmp_path):
-    scan = Scan("1", (tmp_path / "1.npy",), 0)
-    place = {"target": tmp_path / "1.png", "picture": tmp_path / "1_planes.png"}
-    frame = FrameJob(None, scan, tmp_path, **place)
-    theirs = (".1.0123abcd.png", ".1.0123456789abcdef01234567.png", "1.png", "1_planes.png")
-    for name in (*theirs, f".1.{frame.mark}01234567.png", f".1_planes.{frame.mark}01234567.png"):
-        (tmp_path / name).touch()
-    frame.clean()
-    assert sorted(contents(tmp_path)) == sorted(theirs)
-
-
-def test_what_a_killed_sequence_was_writing_goes_when_it_goes_on(tmp_path, sequence):
-    out = tmp_path / "out"
-    out.mkdir()
-    with DirectoryLock(out) as lock:
-        left = out / f".10_planes.{lock.mark_of('10.png')}01234567.png"
-    for path in (left, out / ".10_planes.0123abcd.png"):
-        path.touch()
-    assert main(["depth", str(sequence), *CAMERA, "--out", str(out)]) == 3
-    assert [name for name in contents(out) if name[0] == "."] == [".10_planes.0123abcd.png"]
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    assert contents(tmp_path) == before
 
 
 def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
@@ -311,7 +187,6 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
             [str(frame), *CAMERA[:4], "--threads", "0", *out],
             "expected --threads from 1 to 1,024, got 0",
         ),
-        ([str(frame), *CAMERA, "--workers", "0", *out], "expected --workers >= 1, got 0"),
         ([str(tmp_path / "list.pcd"), *out], "expected an organised cloud"),
         ([str(tmp_path / "turned.pcd"), *out], "expected points of a pinhole camera"),
     ):

@@ -14,29 +14,25 @@ MODULES = ("json", "numpy", "pickle", "random", "select", "torch")
 """Of the standard library and of others, loaded by interpreters, libraries or Ray as they start."""
 SEGMENT = ("segment", "a.npy", "--out", "../o.npz", "--preset", "classic")
 CONVERT = ("convert", "folder", "../in", "../out", "--preset", "classic", "--workers", "2")
-CAMERA = ("--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1")
 COMMAND = """
 import sys
 from torchrg.__main__ import main
-from torchrg.cli import segment
 if __name__ == "__main__":
-    segment.choose_workers = lambda *sizes: 2
     sys.exit(main())
 """
-"""As the installed command, a file in a folder of its own; small clouds have processes too."""
+"""As the installed command, a file in a folder of its own."""
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder of two scans and two depth images, with modules that say when they are run."""
+    """A folder of two scans, with modules that say when they are run."""
     for name in ("in", "here"):
         (tmp_path / name).mkdir()
     for seed, name in enumerate("ab"):
-        points = make_room(num_points=40_000, noise=0.003, seed=seed).points
-        np.save(tmp_path / "in" / f"{name}.npy", points[:2000])
-        np.save(tmp_path / "here" / f"{name}.npy", points)
-        np.save(tmp_path / "here" / f"depth_{name}.npy", np.full((60, 80), 2.0, np.float32))
+        points = make_room(num_points=2_000, noise=0.003, seed=seed).points
+        for folder in ("in", "here"):
+            np.save(tmp_path / folder / f"{name}.npy", points)
     for name in MODULES:
         text = f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})"
         (tmp_path / "here" / f"{name}.py").write_text(text)
@@ -47,19 +43,10 @@ def folder(tmp_path):
     "arguments",
     [
         CONVERT,
-        pytest.param(
-            ("depth", "depth_a.npy", "depth_b.npy", *CAMERA, "--out", "../out", "--workers", "2"),
-            marks=pytest.mark.slow,
-        ),
-        pytest.param((*SEGMENT, "--limit-memory", "0.542"), marks=pytest.mark.slow),
         pytest.param((*SEGMENT, "--compile"), marks=pytest.mark.slow),
         pytest.param((*CONVERT, "--engine", "ray"), marks=[pytest.mark.slow, needs_ray]),
-        pytest.param(
-            (*SEGMENT, "--limit-memory", "0.542", "--engine", "ray"),
-            marks=[pytest.mark.slow, needs_ray],
-        ),
     ],
-    ids=["workers", "frames", "tiles", "compile", "ray", "tiles of ray"],
+    ids=["workers", "compile", "ray"],
 )
 def test_no_module_beside_the_scans_is_run(folder, arguments):
     command = folder.parent / "bin" / "command"
@@ -74,8 +61,6 @@ def test_no_module_beside_the_scans_is_run(folder, arguments):
     )
     assert done.returncode == 0, done.stderr
     assert not (folder.parent / "ran").exists(), (folder.parent / "ran").read_text()
-    if "--limit-memory" in arguments:
-        assert "in tiles of" in done.stdout
     if "--compile" in arguments:
         assert done.stderr == ""
 
@@ -83,5 +68,5 @@ def test_no_module_beside_the_scans_is_run(folder, arguments):
 def test_the_module_called_as_a_command_runs_none_of_them(folder):
     command = [sys.executable, "-m", "torchrg", "info", "a.npy"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert "40,000 of float32" in done.stdout, done.stderr
+    assert "2,000 of float32" in done.stdout, done.stderr
     assert not (folder.parent / "ran").exists(), (folder.parent / "ran").read_text()

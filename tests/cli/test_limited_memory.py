@@ -90,7 +90,7 @@ def test_what_cannot_be_done_is_one_line(rooms, tmp_path, capsys, flags, message
 
 def test_a_full_disk_is_said_before_the_work(rooms, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("torchrg.io.files.free_space", lambda folder: 1000)
-    monkeypatch.setattr(segment, "segment_planes", None)
+    monkeypatch.setattr(segment, "segment_cloud", None)
     assert run(rooms / "b.npz", "--out", tmp_path / "x.npz", "--limit-memory", LIMIT) == 2
     error = capsys.readouterr().err
     assert re.search(r"expected [\d.]+ MB of free disk for the work, got 0\.0 MB", error)

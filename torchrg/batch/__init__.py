@@ -1,12 +1,11 @@
 """Whole data sets: many scans, on one machine or on a cluster, and a record of each.
 
 A source (:class:`~torchrg.batch.sources.FolderSource`, :class:`~torchrg.batch.sources.S3DISSource`,
-:class:`~torchrg.batch.sources.RGBDSource`, or a :class:`~torchrg.batch.scans.Source` of your own)
-lists scans and converts one of them. :func:`~torchrg.batch.run.list_jobs` makes jobs of them,
+:class:`~torchrg.batch.sources.RGBDSource`, or a :class:`~torchrg.batch.sources.CloudSource` of your
+own) lists scans and reads one of them. :func:`~torchrg.batch.run.list_jobs` makes jobs of them,
 :func:`~torchrg.batch.run.make_plan` finds those that are not done,
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
-:func:`~torchrg.batch.run.run_plan` collects what becomes of them. To these engines a scan and a
-depth frame are a :class:`~torchrg.batch.task.Task` each, and nothing else.
+:func:`~torchrg.batch.run.run_plan` collects what becomes of them.
 
 Example:
     >>> import tempfile

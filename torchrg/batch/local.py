@@ -11,77 +11,56 @@ from pathlib import Path
 from threading import Thread
 
 from torchrg._parallel import CHILD_ENVIRONMENT
-from torchrg.batch.lock import DirectoryLock
-from torchrg.batch.memory import spare_memory
-from torchrg.batch.task import Reports, Task, TaskReport
+from torchrg.batch.scans import Job, convert_scan
+from torchrg.batch.task import Reports, TaskReport
 
 BEAT_SECONDS = 0.5
-"""How often an engine yields while no task ends, so that progress is shown and Ctrl-C is heard."""
+"""How often an engine yields while no scan ends, so that progress is shown and Ctrl-C is heard."""
 _STDERR = 2
 """Number of the stream for errors, of every process."""
 _LONGEST_CAUSE = 300
 """Characters, some lines of a terminal, that a report shows of what a process said last."""
 
 
-def run_here(tasks: Sequence[Task]) -> Reports:
-    """Run tasks one after the other in this process, on its threads; yield a report of each.
+def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Reports:
+    """Convert scans in processes of this machine, those that take most memory first.
 
-    While one runs, the system is asked to read the files of the next one.
-    """
-    for number, task in enumerate(tasks):
-        for following in tasks[number + 1 : number + 2]:
-            read_ahead(following.inputs)
-        yield task.run()
-
-
-def run_local(
-    tasks: Sequence[Task],
-    *,
-    workers: int,
-    memory_limit: int | None = None,
-    lock: DirectoryLock | None = None,
-) -> Reports:
-    """Run tasks in processes of this machine, those that take most memory first.
-
-    A task starts when a worker is free and all that run stay within the limit; one that takes more
-    than the limit runs alone. When a worker dies, its task waits until all others are done and is
-    tried once more, alone. Workers end with this process, however it ends. While tasks run, the
-    system is asked to read the files of the next ones.
+    A scan starts when a worker is free and all that run stay within the limit; one that takes more
+    than the limit runs alone. When a worker dies, its scan waits until all others are done and is
+    tried once more, alone. Workers end with this process, however it ends. While scans are
+    converted, the system is asked to read the files of the next ones.
 
     Args:
-        tasks: The tasks.
+        jobs: The scans to convert.
         workers: Most processes at a time.
-        memory_limit: Bytes that the tasks that run may take together. Default: a share of what is
-            free, see :func:`torchrg.batch.memory.spare_memory`.
-        lock: A lock for the workers to hold as long as they live.
+        memory_limit: Bytes that the scans that run may take together.
 
     Yields:
-        A report of each task when it ends, and None while there is none, so that progress can be
+        A report of each scan when it ends, and None while there is none, so that progress can be
         shown. Closing the iterator stops the workers.
     """
-    limit = spare_memory() if memory_limit is None else memory_limit
-    waiting = sorted(tasks, key=lambda task: -task.memory)
-    lost: list[Task] = []
+    waiting = sorted(jobs, key=lambda job: -job.memory)
+    lost: list[Job] = []
     idle: list[_Worker] = []
     busy: dict[Connection, _Worker] = {}
 
-    def start(task: Task, *, attempt: int) -> None:
-        worker = idle.pop() if idle else _Worker(lock)
+    def start(job: Job, *, attempt: int) -> None:
+        worker = idle.pop() if idle else _Worker()
         busy[worker.pipe] = worker
-        worker.begin(task, attempt=attempt)
+        worker.begin(job, attempt=attempt)
 
     try:
         while waiting or lost or busy:
             while len(busy) < workers:
-                free = limit - sum(worker.task.memory for worker in busy.values())
-                fitting = (task for task in waiting if task.memory <= free or not busy)
-                task = next(fitting, None)
-                if task is None:
+                free = memory_limit - sum(worker.job.memory for worker in busy.values())
+                fitting = (job for job in waiting if job.memory <= free or not busy)
+                job = next(fitting, None)
+                if job is None:
                     break
-                waiting.remove(task)
-                start(task, attempt=1)
+                waiting.remove(job)
+                start(job, attempt=1)
                 for following in waiting[workers - 1 : workers]:
-                    read_ahead(following.inputs)
+                    read_ahead(following.scan.inputs)
             if not busy:
                 start(lost.pop(0), attempt=2)
             ready = connection.wait(busy, timeout=BEAT_SECONDS)
@@ -94,7 +73,7 @@ def run_local(
                     idle.append(worker)
                     yield report
                 elif worker.attempt == 1:
-                    lost.append(worker.task)
+                    lost.append(worker.job)
                 else:
                     yield worker.death_report()
     finally:
@@ -113,28 +92,28 @@ def read_ahead(files: Sequence[Path]) -> None:
 
 
 class _Worker:
-    """A process that runs one task after another, and the pipe to it."""
+    """A process that converts one scan after another, and the pipe to it."""
 
-    task: Task
+    job: Job
     attempt: int
 
-    def __init__(self, lock: DirectoryLock | None) -> None:
+    def __init__(self) -> None:
         context = get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        # What ends it before its first task is a line of a report, no traceback on the terminal.
+        # What ends it before its first scan is a line of a report, no traceback on the terminal.
         self.errors, errors = os.pipe()
         with _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
-            self.process = context.Process(target=_serve, args=(theirs, lock, stderr))
+            self.process = context.Process(target=_serve, args=(theirs, stderr))
             self.process.start()
         os.close(errors)
         theirs.close()
 
-    def begin(self, task: Task, *, attempt: int) -> None:
-        """Hand over a task."""
-        self.task, self.attempt = task, attempt
+    def begin(self, job: Job, *, attempt: int) -> None:
+        """Hand over a scan."""
+        self.job, self.attempt = job, attempt
         # A worker that is dead already is noticed when its answer is collected.
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.pipe.send(task)
+            self.pipe.send(job)
 
     def collect(self) -> TaskReport | None:
         """Return the report that is ready, or None if the process died instead."""
@@ -146,7 +125,7 @@ class _Worker:
         return replace(report, attempts=self.attempt)
 
     def death_report(self) -> TaskReport:
-        """Return the report of a task whose worker died."""
+        """Return the report of a scan whose worker died."""
         code = self.process.exitcode or 0
         end = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
         reason = f"its process {end}, twice, the second time alone"
@@ -154,10 +133,10 @@ class _Worker:
             reason = f"{reason}: {cause}"
         if code == -signal.SIGKILL or cause.startswith("MemoryError"):
             reason = f"{reason}; is the memory enough?"
-        return TaskReport(self.task.name, "failed", reason=reason, attempts=self.attempt)
+        return TaskReport(self.job.name, "failed", reason=reason, attempts=self.attempt)
 
     def _cause(self) -> str:
-        """Return what the process said last before its first task, in one line, or nothing."""
+        """Return what the process said last before its first scan, in one line, or nothing."""
         lines = self.said.decode(errors="replace").splitlines()
         # A message goes on in lines that are set in; before it is the traceback.
         begins = [number for number, line in enumerate(lines) if line[:1].strip()]
@@ -174,29 +153,26 @@ class _Worker:
         os.set_blocking(self.errors, False)
         with os.fdopen(self.errors, "rb") as errors:
             self.said = errors.read() or b""
-        if hasattr(self, "task"):
-            self.task.clean()
+        if hasattr(self, "job"):
+            self.job.clean()
 
 
-def _serve(pipe: Connection, lock: DirectoryLock | None, stderr: Connection | None) -> None:
-    """Run tasks until the pipe closes; the lock is held by being here.
-
-    ``stderr`` is where errors go from the first task on.
-    """
+def _serve(pipe: Connection, stderr: Connection | None) -> None:
+    """Convert scans until the pipe closes; from the first on errors go to ``stderr``."""
     import torch
 
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     while True:
         try:
-            task = pipe.recv()
+            job = pipe.recv()
         except EOFError:
             return
         if stderr is not None:
             os.dup2(stderr.fileno(), _STDERR)
             stderr.close()
             stderr = None
-        pipe.send(task.run())
+        pipe.send(convert_scan(job))
 
 
 def _end_with_parent() -> None:

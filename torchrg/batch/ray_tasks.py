@@ -7,7 +7,8 @@ from typing import Any
 from torchrg._optional import require
 from torchrg._parallel import CHILD_ENVIRONMENT
 from torchrg.batch.local import BEAT_SECONDS
-from torchrg.batch.task import Reports, Task, TaskReport
+from torchrg.batch.scans import Job, convert_scan
+from torchrg.batch.task import Reports, TaskReport
 
 _RETRIES = 3
 """How often Ray tries a task again whose process or node was lost."""
@@ -16,27 +17,27 @@ _OBJECT_STORE_BYTES = 100_000_000
 
 
 def run_ray(
-    tasks: Sequence[Task],
+    jobs: Sequence[Job],
     *,
     workers: int | None = None,
     memory_limit: int,
     address: str | None = None,
 ) -> Reports:
-    """Run tasks on Ray, those that take most memory first.
+    """Convert scans on Ray, those that take most memory first.
 
     Each asks for one CPU and the memory that it takes, at most what the largest node has, and Ray
     finds it a place. Inputs and outputs are files that every node sees
     under the same path, and torchrg is installed on each.
 
     Args:
-        tasks: The tasks.
-        workers: Most tasks at a time. Default: as many as Ray has places for.
+        jobs: The scans to convert.
+        workers: Most scans at a time. Default: as many as Ray has places for.
         memory_limit: Memory of a cluster that is started here, in bytes.
         address: Cluster to use. Default: one is started here, and stopped at the end.
 
     Yields:
-        A report of each task when it ends, and None while there is none. Closing the iterator
-        cancels the tasks.
+        A report of each scan when it ends, and None while there is none. Closing the iterator
+        cancels what is not done.
 
     Raises:
         MissingDependencyError: If Ray is not installed.
@@ -57,17 +58,17 @@ def run_ray(
             runtime_env={"env_vars": CHILD_ENVIRONMENT},
             **({} if address else started),
         )
-    pending: dict[Any, Task] = {}
+    pending: dict[Any, Job] = {}
     try:
         largest = max(
             int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]
         )
         run = ray.remote(num_cpus=1, max_retries=_RETRIES)(_run)
-        waiting = sorted(tasks, key=lambda task: task.memory)
+        waiting = sorted(jobs, key=lambda job: job.memory)
         while waiting or pending:
             while waiting and (workers is None or len(pending) < workers):
-                task = waiting.pop()
-                pending[run.options(memory=min(task.memory, largest)).remote(task)] = task
+                job = waiting.pop()
+                pending[run.options(memory=min(job.memory, largest)).remote(job)] = job
             ready, _ = ray.wait(list(pending), num_returns=1, timeout=BEAT_SECONDS)
             if not ready:
                 yield None
@@ -79,20 +80,20 @@ def run_ray(
         ray.shutdown()
 
 
-def _run(task: Task) -> TaskReport:
-    """Run a task in one thread."""
+def _run(job: Job) -> TaskReport:
+    """Convert a scan in one thread."""
     import torch
 
     torch.set_num_threads(1)
-    return task.run()
+    return convert_scan(job)
 
 
-def _collect(ray: Any, reference: Any, task: Task) -> TaskReport:  # noqa: ANN401
-    """Return the report of a task, of its loss if Ray could not finish it."""
+def _collect(ray: Any, reference: Any, job: Job) -> TaskReport:  # noqa: ANN401
+    """Return the report of a scan, of its loss if Ray could not finish it."""
     try:
         report: TaskReport = ray.get(reference)
     except ray.exceptions.RayError as error:
-        task.clean()
+        job.clean()
         text = " ".join(str(error).split())
-        return TaskReport(task.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
+        return TaskReport(job.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
     return report

@@ -4,15 +4,16 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from torchrg.batch.lock import LOCK
-from torchrg.batch.records import describe_versions, read_record, reason_to_convert
+import filelock
+
+from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
 from torchrg.batch.scans import Job, Scan, Source
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.datasets.folder import folded_name
@@ -22,8 +23,47 @@ from torchrg.io.files import check_space
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
-_STAGES = ("hash", "read", "neighbors", "normals", "regions", "planes", "write", "record")
-"""Stages in the order in which a report tells them, before those that only some sources have."""
+LOCK = ".torchrg.lock"
+"""Name of the file in the output directory that is locked; it stays there, empty."""
+PATIENCE_SECONDS = 5.0
+"""Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Have the right to write into a directory, which one command has at a time.
+
+    The lock is the operating system's own, which goes with the process however that ends; the
+    workers of a command end with it. Over a network it holds where the file system passes it on:
+    see the package filelock.
+
+    Args:
+        folder: The directory; it exists.
+
+    Raises:
+        FormatError: If another command has the right, or the file of the lock cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, lock_folder(Path(folder)):
+        ...     print("nobody else writes here")
+        nobody else writes here
+    """
+    lock = filelock.FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=PATIENCE_SECONDS)
+    except filelock.Timeout:
+        raise FormatError(
+            f"{folder}: another torchrg command writes here; wait for it, stop it, or choose "
+            "another directory."
+        ) from None
+    except (OSError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FormatError(f"{folder / LOCK}: cannot be locked: {reason}.") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class Plan(NamedTuple):
@@ -185,16 +225,14 @@ class BatchReport:
         for scan in self.with_status("converted"):
             for stage, seconds in scan.seconds.items():
                 total[stage] = total.get(stage, 0.0) + seconds
-        return {
-            stage: total[stage] for stage in dict.fromkeys((*_STAGES, *total)) if stage in total
-        }
+        return total
 
     @property
     def num_points(self) -> int:
         """Points converted now."""
         return sum(scan.num_points for scan in self.with_status("converted"))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Record:
         """Return the report as JSON can hold it."""
         points, stages = self.num_points, self.stage_seconds
         return {
@@ -220,55 +258,17 @@ class BatchReport:
 
 def _kept_report(job: Job) -> TaskReport:
     """Return the report of a task that an earlier run has done, from its record."""
-    record = read_record(job) or {}
+    record = read_record(job.folder) or {}
     return TaskReport(
         job.name,
         "kept",
         num_points=record.get("points", 0),
         num_regions=record.get("regions", 0),
+        files=tuple(record.get("outputs", ())),
         repairs=tuple(record.get("repairs", ())),
         warnings=tuple(record.get("warnings", ())),
         attempts=0,
     )
-
-
-def run_tasks(
-    names: Sequence[str],
-    reports: Reports,
-    *,
-    engine: str = "local",
-    workers: int | None = 1,
-    kept: Sequence[TaskReport] = (),
-    on_report: Callable[[TaskReport | None], None] = lambda report: None,
-) -> BatchReport:
-    """Run tasks on an engine until all have ended: the loop of every command with several inputs.
-
-    A full disk ends it, as every further task would fail after its work; so does an interrupt.
-
-    Args:
-        names: Those of all tasks, in the order of the report.
-        reports: Those of the engine at work, as tasks end, None in between.
-        engine: Which one, to be noted in the report.
-        workers: And how many tasks it runs at a time.
-        kept: Reports of the tasks that need not run.
-        on_report: Called with each report.
-    """
-    started, begin = time.time(), time.perf_counter()
-    found = {report.name: report for report in kept}
-    interrupted = False
-    try:
-        with contextlib.closing(reports):
-            for report in reports:
-                on_report(report)
-                if report is not None:
-                    found[report.name] = report
-                    if report.disk_full:
-                        break
-    except KeyboardInterrupt:
-        interrupted = True
-    scans = [found.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
-    seconds = time.perf_counter() - begin
-    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
 
 
 def run_plan(
@@ -279,13 +279,35 @@ def run_plan(
     workers: int | None,
     on_report: Callable[[TaskReport | None], None] = lambda report: None,
 ) -> BatchReport:
-    """Convert the scans of a plan that are not done; see :func:`run_tasks`.
+    """Convert the scans of a plan that are not done on an engine.
 
-    What is complete when it ends early stays, and the next run goes on from there.
+    A full disk ends it, as every further scan would fail after its work; so does an interrupt. What
+    is complete then stays, and the next run goes on from there.
+
+    Args:
+        plan: The plan.
+        reports: Those of the engine at work, as scans end, None in between.
+        engine: The name of the engine, to be noted in the report.
+        workers: How many scans it converts at a time.
+        on_report: Called with each report.
     """
-    kept = [_kept_report(job) for job in plan.done]
+    started, begin = time.time(), time.perf_counter()
+    by_name = {job.name: _kept_report(job) for job in plan.done}
+    interrupted = False
+    try:
+        with contextlib.closing(reports):
+            for report in reports:
+                on_report(report)
+                if report is not None:
+                    by_name[report.name] = report
+                    if report.disk_full:
+                        break
+    except KeyboardInterrupt:
+        interrupted = True
     names = [job.name for job in plan.jobs]
-    return run_tasks(names, reports, engine=engine, workers=workers, kept=kept, on_report=on_report)
+    scans = [by_name.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
+    seconds = time.perf_counter() - begin
+    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
 
 
 def write_report(out: Path, report: BatchReport) -> None:

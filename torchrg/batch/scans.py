@@ -1,8 +1,14 @@
-"""What a batch is made of: scans, where they come from, and the task of converting one of them."""
+"""What a batch is made of: scans, where they come from, and the task of converting one of them.
+
+The road of a cloud is :func:`check_finite`, :func:`segment_cloud` and :func:`write_scan`, for every
+source of clouds and for ``torchrg segment``.
+"""
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,23 +18,28 @@ from numpy.typing import NDArray
 from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.records import (
     RECORD,
+    Record,
     check_record,
     describe_work,
     is_unchanged,
     read_record,
     write_record,
 )
-from torchrg.batch.task import Converted, TaskReport, report_on
-from torchrg.datasets.pointcept import write_arrays
+from torchrg.batch.task import Begin, TaskReport, report_on
+from torchrg.config import DepthConfig, PipelineConfig, SuperpointsConfig
+from torchrg.datasets.folder import folded_name
+from torchrg.datasets.layouts import LayoutScan, split_name, stem_of, write_layout
+from torchrg.datasets.pointcept import write_arrays, write_pointcept_scene
 from torchrg.errors import FormatError
-from torchrg.io import CloudStream
-from torchrg.io.files import check_place, make_mark, marked_parts, remove_leftovers, sync_folder
-from torchrg.io.stream import Extent
+from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
+from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.result import describe_planes
-from torchrg.structures import FARTHEST, Cloud, Segmentation
+from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints
 
 _LOOKED_AT = 10_000
-"""Points, spread over a cloud or its first chunk, that tell where most of its points are."""
+"""Points, spread over a cloud, that tell where most of its points are."""
 _MIDDLE = (0.25, 0.75)
 """Quantiles of each coordinate between which the middle half of a cloud lies."""
 _FAR_OFF = 1000
@@ -53,10 +64,34 @@ class Scan:
     item: Any = None
 
 
-class Source(Protocol):
-    """A data set that can be converted: it lists its scans, and reads and writes one of them.
+@dataclass(frozen=True)
+class Reading:
+    """A cloud as a source reads it.
 
-    Sources travel to other processes, so they hold settings and paths but no open files.
+    Attributes:
+        cloud: The cloud; its field ``color``, if it has one, plays a part in superpoints.
+        arrays: What is written beside the results, by name. With ``coord`` among them it is a scene
+            in Pointcept's types, else the coordinates of the cloud are written as they are.
+        dataset: The data set whose classes and objects it has; see
+            :class:`torchrg.datasets.layouts.LayoutScan`.
+        objects: Its objects, likewise.
+        repairs: What was put right in the input, a line each.
+        notes: What a user should know, a line each.
+    """
+
+    cloud: Cloud
+    arrays: Mapping[str, Any]
+    dataset: str = "ScanNet"
+    objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
+    repairs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+class Source(Protocol):
+    """A data set that can be converted: it lists its scans, and converts one of them.
+
+    Sources travel to other processes, so they hold settings and paths but no open files. Those of
+    clouds only list and read: see :class:`torchrg.batch.sources.CloudSource`.
     """
 
     @property
@@ -68,20 +103,20 @@ class Source(Protocol):
         """Whether results may go into :attr:`root` itself."""
 
     @property
-    def settings(self) -> Any:  # noqa: ANN401
-        """A dataclass of settings of the segmentation."""
+    def settings(self) -> PipelineConfig | DepthConfig:
+        """Settings of the segmentation."""
 
     @property
     def bytes_per_point(self) -> int:
         """Space that the results of one point take, to see beforehand whether the disk has it."""
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Record:
         """Return the kind of the source and what else decides results, for JSON."""
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
 
-    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
+    def convert(self, scan: Scan, folder: Path, begin: Begin) -> TaskReport:
         """Read a scan, segment it, and write its results, each file whole or not at all.
 
         The folder exists; ``begin`` is to be called with the name of each stage when it starts.
@@ -90,21 +125,19 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Job:
-    """The task of converting one scan.
+    """The task of converting one scan, which any process can do.
+
+    It holds settings and paths but no open files.
 
     Attributes:
         source: The data set.
         scan: One of its scans.
         out: Where results go.
-        mark: Part of the names that results are written under before they have their own; see
-            :func:`torchrg.io.files.marked_parts`. What a killed process leaves is removed by those
-            who know it.
     """
 
     source: Source
     scan: Scan
     out: Path
-    mark: str = field(default_factory=make_mark, compare=False)
 
     @property
     def name(self) -> str:
@@ -113,41 +146,41 @@ class Job:
 
     @property
     def memory(self) -> int:
-        """What the scan takes at once."""
+        """Bytes that a process with this scan takes at most."""
         return memory_of_scan(self.scan.num_points)
 
     @property
-    def inputs(self) -> tuple[Path, ...]:
-        """The files of the scan."""
-        return self.scan.inputs
-
-    @property
     def folder(self) -> Path:
-        """Where the results of the scan go."""
+        """Where the results of the scan go, and the record of them."""
         return self.out / self.scan.name
 
     @property
-    def record(self) -> Path:
-        """Where the record of the results goes."""
-        return self.folder / RECORD
+    def mark(self) -> str:
+        """Mark of the names that results are written under before they have their own."""
+        return mark_of(self.scan.name)
 
-    def place_of(self, name: str) -> Path:
-        """Return where a result is that a record names."""
-        return self.folder / name
-
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Record:
         """Return what decides the results; see :func:`torchrg.batch.records.describe_work`."""
         source = self.source
-        return describe_work(source.settings, source.describe(), self.inputs, source.root)
-
-    def run(self) -> TaskReport:
-        """Convert the scan; what goes wrong with it is in the report."""
-        return convert_scan(self)
+        return describe_work(source.settings, source.describe(), self.scan.inputs, source.root)
 
     def clean(self) -> None:
         """Remove what a process that was killed left half-written."""
         if self.folder.is_dir():
             remove_leftovers(self.folder, self.mark)
+
+
+def mark_of(name: str) -> str:
+    """Return the mark of the files that are being written for a scan in an output directory.
+
+    It is the same in every run, so that each removes what one that was killed has left; see
+    :func:`torchrg.io.files.marked_parts`.
+
+    Example:
+        >>> mark_of("Area_1/office_1")
+        '65d1ec9889e61d51'
+    """
+    return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
 
 
 def convert_scan(job: Job) -> TaskReport:
@@ -158,7 +191,7 @@ def convert_scan(job: Job) -> TaskReport:
     """
     is_new = False
 
-    def convert(begin: Callable[[str], None]) -> Converted:
+    def convert(begin: Begin) -> TaskReport:
         nonlocal is_new
         begin("hash")
         description = job.describe()
@@ -168,19 +201,20 @@ def convert_scan(job: Job) -> TaskReport:
             sync_folder(folder.parent)
             if folder == job.out:
                 break
-        check_place(job.record)
-        check_record(job)
+        record = job.folder / RECORD
+        check_place(record)
+        check_record(job.folder)
         job.clean()
-        earlier = read_record(job) or {"outputs": {}}
-        job.record.unlink(missing_ok=True)
+        earlier = read_record(job.folder) or {"outputs": {}}
+        record.unlink(missing_ok=True)
         with marked_parts(job.mark):
-            converted = job.source.convert(job.scan, job.folder, begin)
+            report = job.source.convert(job.scan, job.folder, begin)
             begin("record")
-            for name in earlier["outputs"].keys() - set(converted.files):
-                if is_unchanged(job, name, earlier["outputs"][name]):
-                    job.place_of(name).unlink()
-            write_record(job, description, converted)
-        return converted
+            for name in earlier["outputs"].keys() - set(report.files):
+                if is_unchanged(job.folder, name, earlier["outputs"][name]):
+                    (job.folder / name).unlink()
+            write_record(job.folder, description, report)
+        return report
 
     report = report_on(job.name, convert)
     if report.status == "failed" and is_new:
@@ -189,7 +223,7 @@ def convert_scan(job: Job) -> TaskReport:
     return report
 
 
-def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
+def check_finite(cloud: Cloud) -> tuple[str, ...]:
     """Return warnings if points of a cloud are missing, far off, or have lost digits.
 
     Raises:
@@ -199,31 +233,161 @@ def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
         ('2 of 3 points are not finite or beyond 1e+12; they stay in place, unlabelled',)
     """
-    extent = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
-    num_points, num_bad = extent.num_points, extent.num_points - extent.num_finite
-    if extent.num_finite == 0:
+    num_bad = len(cloud) - int(np.count_nonzero(cloud.finite))
+    if num_bad == len(cloud):
         raise FormatError(
             f"{cloud.source}: expected finite points, got none in {num_bad:,} points; those beyond "
             f"{FARTHEST:g} count as missing: use another unit, or look where they come from."
         )
-    notes = []
+    notes: tuple[str, ...] = ()
     if num_bad:
-        notes.append(
-            f"{num_bad:,} of {num_points:,} points are not finite or beyond {FARTHEST:g}; they "
-            "stay in place, unlabelled"
+        notes = (
+            f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "
+            "stay in place, unlabelled",
         )
-    first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
-    known = first.coordinates[first.finite][:: max(len(first) // _LOOKED_AT, 1)]
-    if len(known):
-        low, high = np.quantile(known, _MIDDLE, axis=0)
-        size, width = (extent.high - extent.low).max(), float((high - low).max())
-        if width > 0 and size > _FAR_OFF * width:
-            notes.append(
-                f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which "
-                "costs the others their precision; remove those that are none"
+    finite = cloud.coordinates[cloud.finite] if num_bad else cloud.coordinates
+    low, high = (end.astype(np.float64) for end in (finite.min(axis=0), finite.max(axis=0)))
+    size = float((high - low).max())
+    low, high = np.quantile(finite[:: max(len(cloud) // _LOOKED_AT, 1)], _MIDDLE, axis=0)
+    width = float((high - low).max())
+    if width > 0 and size > _FAR_OFF * width:
+        return (
+            *notes,
+            f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which costs "
+            "the others their precision; remove those that are none",
+        )
+    return (*notes, cloud.precision_note) if cloud.precision_note else notes
+
+
+def segment_cloud(
+    cloud: Cloud,
+    settings: PipelineConfig,
+    *,
+    orient: CloudOrientation = "auto",
+    partition: SuperpointsConfig | None = None,
+    voxel: float | None = None,
+    begin: Begin = lambda stage: None,
+) -> tuple[Segmentation, Superpoints | None]:
+    """Return the planes of a cloud, its normals turned, and its superpoints.
+
+    Args:
+        cloud: The cloud.
+        settings: How planes are found.
+        orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
+        partition: How superpoints are made; None for none.
+        voxel: Side of voxels of which each gives one point; None for all points.
+        begin: Called with the name of each stage when it starts.
+
+    Raises:
+        ConfigError: If normals shall look at scanners, and the cloud does not know of any.
+    """
+    check_viewpoint(cloud, orient, "use --orient interior")
+    seg = segment_planes(
+        cloud.points,
+        settings,
+        voxel=voxel,
+        keep_neighbors=partition is not None,
+        on_stage=begin,
+    )
+    superpoints = None
+    if partition is not None:
+        begin("superpoints")
+        colors = cloud.fields.get("color")
+        superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
+    begin("orientation")
+    return _oriented(cloud, seg, orient, voxel), superpoints
+
+
+def _oriented(
+    cloud: Cloud, seg: Segmentation, orient: CloudOrientation, voxel: float | None
+) -> Segmentation:
+    """Return a segmentation whose normals point to their side; with voxels, to that of these."""
+    if voxel is None:
+        return seg._replace(normals=orient_cloud(cloud, seg.normals, orient))
+    rows, inverse = sample_voxels(cloud.points, voxel)
+    front = None if cloud.front is None else cloud.front[rows]
+    few = replace(
+        cloud, coordinates=cloud.coordinates[rows], fields={}, grid_shape=None, front=front
+    )
+    turned = orient_cloud(few, seg.normals[rows], orient)
+    return seg._replace(normals=restore_points(turned, inverse))
+
+
+def check_stems(layout: str, places: Mapping[str, str]) -> None:
+    """Raise FormatError if a scan would write into the files of another in a layout.
+
+    See :func:`torchrg.datasets.folder.folded_name`.
+
+    Args:
+        layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
+        places: Where each scan is in its data set, by its name.
+    """
+    taken: dict[str, str] = {}
+    for name, place in places.items() if layout != "pointcept" else ():
+        stem = stem_of(layout, name, place)
+        other = taken.setdefault(folded_name(stem), name)
+        if other != name:
+            raise FormatError(
+                f"expected files of its own for each scan, got {stem} for {other} and {name} in "
+                f"layout {layout}; rename one, or choose layout pointcept."
             )
-            return tuple(notes)
-    return (*notes, first.precision_note) if first.precision_note else tuple(notes)
+
+
+def note_on_origin(layout: str, cloud: Cloud) -> tuple[str, ...]:
+    """Return what a user should know of the coordinates of a cloud in a layout."""
+    if layout == "pointcept" or not cloud.origin.any():
+        return ()
+    place = " ".join(f"{value:.12g}" for value in cloud.origin)
+    return (f"coordinates are written about {place}, as they are far from the origin",)
+
+
+def write_scan(
+    layout: str,
+    name: str,
+    folder: Path,
+    reading: Reading,
+    seg: Segmentation,
+    superpoint: NDArray[np.int32] | None,
+    *,
+    place: str | None = None,
+) -> list[str]:
+    """Write a cloud, its planes and its superpoints into the folder of its name, in a layout.
+
+    Args:
+        layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`, which needs
+            superpoints.
+        name: The name of the scan.
+        folder: The folder of that name in the output directory.
+        reading: The cloud.
+        seg: Its planes.
+        superpoint: Superpoint of each point, shape ``(N,)``.
+        place: Where the scan is in its data set, which some layouts keep. Default: its name.
+
+    Returns:
+        Names of the files, as paths from the folder.
+    """
+    cloud, arrays = reading.cloud, reading.arrays
+    if layout == "pointcept" or superpoint is None:
+        origin = cloud.origin.tolist()
+        if "coord" in arrays:
+            return write_pointcept_scene(folder, arrays, seg, superpoint=superpoint, origin=origin)
+        fields = arrays if superpoint is None else {**arrays, "superpoint": superpoint}
+        return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
+    split, stem = split_name(name)
+    scan = LayoutScan(
+        stem,
+        split,
+        folder=name if place is None else place,
+        dataset=reading.dataset,
+        coord=cloud.points.numpy(),
+        normal=seg.normals.numpy(),
+        superpoint=superpoint,
+        plane=seg.labels.numpy(),
+        given={key: np.asarray(values) for key, values in arrays.items()},
+        objects=reading.objects,
+    )
+    out = folder.parents[name.count("/")]
+    return write_layout(layout, folder, out, scan, seg.planes, cloud.origin)
 
 
 def write_results(

@@ -6,19 +6,27 @@ and a test.
 
 import dataclasses
 import json
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._optional import require
-from torchrg.batch.scans import Scan, check_finite, write_results
-from torchrg.batch.task import Converted
+from torchrg.batch.records import Record
+from torchrg.batch.scans import (
+    Reading,
+    Scan,
+    check_finite,
+    check_stems,
+    note_on_origin,
+    segment_cloud,
+    write_results,
+    write_scan,
+)
+from torchrg.batch.task import Begin, TaskReport
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets import (
     S3DIS,
@@ -29,10 +37,8 @@ from torchrg.datasets import (
     read_pointcept_scene,
     read_room,
     read_scannet_scan,
-    write_pointcept_scene,
 )
-from torchrg.datasets.folder import folded_name
-from torchrg.datasets.layouts import LayoutScan, check_layout, stem_of, write_layout
+from torchrg.datasets.layouts import check_layout
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.pointcept import GIVEN_ARRAYS
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
@@ -43,19 +49,24 @@ from torchrg.depth.camera import make_intrinsics, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.io.npy import map_folder
-from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
-from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.normals.sides import CloudOrientation, orient_cloud
 from torchrg.structures import Cloud, Segmentation
 
 _COPIED = tuple(name for name in GIVEN_ARRAYS if name != "normal")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
+TURNING = ("interior", "up")
+"""Sides that normals of an image are turned to; without them, they look at the camera."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class CloudSource:
-    """What sources of clouds share: what is written of each, and in which layout.
+    """What sources of clouds share: how a cloud is converted, what is written, in which layout.
+
+    A source of its own lists scans and reads one of them.
 
     Args:
+        root: The directory of the data set.
+        settings: How to segment.
         superpoint: Whether superpoints are written too; every layout but ``"pointcept"`` has them.
         layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
         partition: How superpoints are made.
@@ -63,6 +74,9 @@ class CloudSource:
         orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
     """
 
+    root: Path
+    settings: PipelineConfig
+    _: KW_ONLY
     superpoint: bool = False
     layout: str = "pointcept"
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
@@ -70,39 +84,61 @@ class CloudSource:
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 104
     """What the largest of the layouts takes."""
+    kind: ClassVar[str]
+    """The name of the kind of source."""
     dataset: ClassVar[str] = "ScanNet"
     """The data set whose layouts it has; clouds without labels are written as those of ScanNet."""
 
     @property
-    def has_superpoints(self) -> bool:
-        """Whether superpoints are made."""
-        return self.superpoint or self.layout != "pointcept"
+    def in_place(self) -> bool:
+        """Whether results go into the folders of the clouds."""
+        return False
 
-    def described(self, **options: Any) -> dict[str, Any]:  # noqa: ANN401
-        """Return these settings, as far as they are not the usual ones, after others."""
-        described = {**options, "superpoint": self.superpoint}
+    def read(self, scan: Scan) -> Reading:
+        """Return what is read of a scan."""
+        raise NotImplementedError
+
+    def convert(self, scan: Scan, folder: Path, begin: Begin) -> TaskReport:
+        """Read a scan, segment it, and write its results, each file whole or not at all."""
+        begin("read")
+        reading = self.read(scan)
+        cloud = reading.cloud
+        notes = (*cloud.notes, *check_finite(cloud), *note_on_origin(self.layout, cloud))
+        has_superpoints = self.superpoint or self.layout != "pointcept"
+        partition = self.partition if has_superpoints else None
+        seg, superpoints = segment_cloud(
+            cloud, self.settings, orient=self.orient, partition=partition, begin=begin
+        )
+        level = None if superpoints is None else [*superpoints.by_level().values()][self.level]
+        begin("write")
+        files = write_scan(
+            self.layout, scan.name, folder, reading, seg, level, place=_place_of(scan)
+        )
+        return TaskReport(
+            scan.name,
+            "converted",
+            len(cloud),
+            len(seg.planes.count),
+            tuple(files),
+            reading.repairs,
+            (*notes, *reading.notes),
+        )
+
+    def describe(self) -> Record:
+        """Return the kind of the source, and the settings that differ from their defaults."""
+        changed: Record = {"kind": self.kind, "superpoint": self.superpoint}
         if self.orient != "none":
-            described["orient"] = self.orient
+            changed["orient"] = self.orient
         if self.layout != "pointcept":
-            described |= {"layout": self.layout, "version": layouts.VERSION}
+            changed |= {"layout": self.layout, "version": layouts.VERSION}
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
-            described |= {"partition": dataclasses.asdict(self.partition), "level": self.level}
-        return json.loads(json.dumps(described))  # type: ignore[no-any-return]
+            partition = json.loads(json.dumps(dataclasses.asdict(self.partition)))
+            changed |= {"partition": partition, "level": self.level}
+        return changed
 
     def checked(self, scans: list[Scan]) -> list[Scan]:
-        """Return scans if none of them would write into the files of another.
-
-        See :func:`torchrg.datasets.folder.folded_name`.
-        """
-        taken: dict[str, str] = {}
-        for scan in scans if self.layout != "pointcept" else ():
-            stem = stem_of(self.layout, scan.name, _place(scan))
-            other = taken.setdefault(folded_name(stem), scan.name)
-            if other != scan.name:
-                raise FormatError(
-                    f"expected files of its own for each scan, got {stem} for {other} and "
-                    f"{scan.name} in layout {self.layout}; rename one, or choose layout pointcept."
-                )
+        """Return scans if none of them would write into the files of another."""
+        check_stems(self.layout, {scan.name: _place_of(scan) for scan in scans})
         return scans
 
     def check_lists(self, out: Path) -> None:
@@ -113,77 +149,8 @@ class CloudSource:
         """Write what the layout has for the data set as a whole, from all scans in ``out``."""
         write_lists(self.layout, self.dataset, out, mark)
 
-    def segment(
-        self,
-        cloud: Cloud,
-        settings: PipelineConfig,
-        colors: Tensor | NDArray[np.generic] | None,
-        begin: Callable[[str], None],
-    ) -> tuple[Segmentation, NDArray[np.int32] | None]:
-        """Return the planes of a cloud, its normals turned, and its superpoints if wanted."""
-        check_viewpoint(cloud, self.orient, "use --orient interior")
-        seg = segment_planes(
-            cloud.points, settings, on_stage=begin, keep_neighbors=self.has_superpoints
-        )
-        parts = self._part(cloud, seg, colors, begin)
-        begin("orientation")
-        return seg._replace(normals=orient_cloud(cloud, seg.normals, self.orient)), parts
 
-    def _part(
-        self,
-        cloud: Cloud,
-        seg: Segmentation,
-        colors: Tensor | NDArray[np.generic] | None,
-        begin: Callable[[str], None],
-    ) -> NDArray[np.int32] | None:
-        """Return the superpoint of each point of a cloud, None where they are not wanted."""
-        if not self.has_superpoints:
-            return None
-        begin("superpoints")
-        found = make_superpoints(cloud.points, seg, self.partition, colors=colors)
-        return [*found.by_level().values()][self.level]
-
-    def write(
-        self,
-        scan: Scan,
-        folder: Path,
-        cloud: Cloud,
-        given: Mapping[str, Any],
-        seg: Segmentation,
-        parts: NDArray[np.int32] | None,
-        **more: Any,  # noqa: ANN401
-    ) -> list[str]:
-        """Write what is ``given`` of each point, and what was found, in the layout.
-
-        ``more`` is what :class:`torchrg.datasets.layouts.LayoutScan` has beside.
-        """
-        if self.layout == "pointcept" or parts is None:
-            origin = cloud.origin.tolist()
-            return write_pointcept_scene(folder, given, seg, superpoint=parts, origin=origin)
-        split, name = layouts.split_name(scan.name)
-        parted = LayoutScan(
-            name,
-            split,
-            _place(scan),
-            coord=cloud.points.numpy(),
-            normal=seg.normals.numpy(),
-            superpoint=parts,
-            plane=seg.labels.numpy(),
-            given={name: np.asarray(values) for name, values in given.items()},
-            **{"dataset": self.dataset, **more},
-        )
-        out = folder.parents[scan.name.count("/")]
-        return write_layout(self.layout, folder, out, parted, seg.planes, cloud.origin)
-
-    def notes(self, cloud: Cloud) -> tuple[str, ...]:
-        """Return what a user should know about a cloud in the layout."""
-        if self.layout == "pointcept" or not cloud.origin.any():
-            return ()
-        place = " ".join(f"{value:.12g}" for value in cloud.origin)
-        return (f"coordinates are written about {place}, as they are far from the origin",)
-
-
-def _place(scan: Scan) -> str:
+def _place_of(scan: Scan) -> str:
     """Return where a scan is in its data set."""
     return scan.name if scan.item is None else str(scan.item)
 
@@ -198,8 +165,6 @@ class FolderSource(CloudSource):
     :func:`torchrg.datasets.write_pointcept_scene`.
 
     Args:
-        root: The folder.
-        settings: How to segment.
         out: Where results go. ``root`` itself completes folders in Pointcept's layout in place;
             no other folder below it can be.
         columns: Names for the columns of text and of bare ``.npy`` arrays; see
@@ -207,21 +172,20 @@ class FolderSource(CloudSource):
         suffixes: Which files are clouds. Default: all that can be read.
     """
 
-    root: Path
-    settings: PipelineConfig
     out: Path
     columns: tuple[str, ...] | None = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
+    kind: ClassVar[str] = "folder"
 
     @property
     def in_place(self) -> bool:
         """Whether results go into the folders of the clouds."""
         return self.out == self.root
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Record:
         """Return the kind and what else decides results."""
-        described = self.described(kind="folder")
-        return described if self.columns is None else described | {"columns": list(self.columns)}
+        columns = {} if self.columns is None else {"columns": list(self.columns)}
+        return super().describe() | columns
 
     def list_scans(self) -> list[Scan]:
         """Return the clouds in natural order, if results do not go in among them."""
@@ -248,35 +212,24 @@ class FolderSource(CloudSource):
         files = tuple(file for file in scene.files if file.stem in used)
         return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
 
-    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one cloud."""
-        begin("read")
+    def read(self, scan: Scan) -> Reading:
+        """Read a file, or a folder in Pointcept's layout."""
         first = scan.inputs[0]
-        is_file = first.parent.relative_to(self.root).as_posix() != scan.name
-        if is_file:
-            cloud = read_cloud(first, columns=self.columns if takes_columns(first) else None)
-            given = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
-        else:
-            sample, given = read_pointcept_scene(first.parent), map_folder(first.parent, _COPIED)
-            # Pointcept's colours are 0 to 255 in any type.
-            colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
-            cloud = Cloud(sample["coord"].numpy(), colors, source=str(first.parent))
-        warnings = (*cloud.notes, *check_finite(cloud), *self.notes(cloud))
-        color = cloud.fields.get("color")
-        seg, parts = self.segment(cloud, self.settings, color, begin)
-        begin("write")
-        if is_file:
-            others = [name for name in cloud.fields if name != "color"]
-            warnings += (f"left out: {', '.join(others)}",) if others else ()
-        if is_file and self.layout == "pointcept":
-            found = {"color": color, "superpoint": parts}
-            fields = {name: values for name, values in found.items() if values is not None}
-            origin = cloud.origin.tolist()
-            files = write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
-        else:
-            dataset = _dataset(given.keys())
-            files = self.write(scan, folder, cloud, given, seg, parts, dataset=dataset)
-        return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=warnings)
+        if first.parent.relative_to(self.root).as_posix() == scan.name:
+            return self._read_scene(first.parent)
+        cloud = read_cloud(first, columns=self.columns if takes_columns(first) else None)
+        others = [name for name in cloud.fields if name != "color"]
+        notes = (f"left out: {', '.join(others)}",) if others else ()
+        arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
+        return Reading(cloud, arrays, notes=notes)
+
+    def _read_scene(self, folder: Path) -> Reading:
+        """Read a folder in Pointcept's layout."""
+        sample, arrays = read_pointcept_scene(folder), map_folder(folder, _COPIED)
+        # Pointcept's colours are 0 to 255 in any type.
+        colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
+        cloud = Cloud(sample["coord"].numpy(), colors, source=str(folder))
+        return Reading(cloud, arrays, _dataset(arrays.keys()))
 
 
 def _dataset(names: Collection[str]) -> str:
@@ -294,23 +247,19 @@ class S3DISSource(CloudSource):
     Writes ``OUT/Area_i/<room>`` as :func:`torchrg.datasets.write_pointcept_scene` does.
 
     Args:
-        root: The folder that holds ``Area_1`` to ``Area_6``.
-        settings: How to segment.
         areas: Numbers of the areas.
         class_order: Meaning of the numbers in ``segment``; see :class:`torchrg.datasets.S3DIS`.
             Other layouts than Pointcept's have its order.
     """
 
-    root: Path
-    settings: PipelineConfig
     areas: tuple[int, ...]
     class_order: str = "pointcept"
-    in_place: ClassVar[bool] = False
+    kind: ClassVar[str] = "s3dis"
     dataset: ClassVar[str] = "S3DIS"
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Record:
         """Return the kind and what else decides results."""
-        return self.described(kind="s3dis", class_order=self.class_order)
+        return super().describe() | {"class_order": self.class_order}
 
     def list_scans(self) -> list[Scan]:
         """Return the rooms in natural order; warn if an area has not as many as the release."""
@@ -326,46 +275,31 @@ class S3DISSource(CloudSource):
             [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
         )
 
-    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one room."""
-        begin("read")
+    def read(self, scan: Scan) -> Reading:
+        """Read a room."""
         room = read_room(self.root / scan.name, class_order=self.class_order)
-        cloud = Cloud(room.coord, source=scan.name)
-        notes = [
-            *check_finite(cloud),
-            *self.notes(cloud),
+        notes = (
             *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
             *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
-        ]
-        seg, parts = self.segment(cloud, self.settings, room.color, begin)
-        begin("write")
-        arrays = {name: getattr(room, name) for name in ("coord", "color", "segment", "instance")}
-        files = self.write(scan, folder, cloud, arrays, seg, parts)
+        )
         repairs = tuple(
             f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
             for r in room.report.repairs
         )
-        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, tuple(notes))
+        arrays = {name: getattr(room, name) for name in ("coord", "color", "segment", "instance")}
+        cloud = Cloud(room.coord, {"color": room.color}, source=scan.name)
+        return Reading(cloud, arrays, self.dataset, repairs=repairs, notes=notes)
 
 
 @dataclass(frozen=True)
 class ScanNetSource(CloudSource):
     """The scans of ScanNet or ScanNet++; see :class:`torchrg.datasets.ScanNet`.
 
-    Writes ``OUT/<split>/<scan>`` as :func:`torchrg.datasets.write_pointcept_scene` does.
-
-    Args:
-        root: The folder that holds ``scans`` or ``data``.
-        settings: How to segment.
+    Its root holds ``scans`` or ``data``. Writes ``OUT/<split>/<scan>`` as
+    :func:`torchrg.datasets.write_pointcept_scene` does.
     """
 
-    root: Path
-    settings: PipelineConfig
-    in_place: ClassVar[bool] = False
-
-    def describe(self) -> dict[str, Any]:
-        """Return the kind and what else decides results."""
-        return self.described(kind="scannet")
+    kind: ClassVar[str] = "scannet"
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
@@ -380,23 +314,20 @@ class ScanNetSource(CloudSource):
             scans.append(Scan(name, files, estimate_points(mesh), place))
         return self.checked(scans)
 
-    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one scan."""
-        begin("read")
+    def read(self, scan: Scan) -> Reading:
+        """Read a scan."""
         mesh = scan.inputs[0]
-        given = read_scannet_scan(mesh, self.root)
-        cloud = Cloud(given["coord"], source=str(mesh), front=given.pop("front", None))
+        arrays = read_scannet_scan(mesh, self.root)
+        front = arrays.pop("front", None)
+        colors = {name: arrays[name] for name in arrays.keys() & {"color"}}
+        cloud = Cloud(arrays["coord"], colors, source=str(mesh), front=front)
         dataset, objects = _dataset_of_mesh(mesh), None
         if self.layout == "scannet" and dataset == "ScanNet":
             objects = read_objects(mesh, len(cloud))
-        notes = (*check_finite(cloud), *self.notes(cloud))
-        if "instance" not in given and not scan.name.startswith("test/"):
-            notes += ("no labels: annotations or the table of their words are missing",)
-        seg, parts = self.segment(cloud, self.settings, given.get("color"), begin)
-        begin("write")
-        more = {"dataset": dataset, "objects": objects}
-        files = self.write(scan, folder, cloud, given, seg, parts, **more)
-        return Converted(len(cloud), len(seg.planes.count), tuple(files), warnings=notes)
+        notes: tuple[str, ...] = ()
+        if "instance" not in arrays and not scan.name.startswith("test/"):
+            notes = ("no labels: annotations or the table of their words are missing",)
+        return Reading(cloud, arrays, dataset, objects, notes=notes)
 
 
 def _dataset_of_mesh(mesh: Path) -> str:
@@ -446,7 +377,7 @@ class RGBDSource:
     in_place: ClassVar[bool] = False
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Record:
         """Return the kind and what else decides results."""
         return {
             "kind": "rgbd",
@@ -454,21 +385,8 @@ class RGBDSource:
             "intrinsics": self.intrinsics,
             "depth_scale": self.depth_scale,
             **({"compile": True} if self.compile else {}),
-            **({"orient": self.orient} if self.turns else {}),
+            **({"orient": self.orient} if self.orient in TURNING else {}),
         }
-
-    @property
-    def turns(self) -> bool:
-        """Whether normals shall point elsewhere than to the camera."""
-        return self.orient in ("interior", "up")
-
-    def turned(self, seg: Segmentation, points: Tensor) -> Segmentation:
-        """Return a segmentation of an image, of these points ``(H, W, 3)``, with turned normals."""
-        if not self.turns:
-            return seg
-        cloud = Cloud(points.reshape(-1, 3).numpy())
-        normals = orient_cloud(cloud, seg.normals.view(-1, 3), self.orient)
-        return seg._replace(normals=normals.view_as(seg.normals))
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
@@ -481,34 +399,46 @@ class RGBDSource:
             for frame in data.frames
         ]
 
-    def convert(self, scan: Scan, folder: Path, begin: Callable[[str], None]) -> Converted:
-        """Read, segment and write one frame."""
+    def convert(self, scan: Scan, folder: Path, begin: Begin) -> TaskReport:
+        """Read a frame, segment it, and write its results, each file whole or not at all."""
         begin("read")
         frame = _frame(scan.item)
         depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         if not bool((depth > 0).any()):
             raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
         begin("planes")
-        found = segment_depth(
+        seg = segment_depth(
             depth, frame.intrinsics, self.settings, pose=frame.pose, compile=self.compile
         )
         points = points_of_image(depth, frame.intrinsics, frame.pose)
-        found = self.turned(found, points)
+        seg = orient_image(seg, points, self.orient)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
-        files = write_results(folder, coord, found)
-        num_points, num_planes = depth.numel(), len(found.planes.count)
+        files = tuple(write_results(folder, coord, seg))
+        num_planes = len(seg.planes.count)
         notes = () if num_planes else ("no plane found",)
-        return Converted(num_points, num_planes, tuple(files), warnings=notes)
+        return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)
 
 
-def _plain(frame: RGBDFrame) -> dict[str, Any]:
+def orient_image(seg: Segmentation, points: Tensor, orient: CloudOrientation) -> Segmentation:
+    """Return the segmentation of an image of points ``(H, W, 3)`` with its normals turned.
+
+    They look at the camera already, which every value but :data:`TURNING` leaves.
+    """
+    if orient not in TURNING:
+        return seg
+    cloud = Cloud(points.reshape(-1, 3).numpy())
+    normals = orient_cloud(cloud, seg.normals.view(-1, 3), orient)
+    return seg._replace(normals=normals.view_as(seg.normals))
+
+
+def _plain(frame: RGBDFrame) -> Record:
     """Return a frame as plain values."""
     pose = None if frame.pose is None else frame.pose.tolist()
     return vars(frame) | {"intrinsics": frame.intrinsics.tolist(), "pose": pose}
 
 
-def _frame(values: dict[str, Any]) -> RGBDFrame:
+def _frame(values: Record) -> RGBDFrame:
     """Return the frame that plain values describe."""
     matrices = {
         name: None if values[name] is None else torch.tensor(values[name], dtype=torch.float64)

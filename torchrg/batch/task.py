@@ -1,36 +1,20 @@
-"""What engines do: tasks, and the report of what became of each."""
+"""The report of a task: what became of a scan, how long each stage took, and why it failed."""
 
 import os
 import platform
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError
 from torchrg.io.files import is_disk_full
 
-
-class Converted(NamedTuple):
-    """What is known of a scan once its results are written; equal runs give equal values.
-
-    Attributes:
-        num_points: Number of points, those that are not finite included.
-        num_regions: Number of planes.
-        files: Names of the files written, in the scan's folder.
-        repairs: What was put right in the input, a line each.
-        warnings: What a user should know, a line each.
-    """
-
-    num_points: int
-    num_regions: int
-    files: tuple[str, ...]
-    repairs: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+Begin = Callable[[str], None]
+"""Called with the name of each stage of the work when it starts."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +24,13 @@ class TaskReport:
     Attributes:
         name: Its name.
         status: ``converted`` now, ``kept`` from an earlier run, ``failed``, or ``not started``.
-        num_points: Points read.
-        num_regions: Planes found.
+        num_points: Number of points, those that are not finite included.
+        num_regions: Number of planes.
+        files: Names of the files written now, in the folder of the scan.
+        repairs: What was put right in the input, a line each.
+        warnings: What a user should know, a line each.
         seconds: Time of each stage by its name.
         peak_memory: Largest resident memory of the process, in bytes.
-        repairs: What was put right in the input.
-        warnings: What a user should know.
         reason: Why it failed, a line.
         details: The traceback of a failure that was not foreseen.
         disk_full: Whether it failed because there is no space left.
@@ -57,10 +42,11 @@ class TaskReport:
     status: Literal["converted", "kept", "failed", "not started"]
     num_points: int = 0
     num_regions: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
-    peak_memory: int = 0
+    files: tuple[str, ...] = ()
     repairs: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+    peak_memory: int = 0
     reason: str = ""
     details: str = ""
     disk_full: bool = False
@@ -72,61 +58,27 @@ Reports = Generator[TaskReport | None, None, None]
 """What an engine yields: a report of each task when it ends, None while there is none."""
 
 
-class Task(Protocol):
-    """Work that any process can do: on a scan or a frame.
-
-    It travels to that process, so it holds settings and paths but no open files.
-    """
-
-    @property
-    def name(self) -> str:
-        """What it is called; no other task of a run has the same name."""
-
-    @property
-    def memory(self) -> int:
-        """Bytes that a process with this task takes at most."""
-
-    @property
-    def inputs(self) -> Sequence[Path]:
-        """The files that it reads."""
-
-    def run(self) -> TaskReport:
-        """Do the work; what goes wrong with it is in the report and never raised."""
-
-    def clean(self) -> None:
-        """Remove what a process that was killed at this task left half-written."""
-
-
-def report_on(name: str, convert: Callable[[Callable[[str], None]], Converted]) -> TaskReport:
-    """Do the work of a task; what goes wrong with it is in the report and never raised.
-
-    ``convert`` is called with a function that it calls with the name of each stage that begins.
-    """
+def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
+    """Do the work of a task; what goes wrong with it is in the report and never raised."""
     clock = _StageClock()
-    outcome: dict[str, Any]
     reset_peak_memory()
     try:
         with warnings.catch_warnings():
             # It is among the warnings of the report.
             warnings.simplefilter("ignore", PrecisionWarning)
-            outcome = {"status": "converted", **convert(clock.begin)._asdict()}
-        del outcome["files"]
+            report = work(clock.begin)
     except Exception as error:  # noqa: BLE001 One task must never end the others.
         is_foreseen = isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)
-        outcome = {
-            "status": "failed",
-            "reason": _reason(error),
-            "details": "" if is_foreseen else traceback.format_exc(),
-            "disk_full": is_disk_full(error),
-        }
+        report = TaskReport(
+            name,
+            "failed",
+            reason=_reason(error),
+            details="" if is_foreseen else traceback.format_exc(),
+            disk_full=is_disk_full(error),
+        )
     clock.begin("done")
-    return TaskReport(
-        name,
-        seconds=clock.seconds,
-        peak_memory=peak_memory(),
-        host=f"{platform.node()} ({os.getpid()})",
-        **outcome,
-    )
+    host = f"{platform.node()} ({os.getpid()})"
+    return replace(report, seconds=clock.seconds, peak_memory=peak_memory(), host=host)
 
 
 class _StageClock:

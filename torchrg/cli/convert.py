@@ -1,7 +1,6 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from tqdm import tqdm
 
 from torchrg._parallel import num_cores
-from torchrg.batch.costs import estimate_costs
 from torchrg.batch.local import run_local
-from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import spare_memory
 from torchrg.batch.run import (
     REPORT,
@@ -20,10 +17,12 @@ from torchrg.batch.run import (
     Plan,
     check_room,
     list_jobs,
+    lock_folder,
     make_plan,
+    run_plan,
     write_report,
 )
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Source, mark_of
 from torchrg.batch.sources import (
     CloudSource,
     FolderSource,
@@ -35,7 +34,8 @@ from torchrg.batch.sources import (
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.cli import console
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.loop import finish, run_with_bar, tell_failure
+from torchrg.cli.ending import INTERRUPTED, SOME_FAILED, fail
+from torchrg.cli.loop import Progress, tell_failure
 from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
@@ -75,6 +75,10 @@ class Arguments:
     """Say what would be done and why, and write nothing."""
     unit: ClassVar[str] = "scan"
     """What one of them is called."""
+    seconds_per_million: ClassVar[tuple[float, str]] = (33.0, "points, as consensus takes")
+    """Time of one core of an Intel Xeon for a million points, and what it is the time of: the table
+    of README.md that ``scripts/bench.py steady`` measures. There ``classic`` takes a third of it,
+    and ``paper`` half as much again."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the data set, both paths absolute."""
@@ -218,6 +222,8 @@ class RGBDArguments(Arguments):
     orient: console.ImageOrientFlag = "auto"
     compile: console.CompileFlag = False
     unit: ClassVar[str] = "frame"
+    seconds_per_million: ClassVar[tuple[float, str]] = (3.0, "pixels")
+    """As that of clouds, by the 0.9 s of a frame of 640 x 480 pixels in README.md."""
 
     def prepared(self) -> Self:
         """Compile the kernels of depth images if they are asked for."""
@@ -285,9 +291,8 @@ def run(argv: list[str]) -> int:
     if pages is not None:
         make_folder(pages)
         check_gallery(pages, [job.name for job in jobs])
-    with DirectoryLock(out) as lock:
-        jobs = [dataclasses.replace(job, mark=lock.mark) for job in jobs]
-        return _convert(_look_at(jobs, arguments), out, arguments, lock)
+    with lock_folder(out):
+        return _convert(_look_at(jobs, arguments), out, arguments)
 
 
 def _check(arguments: Arguments) -> None:
@@ -325,7 +330,7 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
         return make_plan(jobs, force=arguments.force, threads=num_cores(), on_scan=bar.update)
 
 
-def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -> int:
+def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
     check_room(plan)
     jobs, (workers, limit) = plan.to_convert, _workers_and_memory(arguments)
@@ -337,17 +342,21 @@ def _convert(plan: Plan, out: Path, arguments: Arguments, lock: DirectoryLock) -
             )
     if arguments.engine == "local":
         workers = min(workers or num_cores(), max(len(jobs), 1))
-        reports: Reports = run_local(jobs, workers=workers, memory_limit=limit, lock=lock)
+        reports: Reports = run_local(jobs, workers=workers, memory_limit=limit)
     else:
         from torchrg.batch.ray_tasks import run_ray
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
-    report = run_with_bar(
-        plan, reports, engine=arguments.engine, workers=workers, unit=arguments.unit
-    )
+    by_frames = arguments.unit == "frame"
+    sizes = {job.name: 1 if by_frames else job.scan.num_points for job in jobs}
+    bar_unit, total = "frame" if by_frames else "pt", sum(sizes.values())
+    # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
+    with tqdm(total=total, unit=bar_unit, unit_scale=True, smoothing=0, disable=None) as bar:
+        shown = Progress(bar, sizes, unit=arguments.unit)
+        report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     code = _finish(report, out, unit=arguments.unit)
     if isinstance(source := plan.jobs[0].source, CloudSource) and not report.disk_full:
-        source.write_lists(out, lock.mark)
+        source.write_lists(out, mark_of(REPORT))
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
@@ -384,11 +393,17 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
             raise
         console.warn(str(error))
     state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
-    more = f"{state}, {out / REPORT} says more."
-    code = finish(report, out, unit="scan", failed=more)
-    if code == 0:
-        console.say(f"{state} -> {out}")
-    return code
+    again = "The same command goes on from here."
+    if report.disk_full:
+        told = f"{out}: the disk is full; {state}. Make room. {again}"
+        return fail(told, code=SOME_FAILED)
+    if report.interrupted:
+        return fail(f"interrupted; {state}. {again}", code=INTERRUPTED)
+    if len(report.complete) < len(report.scans):
+        told = f"{state}, {out / REPORT} says more."
+        return fail(told, code=SOME_FAILED)
+    console.say(f"{state} -> {out}")
+    return 0
 
 
 def format_plan(plan: Plan) -> str:
@@ -404,18 +419,23 @@ def format_plan(plan: Plan) -> str:
 
 def _say_costs(plan: Plan, out: Path, arguments: Arguments) -> str:
     """Return what a plan would take, in words, or that there is nothing to do."""
-    if not plan.to_convert:
+    jobs = plan.to_convert
+    if not jobs:
         return "nothing to do"
     workers, limit = _workers_and_memory(arguments)
-    costs = estimate_costs(plan, workers=workers or num_cores(), limit=limit)
-    minutes = math.ceil(costs.seconds / 60)
-    spent = f"{minutes / 60:,.1f} hours" if minutes > 90 else f"{minutes} min"
-    free = free_space(out) / 1e9
+    workers, memory, at_once = workers or num_cores(), 0, 0
+    for needed in sorted((job.memory for job in jobs), reverse=True)[:workers]:
+        if at_once and memory + needed > limit:
+            break
+        memory, at_once = memory + needed, at_once + 1
+    source, num_points = jobs[0].source, sum(job.scan.num_points for job in jobs)
+    cost, of_what = arguments.seconds_per_million
+    hours = cost * num_points / 1e6 / 3600
     return (
-        f"disk: about {costs.disk / 1e9:,.3f} GB of {free:,.1f} that are free\n"
-        f"memory: about {costs.memory / 1e9:,.1f} GB for {costs.workers} at a time, "
-        f"within {limit / 1e9:,.1f}\n"
-        f"time: about {spent} on this machine, if it does nothing else"
+        f"disk: about {source.bytes_per_point * num_points / 1e9:,.3f} GB of "
+        f"{free_space(out) / 1e9:,.1f} that are free\n"
+        f"memory: about {memory / 1e9:,.1f} GB for {at_once} at a time, within {limit / 1e9:,.1f}\n"
+        f"time: about {hours / at_once:,.2f} hours, at {cost:g} s of a core for a million {of_what}"
     )
 
 

@@ -1,14 +1,12 @@
 """The loop of every command over several inputs: progress, what failed, and the exit code."""
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from torchrg.batch.run import BatchReport, Plan, run_plan, run_tasks
-from torchrg.batch.task import Converted, Reports, TaskReport, report_on
-from torchrg.cli.ending import INTERRUPTED, SOME_FAILED, fail
+from torchrg.batch.task import Begin, TaskReport, report_on
+from torchrg.cli.ending import SOME_FAILED, fail
 
 
 def run_each(
@@ -20,39 +18,36 @@ def run_each(
     """Call ``write`` with the arguments and the values of each input; return the exit code.
 
     One that fails stops no other and is told in one line; where it is the only one, its error is
-    that of the command.
+    that of the command. A full disk ends the loop, as every further input would fail.
     """
     rows = list(zip(*columns, strict=True))
     if len(rows) == 1:
         write(arguments, *rows[0])
         return 0
+    num_failed = 0
+    for number, (name, row) in enumerate(zip(names, rows, strict=True)):
 
-    def reports() -> Reports:
-        for name, row in zip(names, rows, strict=True):
+        def work(begin: Begin, name: str = name, row: Sequence[Any] = row) -> TaskReport:
+            write(arguments, *row)
+            return TaskReport(name, "converted")
 
-            def convert(begin: Callable[[str], None], row: Any = row) -> Converted:  # noqa: ANN401
-                write(arguments, *row)
-                return Converted(0, 0, ())
+        report = report_on(name, work)
+        tell_failure(report)
+        num_failed += report.status == "failed"
+        if report.disk_full:
+            state = f"{number + 1 - num_failed:,} of {len(rows):,} inputs are complete"
+            told = f"the disk is full; {state}. Make room. The same command begins anew."
+            return fail(f"{arguments.out}: {told}", code=SOME_FAILED)
+    if num_failed:
+        told = f"{num_failed} of {len(rows)} inputs failed, the others are written."
+        return fail(told, code=SOME_FAILED)
+    return 0
 
-            yield report_on(name, convert)
 
-    report = run_tasks(names, reports(), on_report=tell_failure)
-    if report.interrupted:
-        raise KeyboardInterrupt
-    return finish(report, arguments.out, again="The same command begins anew.")
-
-
-def run_with_bar(
-    plan: Plan, reports: Reports, *, engine: str, workers: int | None, unit: str
-) -> BatchReport:
-    """Convert the scans of a plan, with a progress bar on a terminal; ``unit`` is what one is."""
-    by_frames = unit == "frame"
-    sizes = {job.name: 1 if by_frames else job.scan.num_points for job in plan.to_convert}
-    bar_unit, total = "frame" if by_frames else "pt", sum(sizes.values())
-    # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
-    with tqdm(total=total, unit=bar_unit, unit_scale=True, smoothing=0, disable=None) as bar:
-        shown = Progress(bar, sizes, unit=unit)
-        return run_plan(plan, reports, engine=engine, workers=workers, on_report=shown)
+def tell_failure(report: TaskReport) -> None:
+    """Print why a task failed, if it did."""
+    if report.status == "failed":
+        fail(f"{report.name}: {report.reason.removeprefix(f'{report.name}: ')}")
 
 
 class Progress:
@@ -70,33 +65,3 @@ class Progress:
             self.bar.update(self.sizes[report.name])
         failed = f", {self.num_failed} failed" if self.num_failed else ""
         self.bar.set_description_str(f"{self.num_done}/{len(self.sizes)} {self.unit}s{failed}")
-
-
-def tell_failure(report: TaskReport | None) -> None:
-    """Print why a task failed, if it did."""
-    if report is not None and report.status == "failed":
-        fail(f"{report.name}: {report.reason.removeprefix(f'{report.name}: ')}")
-
-
-def finish(
-    report: BatchReport,
-    out: Path,
-    *,
-    unit: str = "input",
-    failed: str = "",
-    again: str = "The same command goes on from here.",
-) -> int:
-    """Say what is left to do where not all is complete, and return the exit code.
-
-    ``failed`` replaces what is said where some failed, and ``again`` how to go on.
-    """
-    num_done, num_tasks = len(report.complete), len(report.scans)
-    state = f"{num_done:,} of {num_tasks:,} {unit}s are complete"
-    if report.disk_full:
-        return fail(f"{out}: the disk is full; {state}. Make room. {again}", code=SOME_FAILED)
-    if report.interrupted:
-        return fail(f"interrupted; {state}. {again}", code=INTERRUPTED)
-    if num_done < num_tasks:
-        others = f"{num_tasks - num_done} of {num_tasks} inputs failed, the others are written."
-        return fail(failed or others, code=SOME_FAILED)
-    return 0

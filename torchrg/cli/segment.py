@@ -7,20 +7,27 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from torchrg import scratch
-from torchrg.batch.lock import DirectoryLock
 from torchrg.batch.memory import available_memory, memory_of_scan, memory_on_disk
-from torchrg.batch.records import describe_run
-from torchrg.batch.scans import Scan, check_finite, write_results
-from torchrg.batch.sources import CloudSource
+from torchrg.batch.records import Record, describe_run
+from torchrg.batch.run import REPORT, lock_folder
+from torchrg.batch.scans import (
+    Reading,
+    check_finite,
+    check_stems,
+    mark_of,
+    note_on_origin,
+    segment_cloud,
+    write_scan,
+)
 from torchrg.cli import console
 from torchrg.cli.arguments import parse
 from torchrg.cli.loop import run_each
 from torchrg.config import SuperpointsConfig
+from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import (
@@ -30,14 +37,9 @@ from torchrg.io import (
     estimate_points,
     merge_streams,
     read_cloud,
-    stream_cloud,
     write_cloud,
 )
 from torchrg.io.files import check_space
-from torchrg.io.stream import Extent
-from torchrg.neighbors import restore_points, sample_voxels
-from torchrg.normals.sides import check_viewpoint, orient_cloud
-from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import (
     Entry,
@@ -50,6 +52,8 @@ from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 STAGES = ("neighbors", "normals", "regions", "planes")
+_DATASET = "ScanNet"
+"""The data set as whose scans layouts take clouds without labels."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 """Flags of depth images, which have a command of their own."""
 
@@ -76,8 +80,8 @@ class Arguments:
     """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
     inputs a directory of pictures."""
     pages: bool = False
-    """Write a page for the browser beside each picture in the directory of --picture, and
-    index.html, in which each picture links to its page (pip install 'torchrg[view]')."""
+    """Write a page for the browser beside each picture, and index.html, in which each picture links
+    to its page; --picture is a directory then (pip install 'torchrg[view]')."""
     voxel: float | None = None
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
@@ -150,12 +154,11 @@ def _sharing(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
     if arguments.layout in (None, "pointcept"):
         yield
         return
-    source = CloudSource(layout=arguments.layout)
-    source.checked([Scan(path.name, (), 0) for path in outputs])
-    with DirectoryLock(arguments.out) as lock:
-        source.check_lists(arguments.out)
+    check_stems(arguments.layout, {path.name: path.name for path in outputs})
+    with lock_folder(arguments.out):
+        check_lists(arguments.layout, _DATASET, arguments.out)
         yield
-        source.write_lists(arguments.out, lock.mark)
+        write_lists(arguments.layout, _DATASET, arguments.out, mark_of(REPORT))
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
@@ -189,69 +192,39 @@ def _segment(
 ) -> None:
     """Segment a cloud with a progress bar on a terminal, and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
-    stream = _stream(arguments, sources)
-    # Of text only reading says how many points there are.
-    num_points = stream.num_points or sum(map(estimate_points, sources))
     limit = _limit_of(arguments)
-    where = _arrays_of(arguments, source, target, num_points, limit)
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    clouds = [read_cloud(path, columns=names.of(path)) for path in sources]
-    cloud = clouds[0]
-    if len(clouds) > 1:
-        cloud = merge_streams(list(map(CloudStream.of, clouds))).stream.read()
-    check_viewpoint(cloud, arguments.orient, "use --orient interior")
+    _check_limit(source, sum(map(estimate_points, sources)), limit)
+    cloud = _read(arguments, sources)
+    where = _arrays_of(arguments, source, target, len(cloud), limit)
     _check_points(arguments, source, cloud, target)
     if _is_depth_image(cloud):
         console.warn(
             f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
         )
-    settings, voxel = arguments.settings.resolved, arguments.voxel
+    partition = arguments.partition if arguments.superpoints else None
     stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
     with console.stage_bar(sources[0].name, stages) as advance, where:
-        seg = segment_planes(
-            cloud.points,
-            settings,
-            voxel=voxel,
-            keep_neighbors=arguments.superpoints,
-            on_stage=advance,
+        seg, superpoints = segment_cloud(
+            cloud,
+            arguments.settings.resolved,
+            orient=arguments.orient,
+            partition=partition,
+            voxel=arguments.voxel,
+            begin=advance,
         )
-        parts, provenance = None, _describe(arguments, sources)
-        if arguments.superpoints:
-            advance("superpoints")
-            parts = make_superpoints(
-                cloud.points,
-                seg,
-                arguments.partition,
-                colors=cloud.fields.get("color"),
-                voxel=voxel,
-            )
-            provenance["superpoints"] = dataclasses.asdict(arguments.partition)
-        advance("orientation")
-        seg = _oriented(cloud, seg, arguments)
     if arguments.layout is None:
-        write_cloud(target, cloud, seg, superpoints=parts, provenance=provenance)
+        provenance = _describe(arguments, sources)
+        write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
     else:
-        _write_layout(arguments, target, cloud, seg, parts)
+        _write_layout(arguments, target, cloud, seg, superpoints)
     if picture is not None:
-        _draw(arguments, picture, Result.of(cloud, seg, parts))
-    if parts is not None:
-        found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
-        console.say(f"{source}: superpoints of each level: {found}")
+        _draw(arguments, picture, Result.of(cloud, seg, superpoints))
+    if superpoints is not None:
+        levels = (superpoints.labels, *superpoints.levels)
+        counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
+        console.say(f"{source}: superpoints of each level: {counts}")
     without = console.without(target, cloud.fields)
-    _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
-
-
-def _oriented(cloud: Cloud, seg: Segmentation, arguments: Arguments) -> Segmentation:
-    """Return a segmentation whose normals point to their side; with voxels, to that of these."""
-    if arguments.voxel is None:
-        return seg._replace(normals=orient_cloud(cloud, seg.normals, arguments.orient))
-    rows, inverse = sample_voxels(cloud.points, arguments.voxel)
-    front = None if cloud.front is None else cloud.front[rows]
-    few = dataclasses.replace(
-        cloud, coordinates=cloud.coordinates[rows], fields={}, grid_shape=None, front=front
-    )
-    turned = orient_cloud(few, seg.normals[rows], arguments.orient)
-    return seg._replace(normals=restore_points(turned, inverse))
+    _report(source, seg, cloud, f"{target}{without}", time.perf_counter() - begin)
 
 
 def _limit_of(arguments: Arguments) -> int:
@@ -260,18 +233,24 @@ def _limit_of(arguments: Arguments) -> int:
     return available_memory() // 2 if given is None else int(given * 1e9)
 
 
-def _arrays_of(
-    arguments: Arguments, source: str, target: Path, num_points: int, limit: int
-) -> contextlib.AbstractContextManager[None]:
-    """Return where the large arrays of a cloud are: in memory, or on a disk that has the room."""
-    needed, least = memory_of_scan(num_points), memory_on_disk(num_points)
-    if needed <= limit:
-        return contextlib.nullcontext()
+def _check_limit(source: str, num_points: int, limit: int) -> None:
+    """Refuse a cloud that takes more memory than allowed even with its large arrays on a disk."""
+    least = memory_on_disk(num_points)
     if least > limit:
         raise ConfigError(
             f"{source}: expected --limit-memory of at least {least / 1e9:.2f} GB for about "
             f"{num_points:,} points, got {limit / 1e9:.2f} GB; raise it, or split the cloud."
         )
+
+
+def _arrays_of(
+    arguments: Arguments, source: str, target: Path, num_points: int, limit: int
+) -> contextlib.AbstractContextManager[None]:
+    """Return where the large arrays of a cloud are: in memory, or on a disk that has the room."""
+    _check_limit(source, num_points, limit)
+    needed = memory_of_scan(num_points)
+    if needed <= limit:
+        return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
     k = max(
         arguments.settings.resolved.normals.k, arguments.settings.resolved.normals.adaptive_k or 0
@@ -289,14 +268,16 @@ def _name_of(sources: tuple[Path, ...]) -> str:
     return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
 
 
-def _stream(arguments: Arguments, sources: tuple[Path, ...]) -> CloudStream:
-    """Open files as one cloud, and say what they do not share."""
+def _read(arguments: Arguments, sources: tuple[Path, ...]) -> Cloud:
+    """Read files as one cloud, and say what they do not share."""
     names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    streams = [stream_cloud(source, columns=names.of(source)) for source in sources]
-    stream, notes = merge_streams(streams)
-    for note in notes:
+    clouds = [read_cloud(path, columns=names.of(path)) for path in sources]
+    if len(clouds) == 1:
+        return clouds[0]
+    merged = merge_streams(list(map(CloudStream.of, clouds)))
+    for note in merged.notes:
         console.warn(f"{_name_of(sources)}: {note}.")
-    return stream
+    return merged.stream.read()
 
 
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
@@ -319,7 +300,7 @@ def _is_depth_image(cloud: Cloud) -> bool:
     return find_intrinsics(pixels) is not None
 
 
-def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]:
+def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> Record:
     """Return the provenance of a cloud of one file or of several."""
     settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
@@ -327,26 +308,28 @@ def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> dict[str, Any]
         provenance["columns"] = arguments.columns
     if arguments.voxel is not None:
         provenance["voxel"] = arguments.voxel
+    if arguments.superpoints:
+        provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     if len(sources) > 1:
         provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
     return provenance
 
 
 def _write_layout(
-    arguments: Arguments, target: Path, cloud: Cloud, seg: Segmentation, parts: Superpoints | None
+    arguments: Arguments,
+    target: Path,
+    cloud: Cloud,
+    seg: Segmentation,
+    superpoints: Superpoints | None,
 ) -> None:
     """Write a result in a layout, its folder ``target``."""
-    part = None if parts is None else [*parts.by_level().values()][arguments.level]
-    given = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
-    if arguments.layout in (None, "pointcept"):
-        fields = given if part is None else {**given, "superpoint": part}
-        origin = cloud.origin.tolist()
-        write_results(target, cloud.coordinates, seg, fields=fields, origin=origin)
-        return
-    source = CloudSource(layout=arguments.layout)
-    for note in source.notes(cloud):
+    layout, level = arguments.layout or "pointcept", None
+    if superpoints is not None:
+        level = [*superpoints.by_level().values()][arguments.level]
+    for note in note_on_origin(layout, cloud):
         console.warn(f"{cloud.source}: {note}.")
-    source.write(Scan(target.name, (), len(cloud)), target, cloud, given, seg, part)
+    arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
+    write_scan(layout, target.name, target, Reading(cloud, arrays, _DATASET), seg, level)
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
@@ -359,10 +342,11 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
         draw_planes(picture, result)
 
 
-def _report(source: str, seg: Segmentation, extent: Extent, target: str, seconds: float) -> None:
+def _report(source: str, seg: Segmentation, cloud: Cloud, target: str, seconds: float) -> None:
     """Print the line about a result, after a warning if there is no plane in it."""
     if len(seg.planes.count) == 0:
-        is_place = (extent.low == extent.high).all()
+        known = cloud.coordinates[cloud.finite]
+        is_place = (known == known[0]).all()
         reason = "all points are equal" if is_place else "no region is large enough"
         console.warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes.count)
