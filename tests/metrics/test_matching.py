@@ -62,10 +62,10 @@ def test_rounding_is_no_difference_and_another_place_is_one(points, one, other):
     assert same.tolist() == [7, 50]
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".npy", ".ply", ".pcd", ".las", ".laz", ".e57", ".xyz"])
+@pytest.mark.parametrize("suffix", [".npz", ".npy", ".ply", ".pcd", ".las", ".laz", ".xyz"])
 @pytest.mark.parametrize("place", [np.zeros(3), CORNER], ids=["near", "far"])
 def test_what_another_format_holds_is_the_same_cloud(tmp_path, points, suffix, place):
-    extra = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
+    extra = {".las": "laspy", ".laz": "laspy"}
     pytest.importorskip(extra[suffix]) if suffix in extra else None
     finite = points[np.isfinite(points).all(axis=1)] - CORNER + place
     write_cloud(tmp_path / f"a{suffix}", Cloud(finite))

@@ -21,14 +21,12 @@ from torchrg.batch.records import (
 from torchrg.batch.task import Converted, TaskReport, report_on
 from torchrg.datasets.pointcept import write_arrays
 from torchrg.errors import FormatError
-from torchrg.io import CloudStream
 from torchrg.io.files import check_place, make_mark, marked_parts, remove_leftovers, sync_folder
-from torchrg.io.stream import Extent
 from torchrg.result import describe_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation
 
 _LOOKED_AT = 10_000
-"""Points, spread over a cloud or its first chunk, that tell where most of its points are."""
+"""Points, spread over a cloud, that tell where most of its points are."""
 _MIDDLE = (0.25, 0.75)
 """Quantiles of each coordinate between which the middle half of a cloud lies."""
 _FAR_OFF = 1000
@@ -189,7 +187,7 @@ def convert_scan(job: Job) -> TaskReport:
     return report
 
 
-def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
+def check_finite(cloud: Cloud) -> tuple[str, ...]:
     """Return warnings if points of a cloud are missing, far off, or have lost digits.
 
     Raises:
@@ -199,9 +197,9 @@ def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
         ('2 of 3 points are not finite or beyond 1e+12; they stay in place, unlabelled',)
     """
-    extent = Extent.of(cloud) if isinstance(cloud, Cloud) else cloud.extent
-    num_points, num_bad = extent.num_points, extent.num_points - extent.num_finite
-    if extent.num_finite == 0:
+    known = cloud.coordinates if cloud.finite.all() else cloud.coordinates[cloud.finite]
+    num_bad = len(cloud) - len(known)
+    if len(known) == 0:
         raise FormatError(
             f"{cloud.source}: expected finite points, got none in {num_bad:,} points; those beyond "
             f"{FARTHEST:g} count as missing: use another unit, or look where they come from."
@@ -209,21 +207,19 @@ def check_finite(cloud: Cloud | CloudStream) -> tuple[str, ...]:
     notes = []
     if num_bad:
         notes.append(
-            f"{num_bad:,} of {num_points:,} points are not finite or beyond {FARTHEST:g}; they "
+            f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "
             "stay in place, unlabelled"
         )
-    first = cloud if isinstance(cloud, Cloud) else next(iter(cloud))
-    known = first.coordinates[first.finite][:: max(len(first) // _LOOKED_AT, 1)]
-    if len(known):
-        low, high = np.quantile(known, _MIDDLE, axis=0)
-        size, width = (extent.high - extent.low).max(), float((high - low).max())
-        if width > 0 and size > _FAR_OFF * width:
-            notes.append(
-                f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which "
-                "costs the others their precision; remove those that are none"
-            )
-            return tuple(notes)
-    return (*notes, first.precision_note) if first.precision_note else tuple(notes)
+    low, high = np.quantile(known[:: max(len(cloud) // _LOOKED_AT, 1)], _MIDDLE, axis=0)
+    ends = known.min(axis=0).astype(np.float64), known.max(axis=0).astype(np.float64)
+    size, width = float((ends[1] - ends[0]).max()), float((high - low).max())
+    if width > 0 and size > _FAR_OFF * width:
+        notes.append(
+            f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which "
+            "costs the others their precision; remove those that are none"
+        )
+        return tuple(notes)
+    return (*notes, cloud.precision_note) if cloud.precision_note else tuple(notes)
 
 
 def write_results(

@@ -25,16 +25,12 @@ from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import (
     RESULT_FIELDS,
-    CloudStream,
     check_output,
-    estimate_points,
-    merge_streams,
+    merge_clouds,
     read_cloud,
-    stream_cloud,
     write_cloud,
 )
 from torchrg.io.files import check_space
-from torchrg.io.stream import Extent
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.normals.sides import check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
@@ -190,16 +186,10 @@ def _segment(
 ) -> None:
     """Segment a cloud with a progress bar on a terminal, and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
-    stream = _stream(arguments, sources)
-    # Of text only reading says how many points there are.
-    num_points = stream.num_points or sum(map(estimate_points, sources))
-    limit = _limit_of(arguments)
-    where = _arrays_of(arguments, source, target, num_points, limit)
     names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    clouds = [read_cloud(path, columns=names.of(path)) for path in sources]
-    cloud = clouds[0]
-    if len(clouds) > 1:
-        cloud = merge_streams(list(map(CloudStream.of, clouds))).stream.read()
+    cloud = merge_clouds([read_cloud(path, columns=names.of(path)) for path in sources])
+    num_points, limit = len(cloud), _limit_of(arguments)
+    where = _arrays_of(arguments, source, target, num_points, limit)
     check_viewpoint(cloud, arguments.orient, "use --orient interior")
     towards = _side_of(arguments, source, cloud, memory_of_scan(num_points), limit)
     arguments = dataclasses.replace(arguments, orient=towards)
@@ -241,7 +231,7 @@ def _segment(
         found = " ".join(f"{int(level.max()) + 1:,}" for level in (parts.labels, *parts.levels))
         console.say(f"{source}: superpoints of each level: {found}")
     without = console.without(target, cloud.fields)
-    _report(source, seg, Extent.of(cloud), f"{target}{without}", time.perf_counter() - begin)
+    _report(source, seg, cloud, f"{target}{without}", time.perf_counter() - begin)
 
 
 def _oriented(cloud: Cloud, seg: Segmentation, arguments: Arguments) -> Segmentation:
@@ -311,16 +301,6 @@ def _name_of(sources: tuple[Path, ...]) -> str:
     return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
 
 
-def _stream(arguments: Arguments, sources: tuple[Path, ...]) -> CloudStream:
-    """Open files as one cloud, and say what they do not share."""
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    streams = [stream_cloud(source, columns=names.of(source)) for source in sources]
-    stream, notes = merge_streams(streams)
-    for note in notes:
-        console.warn(f"{_name_of(sources)}: {note}.")
-    return stream
-
-
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
     """Warn of what is not as it seems, before the work; refuse what cannot be written."""
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
@@ -381,10 +361,11 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
         draw_planes(picture, result)
 
 
-def _report(source: str, seg: Segmentation, extent: Extent, target: str, seconds: float) -> None:
+def _report(source: str, seg: Segmentation, cloud: Cloud, target: str, seconds: float) -> None:
     """Print the line about a result, after a warning if there is no plane in it."""
     if len(seg.planes.count) == 0:
-        is_place = (extent.low == extent.high).all()
+        kept = cloud.coordinates[cloud.finite]
+        is_place = (kept == kept[:1]).all()
         reason = "all points are equal" if is_place else "no region is large enough"
         console.warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes.count)

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+Fronts = tuple[NDArray[np.float32] | None, tuple[str, ...]]
+"""Front of each point of a cloud, as :attr:`torchrg.Cloud.front`, and notes on it."""
 _CORNERS_AT_ONCE = 1 << 18
 """Corners of faces that are added up together, which take some tens of megabytes."""
 _LONGEST_LIST = 1 << 20
