@@ -7,6 +7,7 @@ from torchrg.cli import main
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
+
 def literal_groups(lines):
     """What abspy reads: points up to the colours, and the line after each number of points."""
     end = next(i for i, line in enumerate(lines) if "num_colors" in line)
