@@ -58,9 +58,10 @@ _UNFIT_DESCRIPTION = "more than the standard one holds"
 program gave such a name."""
 LARGEST_INTEGER = 2**31 - 1
 """Largest coordinate of a LAS file, in steps of its scale from its offset."""
-_VERSION_AT, _RECORDS_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 100, 107, 235, 247
-"""Places in the header: minor version, number of records, of points, extended records, and the
-number of points of 64 bits that version 1.4 has beside the old one, which may be 0 there."""
+_VERSION_AT, _START_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 96, 107, 235, 247
+"""Places in the header: minor version, first byte of points and number of records, number of
+points, extended records, and the number of points of 64 bits that version 1.4 has beside the old
+one, which may be 0 there."""
 _DATE_AT, _DATE_BYTES = 90, 4
 """Place in the header of the day and the year of creation, and how many bytes they are."""
 
@@ -343,8 +344,9 @@ def _check_header(path: Path, size: int) -> None:
         head = stream.read(255)
         if head[:4] != b"LASF" or len(head) < 227:
             raise FormatError(f"{path}: byte 0: expected the header of a LAS file; fetch it again.")
-        (num_records,) = struct.unpack_from("<I", head, _RECORDS_AT)
-        check_promise(path, _RECORDS_AT, 54 * num_records, "header records", available=size)
+        start, num_records = struct.unpack_from("<II", head, _START_AT)
+        check_promise(path, _START_AT, start, "what comes before points", available=size)
+        check_promise(path, _START_AT + 4, 54 * num_records, "header records", available=size)
         if head[_VERSION_AT] < 4 or len(head) < 247:
             return
         start, num_extended = struct.unpack_from("<QI", head, _EXTENDED_AT)

@@ -7,13 +7,14 @@ Arrays of another length are left out, and so is what a result says about its pl
 :data:`torchrg.io.fields.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
 """
 
+import io
 import json
 import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -51,6 +52,8 @@ _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
 _BYTES_AT_ONCE = 1 << 20
 """Bytes that are unpacked together, which bounds the memory."""
+_LONGEST_HEADER = 1 << 16
+"""Bytes that are read of an array to find its header, which NumPy takes up to 10,000 of."""
 _EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every array in an archive, the earliest that there is, so that equal results give equal
 bytes."""
@@ -58,34 +61,30 @@ bytes."""
 
 def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
     """Read a ``.npy`` file; ``columns`` are names for those of an array that has none."""
-    with path.open("rb") as stream:
-        layout = _read_header(path, stream, size, content="the array")
-        shape, names = layout.shape, layout.dtype.names
-        if names is None and (len(shape) != 2 or shape[1] < 3):
-            raise FormatError(
-                f"{path}: expected an array of shape (N, 3) or wider, got {shape}; reshape it."
-            )
-        if names is None:
-            check_coordinates(path, (shape[0], 3), layout.dtype)
-            if columns is not None:
-                check_names(path, columns, shape[1])
-        elif columns is not None:
+    shape, dtype = _check_npy(path, size)
+    names = dtype.names
+    if names is not None:
+        if columns is not None:
             raise FormatError(
                 f"{path}: expected no names for columns, as its fields have some: "
                 f"{', '.join(names)}; leave them out."
             )
-        values = _read_values(stream, layout)
-    if names is None:
-        return assemble_table(path, values, columns)
-    flat = values.reshape(-1)
-    return assemble_cloud(path, {name: flat[name] for name in names})
+        records = np.load(path, allow_pickle=False).reshape(-1)
+        return assemble_cloud(path, {name: records[name] for name in records.dtype.names})
+    if len(shape) != 2 or shape[1] < 3:
+        raise FormatError(
+            f"{path}: expected an array of shape (N, 3) or wider, got {shape}; reshape it."
+        )
+    check_coordinates(path, (shape[0], 3), dtype)
+    if columns is not None:
+        check_names(path, columns, shape[1])
+    return assemble_table(path, np.load(path, allow_pickle=False), columns)
 
 
 def count_npy(path: Path, size: int) -> int:
     """Return the number of points: of rows, or of all records."""
-    with path.open("rb") as stream:
-        layout = _read_header(path, stream, size, content="the array")
-    return layout.num_rows if layout.dtype.names is None else math.prod(layout.shape)
+    shape, dtype = _check_npy(path, size)
+    return math.prod(shape if dtype.names is not None else shape[:1])
 
 
 def write_npy(path: Path, cloud: Cloud) -> None:
@@ -97,20 +96,14 @@ def write_npy(path: Path, cloud: Cloud) -> None:
 
 def read_npz(path: Path, size: int) -> Cloud:
     """Read a ``.npz`` file."""
+    # What is left out is read, too, so that damage in it is told.
     with _open_archive(path) as archive:
-        layouts = _layouts(path, archive, size)
-        coordinates = _name_of_coordinates(path, layouts)
-        shape = layouts[coordinates].shape
-        check_coordinates(path, shape, layouts[coordinates].dtype)
-        columns, others = dict[str, Values](), list[str]()
-        for name, layout in layouts.items():
-            if layout.shape[:1] == shape[:1] and name not in _NOT_PER_POINT:
-                columns[name] = _read_member(path, archive, name, layout)
-                continue
-            # What is left out is read, too, so that damage in it is told.
-            _check_bytes(path, archive, name)
-            if name not in _NOT_PER_POINT:
-                others.append(name)
+        shapes = _check_members(path, archive, size)
+        coordinates, shape = _find_coordinates(path, shapes)
+        arrays = {name: _read_member(path, archive, name) for name in shapes}
+    arrays = {name: values for name, values in arrays.items() if name not in _NOT_PER_POINT}
+    others = [name for name, values in arrays.items() if values.shape[:1] != shape[:1]]
+    columns = {name: values for name, values in arrays.items() if name not in others}
     notes = (f"{', '.join(others)} left out: not of {shape[0]:,} rows",) if others else ()
     return assemble_cloud(path, columns, coordinates=coordinates, notes=notes)
 
@@ -118,24 +111,17 @@ def read_npz(path: Path, size: int) -> Cloud:
 def count_npz(path: Path, size: int) -> int:
     """Return the number of rows of the coordinates."""
     with _open_archive(path) as archive:
-        layouts = _layouts(path, archive, size)
-    return layouts[_name_of_coordinates(path, layouts)].num_rows
+        return _find_coordinates(path, _check_members(path, archive, size))[1][0]
 
 
-def _layouts(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, "_Layout"]:
-    """Return the layouts of the arrays of an archive by their names."""
-    return {
-        member.filename.removesuffix(".npy"): _check_member(path, archive, member, size)
-        for member in archive.infolist()
-        if member.filename.endswith(".npy")
-    }
-
-
-def _name_of_coordinates(path: Path, layouts: Mapping[str, "_Layout"]) -> str:
-    """Return the name of the array of an archive that holds coordinates."""
+def _find_coordinates(
+    path: Path, layouts: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
+) -> tuple[str, tuple[int, ...]]:
+    """Return the name and the shape of the array of an archive that holds coordinates."""
     for name in _COORDINATES:
         if name in layouts:
-            return name
+            check_coordinates(path, *layouts[name])
+            return name, layouts[name][0]
     names = ", ".join(map(repr, layouts)) or "none"
     raise FormatError(
         f"{path}: expected an array points (or coord), got {names}; rename the coordinates."
@@ -146,11 +132,8 @@ def read_beside(path: Path) -> dict[str, Values]:
     """Return what a ``.npz`` file says beside its points: table of planes, provenance."""
     size = check_file(path)
     with _open_archive(path) as archive:
-        return {
-            name: _read_member(path, archive, name, layout)
-            for name, layout in _layouts(path, archive, size).items()
-            if name in _NOT_PER_POINT
-        }
+        names = _check_members(path, archive, size).keys() & _NOT_PER_POINT
+        return {name: _read_member(path, archive, name) for name in names}
 
 
 def write_npz(
@@ -225,29 +208,10 @@ def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
 
 def map_array(path: Path) -> Values:
     """Map the array of a ``.npy`` file into memory, copy-on-write: no change reaches the file."""
-    size = check_file(path)
-    with path.open("rb") as stream:
-        shape = _read_header(path, stream, size, content="the array").shape
+    shape, _ = _check_npy(path, check_file(path))
     # There is nothing to map in an empty array, and trying fails.
     values = np.load(path, mmap_mode=None if 0 in shape else "c", allow_pickle=False)
     return np.asarray(values)
-
-
-class _Layout(NamedTuple):
-    """What the header of an array says, and at which byte its values begin.
-
-    In Fortran's order the first index runs fastest, so that columns are whole and not rows.
-    """
-
-    shape: tuple[int, ...]
-    is_fortran: bool
-    dtype: np.dtype[Any]
-    start: int
-
-    @property
-    def num_rows(self) -> int:
-        """Length of the array; one of a bare number."""
-        return self.shape[0] if self.shape else 1
 
 
 @contextmanager
@@ -267,64 +231,53 @@ def _refusing_member(path: Path, name: str) -> AbstractContextManager[None]:
     return refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again")
 
 
-def _check_member(
-    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, size: int
-) -> _Layout:
-    """Return the layout of an array of an archive, of which there are as many bytes as needed."""
-    if member.compress_type not in _LARGEST_RATIO:
-        raise FormatError(
-            f"{path}: expected {member.filename!r} stored or deflated, got compression "
-            f"{member.compress_type}; write it with numpy.savez."
-        )
-    content = repr(member.filename)
-    most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
-    check_promise(path, member.header_offset, member.file_size, content, available=most)
-    name = member.filename.removesuffix(".npy")
-    with _refusing_member(path, name), archive.open(member) as stream:
-        return _read_header(path, stream, member.file_size, content=content)
+def _check_members(
+    path: Path, archive: zipfile.ZipFile, size: int
+) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+    """Return shape and type of the arrays of an archive, of which all bytes can be there."""
+    layouts = {}
+    for member in archive.infolist():
+        if not member.filename.endswith(".npy"):
+            continue
+        if member.compress_type not in _LARGEST_RATIO:
+            raise FormatError(
+                f"{path}: expected {member.filename!r} stored or deflated, got compression "
+                f"{member.compress_type}; write it with numpy.savez."
+            )
+        content, name = repr(member.filename), member.filename.removesuffix(".npy")
+        most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
+        check_promise(path, member.header_offset, member.file_size, content, available=most)
+        with _refusing_member(path, name), archive.open(member) as stream:
+            layouts[name] = _check_array(path, stream, member.file_size, content)
+    return layouts
 
 
-def _check_bytes(path: Path, archive: zipfile.ZipFile, name: str) -> None:
-    """Read a member to its end, where its checksum is compared."""
+def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
+    """Read one array of an archive, and on to its end, where its checksum is compared."""
     with _refusing_member(path, name), archive.open(f"{name}.npy") as stream:
-        _read_to_end(stream)
-
-
-def _read_member(path: Path, archive: zipfile.ZipFile, name: str, layout: _Layout) -> Values:
-    """Read one array of an archive, and its checksum."""
-    with _refusing_member(path, name), archive.open(f"{name}.npy") as stream:
-        stream.read(layout.start)
-        values = _read_values(stream, layout)
-        _read_to_end(stream)
+        values: Values = npy_format.read_array(stream, allow_pickle=False)
+        while stream.read(_BYTES_AT_ONCE):
+            pass
         return values
 
 
-def _read_to_end(stream: IO[bytes]) -> None:
-    """Read on to the end of a member, where its checksum is compared."""
-    while stream.read(_BYTES_AT_ONCE):
-        pass
+def _check_npy(path: Path, size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of the array of a ``.npy`` file, all of whose bytes are there."""
+    with path.open("rb") as stream:
+        return _check_array(path, stream, size, "the array")
 
 
-def _read_values(stream: IO[bytes], layout: _Layout) -> Values:
-    """Read the values of an array, at which the stream is."""
-    values = np.empty(layout.shape, layout.dtype, "F" if layout.is_fortran else "C")
-    memory = values.reshape(-1, order="A").view(np.uint8).data
-    done = 0
-    while done < len(memory):
-        got = stream.readinto(memory[done : done + _BYTES_AT_ONCE])  # type: ignore[attr-defined]
-        if not got:
-            raise EOFError(f"EOF: reading array data, expected {len(memory)} bytes got {done}")
-        done += got
-    return values
-
-
-def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> _Layout:
-    """Read the header of an array and check it against the ``size`` bytes that are there."""
+def _check_array(
+    path: Path, stream: IO[bytes], size: int, content: str
+) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of an array, checked against the ``size`` bytes that are there."""
     message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
     repair = "; write it again with numpy.save or numpy.savez"
     with refusing(message, *DAMAGES, repair=repair):
-        layout = _read_layout(stream)
-    shape, _, dtype, start = layout
+        head = io.BytesIO(stream.read(_LONGEST_HEADER))
+        is_old = npy_format.read_magic(head) == (1, 0)
+        read = npy_format.read_array_header_1_0 if is_old else npy_format.read_array_header_2_0
+        shape, _, dtype = read(head)
     if dtype.hasobject:
         raise FormatError(
             f"{path}: expected numbers or text in {content}, got pickled Python objects, which are "
@@ -335,19 +288,6 @@ def _read_header(path: Path, stream: IO[bytes], size: int, *, content: str) -> _
             f"{path}: byte 0: expected a shape and a type in {content}, got {shape} of {dtype}; "
             "write it again."
         )
-    promised = math.prod(shape) * dtype.itemsize
+    promised, start = math.prod(shape) * dtype.itemsize, head.tell()
     check_promise(path, start, promised, f"{content} of shape {shape}", available=size - start)
-    return layout
-
-
-def _read_layout(stream: IO[bytes]) -> _Layout:
-    """Read what the header of an array says."""
-    version = npy_format.read_magic(stream)
-    read = npy_format.read_array_header_1_0
-    if version != (1, 0):
-        read = npy_format.read_array_header_2_0
-    shape, is_fortran, dtype = read(stream)
-    if version == (3, 0) and dtype.names is not None:
-        # Version 3 is version 2 with another encoding of field names.
-        dtype.names = tuple(name.encode("latin-1").decode("utf-8") for name in dtype.names)
-    return _Layout(tuple(shape), is_fortran, dtype, stream.tell())
+    return shape, dtype

@@ -9,8 +9,8 @@ import io
 import struct
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -27,10 +27,10 @@ from torchrg.io.columns import (
     slices,
     write_records,
 )
-from torchrg.io.faces import BrokenFacesError, Fronts, ListOf, find_fronts, split_lists
+from torchrg.io.faces import BrokenFacesError, Fronts, check_list, find_fronts, stack_faces
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import check_promise
-from torchrg.io.text import LINES_AT_ONCE, read_rows, words_of
+from torchrg.io.text import read_rows, words_of
 from torchrg.structures import Cloud
 
 _TYPES = {
@@ -48,8 +48,8 @@ _NUMPY_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", 
 _READ_TYPES = _TYPES | {
     name: np.dtype(name).str[1:] for name in (*_NUMPY_NAMES, "float32", "float64")
 }
-_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
-"""Letters of the module struct by NumPy's codes of whole numbers."""
+_LETTERS = {code: np.dtype(code).char for code in _TYPES.values()} | {"i8": "q", "u8": "Q"}
+"""Letters of the module struct by NumPy's codes."""
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
 """Bytes of the longest header; a longer one is taken for damage."""
@@ -367,17 +367,32 @@ def _corners_of_binary(
         yield records[name + _LIST].astype(np.int64)
         done += wanted
     stream.seek(start + done * dtype.itemsize)
-    lists, tail = _layout(faces, header.byte_order)
-    code = next(np.dtype(header.byte_order + p.code) for p in faces.properties if p.name == name)
+    yield from stack_faces(
+        _faces_of_bytes(stream, faces, header.byte_order), faces.num_records - done
+    )
 
-    def gather(data: bytes, starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
-        raw = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(length * code.itemsize)]
-        read: Values = np.frombuffer(raw.tobytes(), code)
-        corners: NDArray[np.int64] = read.astype(np.int64).reshape(len(starts), length)
-        return corners
 
-    blocks = iter(partial(stream.read, _BYTES_AT_ONCE), b"")
-    yield from split_lists(blocks, lists, tail, faces.num_records - done, gather)
+def _faces_of_bytes(
+    stream: BinaryIO, element: _Element, byte_order: str
+) -> Iterator[tuple[float, ...]]:
+    """Yield the vertices of the faces from here to the end of a binary file."""
+
+    def take(code: str, count: int) -> tuple[float, ...]:
+        form = f"{byte_order}{count}{_LETTERS[code]}"
+        raw = stream.read(struct.calcsize(form))
+        return struct.unpack(form, raw)
+
+    corners: tuple[float, ...] = ()
+    with suppress(struct.error):  # Raised at the end of the file.
+        while True:
+            for prop in element.properties:
+                length = 1
+                if prop.length_code is not None:
+                    length = check_list(take(prop.length_code, 1)[0], np.dtype(prop.code).itemsize)
+                values = take(prop.code, length)
+                if prop.name in _CORNERS and prop.length_code is not None:
+                    corners = values
+            yield corners
 
 
 def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator[NDArray[np.int64]]:
@@ -385,51 +400,27 @@ def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator
     stream.seek(header.num_bytes)
     *before, faces = header.elements
     counts = [element.num_records for element in before]
-    lines = islice(stream, sum(counts[:vertex]), None)
+    lines = islice(stream, min(sum(counts[:vertex]), sys.maxsize), None)
     between = min(sum(counts[vertex:]), sys.maxsize)
     lines = islice((line for line in lines if line.strip()), between, None)
-
-    def words() -> Iterator[list[float]]:
-        while block := list(islice(lines, LINES_AT_ONCE)):
-            try:
-                yield [float(word) for line in block for word in line.split()]
-            except ValueError as error:
-                raise BrokenFacesError(str(error)[:_SHOWN]) from None
-
-    def gather(data: list[float], starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
-        corners: NDArray[np.int64] = np.array(data)[starts[:, None] + np.arange(length)].astype(int)
-        return corners
-
-    lists, tail = _layout(faces, header.byte_order)
-    return split_lists(words(), lists, tail, faces.num_records, gather)
+    return stack_faces((_face_of_line(line, faces) for line in lines), faces.num_records)
 
 
-def _layout(element: _Element, byte_order: str) -> tuple[list[ListOf], int]:
-    """Return the lists of an element, and how much stands behind the last of them."""
-    lists, skipped = list[ListOf](), 0
-
-    def size(code: str) -> int:
-        return np.dtype(code).itemsize if byte_order else 1
-
+def _face_of_line(line: bytes, element: _Element) -> list[float]:
+    """Return the vertices of the face of a line."""
+    try:
+        words = [float(word) for word in line.split()]
+    except ValueError as error:
+        raise BrokenFacesError(str(error)[:_SHOWN]) from None
+    place, corners = 0, list[float]()
     for prop in element.properties:
-        if prop.length_code is None:
-            skipped += size(prop.code)
-            continue
-        read = _word_as_length
-        if byte_order:
-            read = partial(_read_length, struct.Struct(byte_order + _LETTERS[prop.length_code]))
-        is_corners = prop.name in _CORNERS
-        lists.append(ListOf(skipped, read, size(prop.length_code), size(prop.code), is_corners))
-        skipped = 0
-    return lists, skipped
-
-
-def _read_length(form: struct.Struct, data: bytes, place: int) -> int:
-    """Return the length of a list that begins at a byte."""
-    length: int = form.unpack_from(data, place)[0]
-    return length
-
-
-def _word_as_length(data: list[float], place: int) -> int:
-    """Return the length of a list that begins with a word; -1 for one that is none."""
-    return int(data[place]) if 0 <= data[place] < sys.maxsize else -1
+        length = 1
+        if prop.length_code is not None:
+            length = check_list(words[place] if place < len(words) else -1, 1)
+            place += 1
+        if prop.name in _CORNERS and prop.length_code is not None:
+            corners = words[place : place + length]
+        place += length
+    if place > len(words):
+        raise BrokenFacesError("a line of too few numbers")
+    return corners
