@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.e57 import SYSTEM
-from torchrg.io.fields import WIDEN, Values
 from torchrg.io.las import LARGEST_INTEGER
 from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.structures import Cloud
@@ -20,25 +18,17 @@ _SUSPICIOUS_RATIO = 100
 less, and a cloud in centimetres differs from one in metres by this much."""
 _PROJECTION = "LASF_Projection"
 """Owner of the records that say in which coordinates a LAS file is."""
-_ENTRIES = {
-    "las": "LAS header",
-    "scans": "poses of scans",
-    SYSTEM: "coordinate system",
-    "viewpoint": "viewpoint",
-}
-"""Entries of the header of a cloud, for people."""
 
 
 def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
     """Put the points of several clouds one after the other, with the fields that they share.
 
     Convention:
-        A field is kept if every cloud has it with as many columns, numbers all or text all, or is a
-        LAS file in which it is zero and therefore left out; it has the type that holds all of them,
-        and colours of 8 bits become such of 16 where another cloud has these. Coordinates are
-        float64 if any are. Scans of E57 files are numbered on. Of the headers that is kept in which
-        all agree, and of LAS files one with the finest scale, if they have the same dimensions and
-        its grid reaches all points. The notes say what is left out.
+        A field is kept if every cloud has it with as many columns of one kind of numbers, and
+        colours of as many bits. Coordinates are float64 if any are. Of the headers that is kept in
+        which all agree; of LAS files it is one with the finest scale, if they have the same
+        dimensions and its grid reaches all points; of E57 files all scans. The notes say in one
+        line what is left out.
 
     Args:
         clouds: The clouds, at least one; their coordinates are taken to be of one frame and unit.
@@ -59,70 +49,39 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
         return clouds[0]
     notes = [f"{cloud.source}: {note}" for cloud in clouds for note in cloud.notes]
     notes += _check_systems(clouds)
-    fields, header = dict[str, Values](), _common_header(clouds)
-    lost = list[str]()
-    for name in dict.fromkeys(name for cloud in clouds for name in cloud.fields):
-        values = _field(name, clouds)
-        if values is None:
-            lost.append(name)
-        else:
-            fields[name] = values
-    lost += [
-        words
-        for kind, words in _ENTRIES.items()
-        if kind not in header
-        and any(cloud.header.get(kind, DEFAULT_VIEWPOINT) != DEFAULT_VIEWPOINT for cloud in clouds)
-    ]
+    header = _common_header(clouds)
+    names = dict.fromkeys(name for cloud in clouds for name in cloud.fields)
+    shared = [name for name in names if len({_kind(name, cloud) for cloud in clouds}) == 1]
+    lost = [name for name in names if name not in shared]
+    lost += dict.fromkeys(
+        f"{kind} of the header"
+        for cloud in clouds
+        for kind, entry in cloud.header.items()
+        if kind not in header and entry != DEFAULT_VIEWPOINT
+    )
     if lost:
         notes.append(f"left out, as not all files have them alike: {', '.join(lost)}")
     times = Counter(cloud.source for cloud in clouds if cloud.source)
     notes += [f"{name} is taken {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(clouds)
+    fronts = [np.zeros((len(c), 3), np.float32) if c.front is None else c.front for c in clouds]
+    has_front = any(cloud.front is not None for cloud in clouds)
     return Cloud(
         np.concatenate([cloud.coordinates for cloud in clouds]),
-        fields,
+        {name: np.concatenate([cloud.fields[name] for cloud in clouds]) for name in shared},
         source=f"{clouds[0].source} and {len(clouds) - 1} more",
         header=header,
         notes=tuple(notes),
-        front=_fronts(clouds),
+        front=np.concatenate(fronts) if has_front else None,
     )
 
 
-def _field(name: str, clouds: Sequence[Cloud]) -> Values | None:
-    """Return a field of all clouds, or None if they do not share it."""
-    if name == "scan" and all("scans" in cloud.header for cloud in clouds):
-        starts = np.cumsum([0, *(len(cloud.header["scans"]) for cloud in clouds)])
-        scans = [cloud.fields.get("scan", np.zeros(len(cloud), np.int32)) for cloud in clouds]
-        numbers = [scan + start for scan, start in zip(scans, starts, strict=False)]
-        return np.concatenate(numbers).astype(np.int32)
-    known = [cloud.fields[name] for cloud in clouds if name in cloud.fields]
-    kinds = {"number" if values.dtype.kind in "biuf" else values.dtype.kind for values in known}
-    if len({values.shape[1:] for values in known}) > 1 or len(kinds) > 1:
-        return None
-    if not all(name in cloud.fields or _is_zero(cloud, name) for cloud in clouds):
-        return None
-    shape, dtype = known[0].shape[1:], np.result_type(*(values.dtype for values in known))
-    parts = [cloud.fields.get(name, np.zeros((len(cloud), *shape), dtype)) for cloud in clouds]
-    if name == "color" and dtype == np.uint16:
-        parts = [p.astype(dtype) * WIDEN if p.dtype == np.uint8 else p for p in parts]
-    return np.concatenate(parts)
-
-
-def _is_zero(cloud: Cloud, name: str) -> bool:
-    """Whether a field that is not there is a dimension of the LAS file that is zero everywhere."""
-    header = cloud.header.get("las")
-    known = () if header is None else set(header.point_format.standard_dimension_names)
-    return ("red" if name == "color" else name) in known
-
-
-def _fronts(clouds: Sequence[Cloud]) -> NDArray[np.float32] | None:
-    """Return the fronts of all points, zero where a cloud has none."""
-    if all(cloud.front is None for cloud in clouds):
-        return None
-    nothing = [np.zeros((len(cloud), 3), np.float32) for cloud in clouds]
-    return np.concatenate(
-        [zero if c.front is None else c.front for c, zero in zip(clouds, nothing, strict=True)]
-    )
+def _kind(name: str, cloud: Cloud) -> object:
+    """Return what two clouds have to share of a field, which no two do of numbers of scans."""
+    values = cloud.fields.get(name)
+    if values is None or (name == "scan" and "scans" in cloud.header):
+        return id(cloud)
+    return values.shape[1:], values.dtype if name == "color" else values.dtype.kind
 
 
 def _note_sizes(clouds: Sequence[Cloud]) -> list[str]:
@@ -143,34 +102,30 @@ def _note_sizes(clouds: Sequence[Cloud]) -> list[str]:
 
 def _common_header(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
     """Return the entries of the headers in which all clouds agree, and all scans."""
-    headers, first = [cloud.header for cloud in clouds], clouds[0].header
-    kinds = [kind for kind in first if all(kind in header for header in headers)]
-    common = {
-        kind: first[kind]
-        for kind in kinds
-        if kind not in ("las", "scans") and all(h[kind] == first[kind] for h in headers)
-    }
-    if "scans" in kinds:
-        common["scans"] = tuple(scan for header in headers for scan in header["scans"])
-    if "las" in kinds and (header := _common_las(clouds)) is not None:
-        common["las"] = header
+    headers = [cloud.header for cloud in clouds]
+    common = dict[str, Any]()
+    for kind, entry in headers[0].items():
+        if not all(kind in header for header in headers):
+            continue
+        if kind == "scans":
+            common[kind] = tuple(scan for header in headers for scan in header[kind])
+        elif kind == "las":
+            common |= _common_las(clouds)
+        elif all(header[kind] == entry for header in headers):
+            common[kind] = entry
     return common
 
 
-def _common_las(clouds: Sequence[Cloud]) -> Any | None:  # noqa: ANN401
-    """Return the header of a LAS file with a grid for all, if their dimensions are the same.
-
-    It is that of the first file that has GPS times, as it says from which moment they count.
-    """
-    formats = [cloud.header["las"].point_format for cloud in clouds]
+def _common_las(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
+    """Return the header of the first LAS file with a grid for all, if their dimensions agree."""
+    headers = [cloud.header["las"] for cloud in clouds]
     # As text, because the scales of a dimension of several elements do not compare to one truth.
-    if len({repr((each.id, [*each.dimensions])) for each in formats}) > 1:
-        return None
-    first = next((cloud for cloud in clouds if "gps_time" in cloud.fields), clouds[0])
-    header = copy.deepcopy(first.header["las"])
-    header.scales = np.min([cloud.header["las"].scales for cloud in clouds], axis=0)
+    if len({repr((h.point_format.id, [*h.point_format.dimensions])) for h in headers}) > 1:
+        return {}
+    header = copy.deepcopy(headers[0])
+    header.scales = np.min([each.scales for each in headers], axis=0)
     farthest = max(np.abs(cloud.coordinates - header.offsets).max() for cloud in clouds)
-    return header if farthest <= LARGEST_INTEGER * header.scales.min() else None
+    return {"las": header} if farthest <= LARGEST_INTEGER * header.scales.min() else {}
 
 
 def _check_systems(clouds: Sequence[Cloud]) -> list[str]:

@@ -6,6 +6,7 @@ needs every header line in place, and writes ASCII with ten decimals.
 """
 
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -90,7 +91,7 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
 
 
 class _Header(NamedTuple):
-    """What a header says, and how long it is.
+    """What a header says, and how many lines it has.
 
     A point has ``dtype``, whose padding fields are called ``_ 0``, ``_ 1`` and so on; a cloud
     without order is one row of ``width`` points.
@@ -102,7 +103,6 @@ class _Header(NamedTuple):
     viewpoint: tuple[float, ...]
     encoding: str
     num_lines: int
-    num_bytes: int
 
     @property
     def num_points(self) -> int:
@@ -147,9 +147,8 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     encoding = " ".join(entries.words("DATA"))
     if encoding not in _ENCODINGS:
         raise entries.error("DATA", f"one of {', '.join(_ENCODINGS)}")
-    viewpoint = entries.numbers("VIEWPOINT", 7, DEFAULT_VIEWPOINT)
-    dtype = _record_type(entries)
-    return _Header(dtype, width, height, viewpoint, encoding, number, stream.tell())
+    dtype, viewpoint = _record_type(entries), entries.viewpoint()
+    return _Header(dtype, width, height, viewpoint, encoding, number)
 
 
 class _Entries(NamedTuple):
@@ -187,17 +186,15 @@ class _Entries(NamedTuple):
             raise self.error(key, "a size that fits a file")
         return [int(word) for word in words]
 
-    def numbers(self, key: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
-        """Return numbers after a key."""
-        if key not in self.lines:
-            return default
-        try:
-            values = tuple(float(word) for word in self.words(key))
-        except ValueError:
-            values = ()
-        if len(values) != count:
-            raise self.error(key, f"{count} numbers")
-        return values
+    def viewpoint(self) -> tuple[float, ...]:
+        """Return position and quaternion of the sensor."""
+        if "VIEWPOINT" not in self.lines:
+            return DEFAULT_VIEWPOINT
+        with suppress(ValueError):
+            values = tuple(map(float, self.words("VIEWPOINT")))
+            if len(values) == len(DEFAULT_VIEWPOINT):
+                return values
+        raise self.error("VIEWPOINT", "7 numbers")
 
 
 def _record_type(entries: _Entries) -> np.dtype[np.void]:
@@ -233,23 +230,17 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Valu
         (name, "f8" if _is_padding(name) else header.dtype[name].base, header.dtype[name].shape)
         for name in header.dtype.names or ()
     ]
+    line_number = header.num_lines + 1
     return read_rows(
-        path,
-        stream,
-        np.dtype(parts),
-        start=header.num_bytes,
-        num_rows=header.num_points,
-        size=size,
-        num_lines=header.num_lines,
-        content="points",
+        path, stream, np.dtype(parts), header.num_points, "points", line_number=line_number
     )
 
 
 def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the points of a binary file."""
     promised, content = header.num_points * header.dtype.itemsize, f"{header.num_points:,} points"
-    check_promise(path, header.num_bytes, promised, content, available=size - header.num_bytes)
-    stream.seek(header.num_bytes)
+    start = stream.tell()
+    check_promise(path, start, promised, content, available=size - start)
     return np.fromfile(stream, header.dtype, count=header.num_points)
 
 
@@ -261,9 +252,8 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     # PCL leaves padding out of the block; writers that copy whole records do not.
     needed = header.num_points * sum(header.dtype[name].itemsize for name in names)
     padded = header.num_points * header.dtype.itemsize
-    start = header.num_bytes
+    start = stream.tell()
     check_promise(path, start, 8, "two block sizes", available=size - start)
-    stream.seek(start)
     packed_size, full_size = struct.unpack("<II", stream.read(8))
     content = f"a block of {header.num_points:,} points"
     start += 8

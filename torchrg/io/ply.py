@@ -324,12 +324,10 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Valu
         path,
         stream,
         np.dtype([(prop.name, prop.code) for prop in vertex.properties]),
-        num_rows=vertex.num_records,
-        size=size,
-        num_lines=header.num_lines,
-        start=header.num_bytes,
+        vertex.num_records,
+        "vertices",
+        line_number=header.num_lines + 1,
         skipped=sum(element.num_records for element in before),
-        content="vertices",
     )
 
 

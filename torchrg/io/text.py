@@ -8,6 +8,7 @@ in ASCII files of other formats are read here, too.
 """
 
 import csv
+import os
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -97,27 +98,25 @@ def read_rows(
     path: Path,
     stream: BinaryIO,
     dtype: np.dtype[Any],
-    *,
-    start: int,
     num_rows: int,
-    size: int,
-    num_lines: int,
-    skipped: int = 0,
     content: str,
+    *,
+    line_number: int,
+    skipped: int = 0,
 ) -> Values:
-    """Read rows of a structured type from an ASCII file of ``size`` bytes.
+    """Read rows of a structured type from an ASCII file that is open behind its header.
 
-    The header has ``num_lines`` lines and ends before byte ``start``; ``skipped`` lines come before
-    the rows, of which the header promises ``num_rows``. ``content`` is what rows are, for messages.
+    Its next line has this number; so many lines are skipped before the rows. ``content`` is what
+    rows are, for messages.
     """
     # A digit and what separates it from the next; the last may end with the file.
-    least = num_rows * _num_columns(dtype) * 2 - 1
+    least, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
+    available = os.fstat(stream.fileno()).st_size - start
     content = f"{num_rows:,} {content}"
-    check_promise(path, start, least, content, available=size - start, at_least=True)
-    stream.seek(start)
+    check_promise(path, start, least, content, available=available, at_least=True)
     lines = (raw.decode("latin-1") for raw in stream)
-    first_line = num_lines + 1 + sum(1 for _ in islice(lines, min(skipped, sys.maxsize)))
-    return _read_table(path, lines, dtype, first_line, num_rows=num_rows)
+    line_number += sum(1 for _ in islice(lines, min(skipped, sys.maxsize)))
+    return _read_table(path, lines, dtype, line_number, num_rows=num_rows)
 
 
 def _read_table(
