@@ -166,6 +166,7 @@ def array_bytes(shape, descr="'<f8'", data=b""):
         (array_bytes((4, 3), "'<q9'"), "byte 0: expected the header of a NumPy array"),
         (array_bytes("(4, 3", data=b"0" * 96), "byte 0: expected the header of a NumPy array"),
         (array_bytes("('a', 3)", data=b"0" * 96), "byte 0: expected the header of a NumPy array"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff{", "byte 0: expected the header of a NumPy array"),
         (b"\x93NUMPY\x09\x00", "byte 0: expected the header of a NumPy array"),
         (b"\x93NUM", "byte 0: expected the header of a NumPy array"),
     ],

@@ -58,7 +58,7 @@ class Format(NamedTuple):
 
 
 RESULT_FIELDS = ("labels", "normals", "curvature")
-"""What a segmentation writes of each point beside the fields of the cloud."""
+"""Fields that a segmentation adds to those of a cloud."""
 FORMATS: dict[str, Format] = {
     ".npz": Format(read_npz, count_npz, write_npz),
     ".npy": Format(read_npy, count_npy, write_npy, takes_columns=True),

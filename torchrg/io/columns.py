@@ -96,14 +96,14 @@ def _storable(path: Path, name: str, values: Values, spelling: Spelling) -> Valu
 
 def _spread(name: str, values: Values, spelling: Spelling) -> list[tuple[str, Values]]:
     """Cut a field into named columns."""
-    names = spell(name, values.shape[1:], spelling)
+    names = _spell(name, values.shape[1:], spelling)
     parts = [values.reshape(-1)] if values.shape[1:] == (1,) else [values]
     if len(names) > 1:
         parts = [values[:, i] for i in range(len(names))]
     return list(zip(names, parts, strict=True))
 
 
-def spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[str, ...]:
+def _spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[str, ...]:
     """Return the names of the columns of a field of which rows have a shape."""
     word = (name if spelling.blanks else "_".join(name.split())) or "field"
     if row_shape in ((), (1,)):

@@ -99,7 +99,7 @@ def assemble_cloud(
     points = checked_coordinates(path, places)
     fields = {
         name: _joined(path, [rest[part] for part in parts])
-        for name, parts in sources_of(rest).items()
+        for name, parts in _sources_of(rest).items()
     }
     for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
         if name in fields:
@@ -268,7 +268,7 @@ def are_whole(values: Values) -> bool:
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
-def sources_of(columns: Columns) -> dict[str, list[str]]:
+def _sources_of(columns: Columns) -> dict[str, list[str]]:
     """Return the columns that each field is made of; the first of two equal names wins it.
 
     Triples and numbered columns are joined, the others renamed. Shapes and types decide, no values.

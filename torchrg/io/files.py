@@ -40,7 +40,7 @@ _MORE_BYTES = 1 << 20
 """Bytes that are tried on a disk that may be full. They are more than a library writes at a time,
 and do not fit where its last ones did not."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
-"""What the names have in common that :func:`atomic_path` writes under here."""
+"""Mark in the names that :func:`atomic_path` writes under here."""
 
 
 @contextmanager

@@ -18,16 +18,8 @@ import numpy as np
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud, slices, spell
-from torchrg.io.fields import (
-    WIDEN,
-    Columns,
-    Values,
-    are_whole,
-    assemble_cloud,
-    name_aside,
-    sources_of,
-)
+from torchrg.io.columns import Spelling, flatten_cloud, slices
+from torchrg.io.fields import WIDEN, Columns, Values, are_whole, assemble_cloud
 from torchrg.io.files import (
     DAMAGES,
     asking_system,
@@ -41,6 +33,11 @@ from torchrg.structures import Cloud
 _SPELLING = Spelling(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True
 )
+_ASIDE = {
+    **{name: f"normals_input_{i}" for i, name in enumerate(_SPELLING.normals)},
+    _SPELLING.curvature: "curvature_input",
+}
+"""Names of columns that gave way to a result, where they do not end in ``_input`` alone."""
 _POINTS_AT_ONCE = 1 << 20
 """Points that are read or written together. They take tens of megabytes."""
 _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
@@ -209,7 +206,7 @@ def _add_dimensions(
     values exactly. A column that the standard dimension of its name cannot hold gets one more.
     """
     dimensions, params = dict[str, Values](), list[Any]()
-    for own in _own_dimensions(cloud):
+    for own in _own_dimensions(cloud.header.get("las"), columns):
         if own.holds(columns):
             known = own.dimension
             more = (known.description, known.offsets, known.scales, known.no_data)
@@ -269,35 +266,22 @@ class _Own(NamedTuple):
         return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
 
 
-def _own_dimensions(cloud: Cloud) -> list[_Own]:
+def _own_dimensions(header: Any, columns: Columns) -> list[_Own]:  # noqa: ANN401
     """Return the extra dimensions of the file that a cloud came from, as far as it still has them.
 
     A field that was put aside for a result takes its dimension along, under its new name.
     """
-    header = cloud.header.get("las")
-    if header is None:
-        return []
-    dimensions = {name: dim for dim in header.point_format.dimensions for name in _parts_of(dim)}
-    fields = sources_of({name: np.empty(0, _type_of(dim)) for name, dim in dimensions.items()})
-    found = dict[str, tuple[str, str]]()
-    for field, parts in fields.items():
-        aside = name_aside(field)
-        is_aside = aside in cloud.fields and aside not in fields
-        name = aside if is_aside else field
-        if name not in cloud.fields:
-            continue
-        spelled = spell(name, cloud.fields[name].shape[1:], _SPELLING)
-        if len(spelled) != len(parts):
-            continue
-        for part, column in zip(parts, spelled, strict=True):
-            new = column if dimensions[part].num_elements == 1 else name
-            found[part] = (column, new if is_aside else dimensions[part].name)
-    own = []
-    for dim in header.point_format.extra_dimensions:
-        elements = [found[part] for part in _parts_of(dim) if part in found]
-        if len(elements) == dim.num_elements:
-            columns, names = zip(*elements, strict=True)
-            own.append(_Own(dim._replace(name=names[0]), columns))
+    own = list[_Own]()
+    dimensions = [] if header is None else [*header.point_format.extra_dimensions]
+    names = {dimension.name for dimension in dimensions}
+    for dimension in dimensions:
+        parts = list[str]()
+        for part in _parts_of(dimension):
+            aside = _ASIDE.get(part, f"{part}_input")
+            parts.append(aside if aside in columns and aside not in names else part)
+        if all(part in columns for part in parts):
+            name = parts[0] if len(parts) == 1 else dimension.name
+            own.append(_Own(dimension._replace(name=name), tuple(parts)))
     return own
 
 
@@ -305,13 +289,6 @@ def _parts_of(dimension: Any) -> list[str]:  # noqa: ANN401
     """Return the names of the columns that a dimension is read as."""
     name, count = dimension.name, dimension.num_elements
     return [name] if count == 1 else [f"{name}_{i}" for i in range(count)]
-
-
-def _type_of(dimension: Any) -> np.dtype[Any]:  # noqa: ANN401
-    """Return the type of the columns that a dimension is read as."""
-    if dimension.is_scaled:
-        return np.dtype(np.float64)
-    return np.dtype(np.uint8) if dimension.dtype is None else dimension.dtype.base
 
 
 def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401

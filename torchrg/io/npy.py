@@ -47,7 +47,7 @@ _NOT_PER_POINT = {
     *(f"outline_{name}" for name in ("points", "ring_sizes", "ring_planes")),
     "provenance",
 }
-"""What a result says beside its points, of however many rows."""
+"""Arrays of a result that are not about its points, of however many rows."""
 _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
 _BYTES_AT_ONCE = 1 << 20

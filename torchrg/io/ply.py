@@ -5,7 +5,6 @@ meshio reads ``uchar`` as signed, knows no ``short``, ends the process at elemen
 and face, and takes the memory a header promises; trimesh writes float32 and drops fields.
 """
 
-import io
 import struct
 import sys
 from collections.abc import Iterator
@@ -56,7 +55,7 @@ _LONGEST_HEADER = 1 << 20
 _LONGEST_LIST = 1 << 20
 """Bytes of the longest list; a longer one is taken for damage."""
 _CORNERS = ("vertex_indices", "vertex_index")
-"""What the list of a face's vertices is called."""
+"""Names of the list of a face's vertices."""
 _BYTES_AT_ONCE = 1 << 22
 """Bytes of faces that are read together."""
 _SHOWN = 60
@@ -263,8 +262,7 @@ def _check_element(
     path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
 ) -> np.dtype[np.void]:
     """Return the type of the records of an element, all of which are there; go to the first."""
-    stream.seek(start)
-    dtype = _record_type(path, stream, element, byte_order, size)
+    dtype = _record_type(path, stream, element, byte_order, start, size)
     promised = element.num_records * dtype.itemsize
     content = f"{element.num_records:,} records of {element.name}"
     check_promise(path, start, promised, content, available=size - start)
@@ -273,27 +271,25 @@ def _check_element(
 
 
 def _record_type(
-    path: Path, stream: BinaryIO, element: _Element, byte_order: str, size: int
+    path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
 ) -> np.dtype[np.void]:
     """Return the type of a record; lists have the length that the first record gives them."""
-    parts: list[tuple[str, str | np.dtype[np.generic]] | tuple[str, str, tuple[int]]] = []
+    parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for prop in element.properties:
+        code = byte_order + prop.code
         if prop.length_code is None:
-            parts.append((prop.name, byte_order + prop.code))
-            stream.seek(np.dtype(prop.code).itemsize, io.SEEK_CUR)
+            parts.append((prop.name, code))
             continue
-        length_type = np.dtype(byte_order + prop.length_code)
-        raw = stream.read(length_type.itemsize) if element.num_records else b""
-        length = int(np.frombuffer(raw, length_type)[0]) if len(raw) == length_type.itemsize else 0
-        num_bytes = length * np.dtype(prop.code).itemsize
-        if not 0 <= num_bytes <= min(size, _LONGEST_LIST):
+        parts.append((prop.name + _LENGTH, byte_order + prop.length_code))
+        stream.seek(start + np.dtype(parts).itemsize - np.dtype(prop.length_code).itemsize)
+        raw = np.fromfile(stream, byte_order + prop.length_code, min(element.num_records, 1))
+        length = int(raw[0]) if len(raw) else 0
+        if not 0 <= length * np.dtype(code).itemsize <= min(size, _LONGEST_LIST):
             raise FormatError(
                 f"{path}: byte {stream.tell()}: expected a list that fits the file, got length "
                 f"{length:,}; the file is damaged, fetch it again."
             )
-        stream.seek(num_bytes, io.SEEK_CUR)
-        parts.append((prop.name + _LENGTH, length_type))
-        parts.append((prop.name + _LIST, byte_order + prop.code, (length,)))
+        parts.append((prop.name + _LIST, code, (length,)))
     return np.dtype(parts)
 
 
@@ -352,8 +348,7 @@ def _corners_of_binary(
     """Yield the vertices of faces, of many at a time as long as all lists have one length."""
     *before, faces = header.elements
     start = _pass_elements(path, stream, header, before, size)
-    stream.seek(start)
-    dtype = _record_type(path, stream, faces, header.byte_order, size)
+    dtype = _record_type(path, stream, faces, header.byte_order, start, size)
     name = next(prop.name for prop in faces.properties if prop.name in _CORNERS)
     done, at_once = 0, max(_BYTES_AT_ONCE // dtype.itemsize, 1)
     while done < faces.num_records:
