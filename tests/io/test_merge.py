@@ -49,7 +49,7 @@ def test_fields_that_differ_are_left_out_and_named_in_one_line():
         ]
     )
     assert merged.fields == {}
-    assert merged.notes == ("left out, as not all files have them alike: a, b, c, d",)
+    assert merged.notes == ("fields left out, as not all files have them alike: a, b, c, d",)
 
 
 def test_kinds_of_numbers_are_joined_and_colours_only_of_as_many_bits():
@@ -58,7 +58,7 @@ def test_kinds_of_numbers_are_joined_and_colours_only_of_as_many_bits():
     fields = {"color": eight, "n": np.array([1, 2], np.uint8), "m": np.ones(2, np.float32)}
     more = {"color": eight.astype(np.uint16), "n": np.ones(2), "m": np.array([0.1, 2])}
     merged = merge_clouds([Cloud(points, fields), Cloud(points, more)])
-    assert merged.notes == ("left out, as not all files have them alike: color, n",)
+    assert merged.notes == ("fields left out, as not all files have them alike: color, n",)
     assert merged.fields["m"].tolist() == [1, 1, 0.1, 2]
     again = merge_clouds([Cloud(points, fields)] * 2)
     assert again.fields["color"].dtype == np.uint8
@@ -112,7 +112,7 @@ def test_las_tiles_keep_a_header_whose_grid_holds_them(tmp_path):
     np.testing.assert_allclose(after.x, merged.coordinates[:, 0], rtol=0, atol=0.0025)
     # The header of the file that was read is its own.
     assert tiles[0].header["las"].scales.tolist() == [0.01] * 3
-    lost = ("left out, as not all files have them alike: las of the header",)
+    lost = ("facts of the header left out, as not all files have them alike: las",)
     for other in (
         las_tile(tmp_path / "far.las", 2.5e7),
         las_tile(tmp_path / "other.las", 0.0, point_format=6),
@@ -163,7 +163,7 @@ def test_gps_times_that_count_differently_are_refused(tmp_path):
         with pytest.raises(FormatError, match=message):
             merge_clouds(clouds)
     assert merge_clouds([unused, standard]).notes == (
-        "left out, as not all files have them alike: gps_time",
+        "fields left out, as not all files have them alike: gps_time",
     )
     merged = merge_clouds([standard, replace(standard, source="b.las")])
     write_cloud(tmp_path / "all.las", merged)
@@ -184,7 +184,7 @@ def test_extra_dimensions_that_are_described_differently_are_plain_numbers(tmp_p
         data.Range = np.arange(9) + 1
         data.write(tmp_path / f"{name}.las")
     merged = merge_clouds([read_cloud(tmp_path / f"{name}.las") for name in "ab"])
-    assert merged.notes == ("left out, as not all files have them alike: las of the header",)
+    assert merged.notes == ("facts of the header left out, as not all files have them alike: las",)
     write_cloud(tmp_path / "all.las", merged)
     after = laspy.read(tmp_path / "all.las")
     assert not after.point_format.dimension_by_name("Range").is_scaled
@@ -199,7 +199,7 @@ def test_entries_of_the_header_that_differ_are_told():
     )
     assert merge_clouds([plain, usual]).notes == merge_clouds([usual, usual]).notes == ()
     assert merge_clouds([seen, seen]).header == {"viewpoint": away}
-    lost = ("left out, as not all files have them alike: viewpoint of the header",)
+    lost = ("facts of the header left out, as not all files have them alike: viewpoint",)
     assert merge_clouds([plain, seen]).notes == merge_clouds([seen, usual]).notes == lost
     scanned = Cloud(random_points(), header={"scans": (ScanPose("a"),)})
     assert merge_clouds([plain, scanned]).notes == (lost[0].replace("viewpoint", "scans"),)
@@ -221,6 +221,6 @@ def test_scans_of_several_e57_files_are_all_there_and_their_numbers_left_out():
     first = Cloud(random_points(20), {"scan": number}, header=two)
     second = Cloud(random_points(5), header=one, front=np.ones((5, 3), np.float32))
     merged = merge_clouds([first, first, second])
-    assert merged.notes == ("left out, as not all files have them alike: scan",)
+    assert merged.notes == ("fields left out, as not all files have them alike: scan",)
     assert [scan.name for scan in merged.header["scans"]] == ["a", "b", "a", "b", "c"]
     assert merged.front.any(axis=1).tolist() == [False] * 40 + [True] * 5

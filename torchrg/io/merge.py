@@ -41,7 +41,7 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
         >>> clouds = [Cloud(np.eye(3), {"labels": np.arange(3)}), Cloud(np.zeros((1, 3)))]
         >>> merged = merge_clouds(clouds)
         >>> len(merged), merged.notes
-        (4, ('left out, as not all files have them alike: labels',))
+        (4, ('fields left out, as not all files have them alike: labels',))
     """
     if not clouds:
         raise FormatError("merge: expected at least one cloud, got none; name a file.")
@@ -53,14 +53,15 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
     names = dict.fromkeys(name for cloud in clouds for name in cloud.fields)
     shared = [name for name in names if len({_kind(name, cloud) for cloud in clouds}) == 1]
     lost = [name for name in names if name not in shared]
-    lost += dict.fromkeys(
-        f"{kind} of the header"
+    dropped = dict.fromkeys(
+        kind
         for cloud in clouds
         for kind, entry in cloud.header.items()
         if kind not in header and entry != DEFAULT_VIEWPOINT
     )
-    if lost:
-        notes.append(f"left out, as not all files have them alike: {', '.join(lost)}")
+    for what, left in (("fields", lost), ("facts of the header", dropped)):
+        if left:
+            notes.append(f"{what} left out, as not all files have them alike: {', '.join(left)}")
     times = Counter(cloud.source for cloud in clouds if cloud.source)
     notes += [f"{name} is taken {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(clouds)

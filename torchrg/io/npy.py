@@ -39,6 +39,8 @@ from torchrg.io.files import (
 )
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
 
+_Layout = tuple[tuple[int, ...], np.dtype[Any]]
+"""Shape and type of an array."""
 _COORDINATES = ("points", "coord")
 _RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 _NOT_PER_POINT = {
@@ -98,9 +100,9 @@ def read_npz(path: Path, size: int) -> Cloud:
     """Read a ``.npz`` file."""
     # What is left out is read, too, so that damage in it is told.
     with _open_archive(path) as archive:
-        shapes = _check_members(path, archive, size)
-        coordinates, shape = _find_coordinates(path, shapes)
-        arrays = {name: _read_member(path, archive, name) for name in shapes}
+        layouts = _check_members(path, archive, size)
+        coordinates, shape = _find_coordinates(path, layouts)
+        arrays = {name: _read_member(path, archive, name) for name in layouts}
     arrays = {name: values for name, values in arrays.items() if name not in _NOT_PER_POINT}
     others = [name for name, values in arrays.items() if values.shape[:1] != shape[:1]]
     columns = {name: values for name, values in arrays.items() if name not in others}
@@ -114,9 +116,7 @@ def count_npz(path: Path, size: int) -> int:
         return _find_coordinates(path, _check_members(path, archive, size))[1][0]
 
 
-def _find_coordinates(
-    path: Path, layouts: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
-) -> tuple[str, tuple[int, ...]]:
+def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str, tuple[int, ...]]:
     """Return the name and the shape of the array of an archive that holds coordinates."""
     for name in _COORDINATES:
         if name in layouts:
@@ -231,9 +231,7 @@ def _refusing_member(path: Path, name: str) -> AbstractContextManager[None]:
     return refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again")
 
 
-def _check_members(
-    path: Path, archive: zipfile.ZipFile, size: int
-) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, _Layout]:
     """Return shape and type of the arrays of an archive, of which all bytes can be there."""
     layouts = {}
     for member in archive.infolist():
@@ -261,15 +259,13 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
         return values
 
 
-def _check_npy(path: Path, size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _check_npy(path: Path, size: int) -> _Layout:
     """Return shape and type of the array of a ``.npy`` file, all of whose bytes are there."""
     with path.open("rb") as stream:
         return _check_array(path, stream, size, "the array")
 
 
-def _check_array(
-    path: Path, stream: IO[bytes], size: int, content: str
-) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Layout:
     """Return shape and type of an array, checked against the ``size`` bytes that are there."""
     message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
     repair = "; write it again with numpy.save or numpy.savez"
