@@ -370,21 +370,28 @@ def _faces_of_bytes(
 ) -> Iterator[tuple[float, ...]]:
     """Yield the vertices of the faces from here to the end of a binary file."""
 
-    def take(code: str, count: int) -> tuple[float, ...]:
-        form = f"{byte_order}{count}{_LETTERS[code]}"
-        raw = stream.read(struct.calcsize(form))
-        return struct.unpack(form, raw)
+    def take(letter: str, count: int) -> tuple[float, ...]:
+        form = f"{byte_order}{count}{letter}"
+        return struct.unpack(form, stream.read(struct.calcsize(form)))
 
+    lists = [
+        (
+            None if prop.length_code is None else _LETTERS[prop.length_code],
+            _LETTERS[prop.code],
+            np.dtype(prop.code).itemsize,
+            prop.name in _CORNERS,
+        )
+        for prop in element.properties
+    ]
     corners: tuple[float, ...] = ()
     with suppress(struct.error):  # Raised at the end of the file.
         while True:
-            for prop in element.properties:
-                length = 1
-                if prop.length_code is not None:
-                    length = check_list(take(prop.length_code, 1)[0], np.dtype(prop.code).itemsize)
-                values = take(prop.code, length)
-                if prop.name in _CORNERS and prop.length_code is not None:
-                    corners = values
+            for length_letter, letter, size, is_corners in lists:
+                if length_letter is None:
+                    take(letter, 1)
+                    continue
+                values = take(letter, check_list(take(length_letter, 1)[0], size))
+                corners = values if is_corners else corners
             yield corners
 
 
