@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TextIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -56,11 +56,11 @@ _FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
 
 def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
     """Read points as text, always in float64; ``columns`` are names in place of the file's own."""
-    with _open_lines(path) as stream:
+    # Letters matter only in the names of columns.
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
         opening = _read_opening(path, stream, columns)
-    dtype = np.dtype([("row", "f8", (opening.num_columns,))])
-    with _open_lines(path) as stream:
-        lines = islice(stream, opening.line_number - 1, None)
+        lines = chain([opening.line], stream)
+        dtype = np.dtype([("row", "f8", (opening.num_columns,))])
         rows = _read_table(path, lines, dtype, opening.line_number, form=opening.form)
     if len(rows) < opening.num_points:
         raise FormatError(
@@ -70,11 +70,6 @@ def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cl
     is_comma = opening.form.decimal == ","
     notes = ("its commas are taken as decimal points",) if is_comma else ()
     return assemble_table(path, rows["row"], opening.names, notes)
-
-
-def _open_lines(path: Path) -> TextIO:
-    """Open a file whose letters matter only in the names of columns."""
-    return path.open(encoding="utf-8-sig", errors="replace")
 
 
 def write_text(path: Path, cloud: Cloud) -> None:
@@ -221,7 +216,7 @@ def _num_columns(dtype: np.dtype[Any]) -> int:
 
 
 class _Opening(NamedTuple):
-    """What the lines up to the first point say, and the number of that point's line, from one.
+    """What the lines up to the first point say, that point's line, and its number, from one.
 
     Names are None without a header. The number of points is 0 where none is said.
     """
@@ -229,8 +224,9 @@ class _Opening(NamedTuple):
     names: list[str] | None
     form: _Form
     num_columns: int
-    line_number: int
     num_points: int
+    line: str
+    line_number: int
 
 
 def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None) -> _Opening:
@@ -274,7 +270,7 @@ def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None)
                 names: list[str] | None = list(given)
             else:
                 names = _names_of(path, header, words, number) if header else None
-            return _Opening(names, form, len(words), number, max(counts, default=0))
+            return _Opening(names, form, len(words), max(counts, default=0), line, number)
     raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
 
 
