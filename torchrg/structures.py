@@ -456,12 +456,6 @@ class Superpoints(NamedTuple):
     plane: Tensor
     levels: tuple[Tensor, ...]
 
-    def rows(self, rows: slice) -> "Superpoints":
-        """Return the superpoints of some of the points."""
-        return Superpoints(
-            self.labels[rows], self.plane, tuple(level[rows] for level in self.levels)
-        )
-
     def by_level(self) -> dict[str, NDArray[np.int32]]:
         """Return all partitions by the names that they have in files.
 
