@@ -23,7 +23,6 @@ from torchrg.io import read_cloud
 from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
 from torchrg.io.npy import map_folder, read_beside
-from torchrg.io.stream import CloudStream, Extent
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.regions import summarize_planes
@@ -81,7 +80,6 @@ class Result:
             labels, ascending. Default: there is none.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
         provenance: How the result was made.
-        whole: Extent of the cloud of which these points are a sample. Default: they are all.
 
     Example:
         >>> points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [5, 5, 5]])
@@ -95,7 +93,6 @@ class Result:
     table: Planes | None = None
     plane_of_superpoint: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    whole: Extent | None = None
 
     @classmethod
     def of(
@@ -124,50 +121,6 @@ class Result:
         labelled = replace(cloud, fields=put_results(cloud.fields, found))
         plane_of_superpoint = None if superpoints is None else superpoints.plane
         return cls(labelled, segmentation.planes, plane_of_superpoint)
-
-    @classmethod
-    def of_sample(
-        cls, stream: CloudStream, segmentation: Segmentation, max_points: int
-    ) -> "Result":
-        """Return the result of segmenting a cloud in chunks, with so many points and a few at most.
-
-        They are a random sample of the finite ones, whatever the order of these, and those at the
-        ends of the cloud, so that origin and box are those of the whole. The table is that of all
-        points.
-
-        Raises:
-            ShapeError: If the segmentation does not have its points.
-
-        Example:
-            >>> from torchrg.pipeline import segment_planes
-            >>> cloud = Cloud(torch.cartesian_prod(*[torch.arange(9.0)] * 2, torch.ones(1)).numpy())
-            >>> stream, seg = CloudStream.of(cloud, chunk_size=20), segment_planes(cloud.points)
-            >>> sample = Result.of_sample(stream, seg, 10)
-            >>> 10 <= len(sample.cloud) <= 14, sample.planes.count.tolist()
-            (True, [81])
-        """
-        points = segmentation.points
-        if points is None:
-            raise ShapeError("Result: expected a segmentation with points, got none; pass them.")
-        finite = finite_rows(points)
-        chosen = finite[np.random.default_rng(0).permutation(len(finite))[:max_points]]
-        ends: list[int] = []
-        if len(finite):
-            kept = points[finite]
-            ends = [*kept.argmin(dim=0).tolist(), *kept.argmax(dim=0).tolist()]
-        rows = np.union1d(chosen.numpy(), finite[ends].numpy())
-
-        def take(chunk: Cloud, span: slice) -> Cloud:
-            own = rows[slice(*np.searchsorted(rows, (span.start, span.stop)))]
-            found = {name: getattr(segmentation, name)[own].numpy(force=True) for name in _FOUND}
-            own = own - span.start
-            fields = {name: each[own] for name, each in chunk.fields.items() if name in _KINDS}
-            coordinates = chunk.coordinates[own]
-            fields = put_results(fields, found)
-            return replace(chunk, coordinates=coordinates, fields=fields, front=None)
-
-        cloud = replace(stream, grid_shape=None).each(take).read()
-        return cls(cloud, segmentation.planes, whole=stream.extent)
 
     @cached_property
     def fields(self) -> dict[str, Tensor]:

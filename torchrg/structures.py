@@ -37,9 +37,10 @@ class Cloud:
             ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8).
         grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
         source: The file it came from, for messages.
-        header: What the file says about the cloud as a whole, so that it can be written again:
-            ``viewpoint`` of a PCD file (seven numbers, position and quaternion w x y z), ``las``
-            (the header of a LAS file), ``scans`` and ``coordinate_metadata`` of an E57 file.
+        header: What the file says about the cloud as a whole: ``viewpoint`` of a PCD file (seven
+            numbers, position and quaternion w x y z) and ``las`` (the header of a LAS file), which
+            are written again, ``scans`` (names and poses) and ``coordinate_metadata`` of an E57
+            file.
         notes: What reading took for granted or left out, a line each without a full stop, for
             people.
         front: Direction from each point to where its surface was seen from, of any length, zero
@@ -454,12 +455,6 @@ class Superpoints(NamedTuple):
     labels: Tensor
     plane: Tensor
     levels: tuple[Tensor, ...]
-
-    def rows(self, rows: slice) -> "Superpoints":
-        """Return the superpoints of some of the points."""
-        return Superpoints(
-            self.labels[rows], self.plane, tuple(level[rows] for level in self.levels)
-        )
 
     def by_level(self) -> dict[str, NDArray[np.int32]]:
         """Return all partitions by the names that they have in files.

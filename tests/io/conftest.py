@@ -73,3 +73,19 @@ def assert_same(found, expected):
 @pytest.fixture(name="assert_same")
 def assert_same_fixture():
     return assert_same
+
+
+@pytest.fixture
+def write_scan():
+    """Write coordinates and colours of a cloud as an E57 file, which torchrg only reads."""
+    pye57 = pytest.importorskip("pye57")
+
+    def write(path, cloud, **about):
+        columns = {f"cartesian{axis}": cloud.coordinates[:, i] for i, axis in enumerate("XYZ")}
+        for i, name in enumerate(("Red", "Green", "Blue") if "color" in cloud.fields else ()):
+            columns[f"color{name}"] = cloud.fields["color"][:, i]
+        with pye57.E57(str(path), "w") as file:
+            file.write_scan_raw(columns, **about)
+        return path
+
+    return write

@@ -7,7 +7,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.columns import merge_limits, narrow_integers
+from torchrg.io.columns import narrow_integers
 from torchrg.io.fields import assemble_cloud
 from torchrg.structures import Cloud
 
@@ -110,14 +110,31 @@ def test_coordinates_need_their_names_and_one_number_each():
         (0, 2**32, "i8"),
     ],
 )
-def test_integers_are_narrowed_only_where_those_of_all_chunks_fit(low, high, code):
-    limits = {}
-    for chunk in ([0, high], [low, 0]):
-        merge_limits(limits, {"a": np.array(chunk)})
+def test_integers_are_narrowed_only_where_all_fit(low, high, code):
     values = np.array([low, 0, high])
-    found = narrow_integers(values, ("i4", "u4"), limits["a"])
+    found = narrow_integers(values, ("i4", "u4"))
     assert found.dtype == code
     assert found.tolist() == values.tolist()
+
+
+@pytest.mark.parametrize(
+    ("code", "value", "last", "depth", "kept"),
+    [
+        ("f4", 0.5, 1.0, np.uint8, 128),
+        ("f4", 0.5, 2.0, np.uint8, 0),
+        ("u2", 514, 65535, np.uint8, 2),
+        ("u2", 514, 65534, np.uint16, 514),
+        ("u2", 200, 65535, np.uint16, 200),
+        ("i4", 200, 255, np.uint8, 200),
+        ("f8", 0.5, np.nan, np.uint8, 128),
+    ],
+)
+def test_one_colour_decides_the_depth_of_all(code, value, last, depth, kept):
+    color = np.full((2, 3), value).astype(code)
+    color[-1] = last
+    found = fields_of(color=color)["color"]
+    assert found.dtype == depth
+    assert found[0, 0] == kept
 
 
 def test_colours_of_sixteen_bits_are_rounded_where_a_format_has_eight(tmp_path):

@@ -35,10 +35,11 @@ def damaged_files(whole):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suffix", list(FORMATS))
-def test_failed_reads_keep_no_memory(tmp_path, suffix):
+def test_failed_reads_keep_no_memory(tmp_path, suffix, request):
     pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
     points = np.random.default_rng(0).random((NUM_POINTS, 3))
-    write_cloud(tmp_path / f"whole{suffix}", Cloud(points))
+    write = request.getfixturevalue("write_scan") if suffix == ".e57" else write_cloud
+    write(tmp_path / f"whole{suffix}", Cloud(points))
     paths = []
     for number, data in enumerate(damaged_files((tmp_path / f"whole{suffix}").read_bytes())):
         path = tmp_path / f"{number}{suffix}"

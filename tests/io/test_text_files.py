@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import CloudStream, read_cloud, stream_cloud, write_cloud
+from torchrg.io import read_cloud, write_cloud
 from torchrg.io.text import LINES_AT_ONCE
 from torchrg.structures import Cloud
 
@@ -49,9 +49,9 @@ def test_every_way_to_write_two_points_is_read(tmp_path, suffix, text):
 )
 def test_decimals_may_begin_with_commas_and_that_is_told(tmp_path, text):
     path = save(tmp_path / "a.txt", text)
-    for cloud in (read_cloud(path), next(iter(stream_cloud(path)))):
-        assert cloud.coordinates.tolist() == POINTS
-        assert cloud.notes == ("its commas are taken as decimal points",)
+    cloud = read_cloud(path)
+    assert cloud.coordinates.tolist() == POINTS
+    assert cloud.notes == ("its commas are taken as decimal points",)
 
 
 @pytest.mark.parametrize(
@@ -94,15 +94,45 @@ LEICA = "0 1.5 -2 {} 255 128 7\n3 4 1e3 {} 0 1 2\n"
     ],
 )
 def test_names_that_are_taken_for_granted_are_told(tmp_path, text, taken):
-    path = save(tmp_path / "a.txt", text)
-    stream = stream_cloud(path, chunk_size=1)
-    clouds = [read_cloud(path), *stream, stream.read(), *CloudStream.of(read_cloud(path))]
-    assert len(clouds) == 5
-    for cloud in clouds:
-        told = f"its columns have no names and are taken as {taken}; if they are others, name them"
-        assert [note.removesuffix(" with --columns") for note in cloud.notes] == [told] * bool(
-            taken
-        )
+    cloud = read_cloud(save(tmp_path / "a.txt", text))
+    told = f"its columns have no names and are taken as {taken}; if they are others, name them"
+    assert [note.removesuffix(" with --columns") for note in cloud.notes] == [told] * bool(taken)
+
+
+@pytest.mark.parametrize("kind", [".npy", ".xyz"])
+@pytest.mark.parametrize("at", [0, 59])
+@pytest.mark.parametrize(
+    ("row", "fields"),
+    [
+        ([0.0, 0.6, 0.8, 1.0], ["normals", "column_7"]),
+        ([0.0, 0.6, 0.8, 1.5], ["normals", "column_7"]),
+        ([0.5, 0.0, 0.6, 0.8], ["normals", "column_4"]),
+        ([256.0, 2.0, 3.0, 1.0], ["color", "intensity"]),
+        ([0.0, 2.0, 3.0, 256.0], ["color", "column_7"]),
+        ([0.0, 2.0, 3.0, 1.0], ["column_4", "column_5", "column_6", "column_7"]),
+        ([0.0, 0.5, 0.5, 1.0], ["column_4", "column_5", "column_6", "column_7"]),
+        ([np.nan, 0.0, 1.0, 0.5], ["normals", "column_7"]),
+    ],
+)
+def test_one_row_decides_the_names_of_all(tmp_path, kind, at, row, fields):
+    # Unit vectors that are whole numbers, too: normals or colours, as the other row says.
+    table = np.zeros((60, 7))
+    table[:, :3] = np.random.default_rng(0).random((60, 3))
+    table[np.arange(60), 3 + np.arange(60) % 3] = 1.0
+    table[at, 3:] = row
+    path = tmp_path / f"a{kind}"
+    np.save(path, table) if kind == ".npy" else np.savetxt(path, table)
+    assert list(read_cloud(path).fields) == fields
+
+
+def test_names_are_guessed_from_the_first_thousand_rows(tmp_path):
+    table = np.zeros((1001, 6))
+    table[:, 5] = 1.0
+    table[1000, 3:] = 0.5
+    np.savetxt(tmp_path / "a.txt", table)
+    assert list(read_cloud(tmp_path / "a.txt").fields) == ["normals"]
+    np.savetxt(tmp_path / "b.txt", table[1:])
+    assert list(read_cloud(tmp_path / "b.txt").fields) == ["column_4", "column_5", "column_6"]
 
 
 @pytest.mark.parametrize("kind", [".txt", ".npy"])
@@ -111,13 +141,13 @@ def test_names_that_are_given_decide(tmp_path, kind):
     path = tmp_path / f"a{kind}"
     np.savetxt(path, table) if kind == ".txt" else np.save(path, table)
     names = ["_", "x", "y", "z", "intensity", "r", "g", "b"]
-    for cloud in (read_cloud(path, columns=names), stream_cloud(path, columns=names).read()):
-        assert cloud.coordinates.tolist() == POINTS
-        assert {name: values.tolist() for name, values in cloud.fields.items()} == {
-            "color": [[255, 128, 7], [0, 1, 2]],
-            "intensity": [200, 100],
-        }
-        assert cloud.notes == ()
+    cloud = read_cloud(path, columns=names)
+    assert cloud.coordinates.tolist() == POINTS
+    assert {name: values.tolist() for name, values in cloud.fields.items()} == {
+        "color": [[255, 128, 7], [0, 1, 2]],
+        "intensity": [200, 100],
+    }
+    assert cloud.notes == ()
 
 
 def test_names_that_are_given_take_the_place_of_the_first_line(tmp_path):
@@ -151,7 +181,16 @@ def test_names_for_files_that_have_their_own_are_refused(tmp_path):
     with pytest.raises(FormatError, match=r"a\.ply: expected text or \.npy for names of columns"):
         read_cloud(tmp_path / "a.ply", columns=["x", "y", "z"])
     with pytest.raises(FormatError, match=r"a\.npy: expected no names .* some: x, y, z, a; leave"):
-        stream_cloud(tmp_path / "a.npy", columns=["x", "y", "z", "b"])
+        read_cloud(tmp_path / "a.npy", columns=["x", "y", "z", "b"])
+
+
+def test_text_between_blank_lines_and_comments(tmp_path):
+    lines = ["// x y z label", "3", "0 0 0 1", "", "# a", "# b", "1 0 0 2", "", "1 2 3 4 # end", ""]
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    assert read_cloud(tmp_path / "a.txt").fields["labels"].tolist() == [1, 2, 4]
+    (tmp_path / "a.txt").write_text("\n".join([*lines, "1 2 x"]))
+    with pytest.raises(FormatError, match=r"a\.txt: line 11: expected 4 numbers, got '1 2 x'"):
+        read_cloud(tmp_path / "a.txt")
 
 
 def test_names_in_the_first_line_name_the_columns(tmp_path):

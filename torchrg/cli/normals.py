@@ -33,7 +33,7 @@ class Arguments:
         torchrg normals scan.pcd --out normals.ply
         torchrg normals scan.ply --out normals.ply --orient interior
         torchrg normals scan.ply --out normals.npz --method pca --normals.k 30
-        torchrg normals scan.e57 --out normals.e57 --orient viewpoint
+        torchrg normals scan.e57 --out normals.laz --orient viewpoint
         torchrg normals scan.ply --out normals.ply --orient viewpoint --viewpoint 0 0 1.6
     """
 

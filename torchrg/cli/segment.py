@@ -32,10 +32,9 @@ from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import (
     RESULT_FIELDS,
-    CloudStream,
     check_output,
     estimate_points,
-    merge_streams,
+    merge_clouds,
     read_cloud,
     write_cloud,
 )
@@ -194,7 +193,8 @@ def _segment(
     begin, source = time.perf_counter(), _name_of(sources)
     limit = _limit_of(arguments)
     _check_limit(source, sum(map(estimate_points, sources)), limit)
-    cloud = _read(arguments, sources)
+    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    cloud = merge_clouds([read_cloud(path, columns=names.of(path)) for path in sources])
     where = _arrays_of(arguments, source, target, len(cloud), limit)
     _check_points(arguments, source, cloud, target)
     if _is_depth_image(cloud):
@@ -266,18 +266,6 @@ def _arrays_of(
 def _name_of(sources: tuple[Path, ...]) -> str:
     """Return what a cloud of some files is called in messages."""
     return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
-
-
-def _read(arguments: Arguments, sources: tuple[Path, ...]) -> Cloud:
-    """Read files as one cloud, and say what they do not share."""
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    clouds = [read_cloud(path, columns=names.of(path)) for path in sources]
-    if len(clouds) == 1:
-        return clouds[0]
-    merged = merge_streams(list(map(CloudStream.of, clouds)))
-    for note in merged.notes:
-        console.warn(f"{_name_of(sources)}: {note}.")
-    return merged.stream.read()
 
 
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:

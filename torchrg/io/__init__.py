@@ -2,97 +2,77 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import FormatError
 from torchrg.io.columns import check_length
-from torchrg.io.e57 import check_e57, count_e57, open_e57, write_e57
-from torchrg.io.fields import checked_coordinates
-from torchrg.io.files import atomic_path, check_file, check_place
-from torchrg.io.las import check_las, count_las, open_las, write_las
-from torchrg.io.merge import merge_streams
-from torchrg.io.npy import (
-    ARCHIVE_DAMAGES,
-    open_npy,
-    open_npz,
-    write_npy,
-    write_npz,
-)
-from torchrg.io.pcd import open_pcd, write_pcd
-from torchrg.io.ply import open_ply, write_ply
-from torchrg.io.stream import (
-    POINTS_A_CHUNK,
-    SILENT,
-    CloudStream,
-    Table,
-    read_table,
-    reporting_unreadable,
-    stream_table,
-)
-from torchrg.io.text import count_text, open_text, write_text
-from torchrg.io.vg import open_bvg, open_vg, write_bvg, write_vg
+from torchrg.io.e57 import count_e57, read_e57
+from torchrg.io.fields import checked_coordinates, put_results
+from torchrg.io.files import ARCHIVE_DAMAGES, atomic_path, check_file, check_place
+from torchrg.io.las import check_las, count_las, read_las, write_las
+from torchrg.io.merge import merge_clouds
+from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
+from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
+from torchrg.io.ply import count_ply, read_ply, write_ply
+from torchrg.io.text import count_text, read_text, write_text
+from torchrg.io.vg import write_vg
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
     "FORMATS",
     "RESULT_FIELDS",
-    "CloudStream",
     "atomic_path",
     "check_output",
     "estimate_points",
-    "merge_streams",
+    "merge_clouds",
     "read_cloud",
-    "stream_cloud",
     "takes_columns",
     "write_cloud",
 ]
 
 
 class Format(NamedTuple):
-    """How a kind of file is read and written; a new kind is a codec, a row of FORMATS, and a test.
+    """How a kind of file is read and written; a new kind is a file, a row of FORMATS, and a test.
 
     Attributes:
-        open: Reads the header of a file of so many bytes, not 0, and gives a table of its points,
-            in chunks. Opening it, or reading the damaged chunk, raises FormatError if the file is
-            damaged. Where columns can be without names, these come third.
-        write: Writes a cloud, going through its chunks once or several times. Raises FormatError if
-            the format cannot hold it.
-        count: Number of points, from the open file and its size, of a format whose table cannot
-            say it at once. May raise anything of a damaged file. None where the table can.
+        read: Reads a file of so many bytes, not 0. Raises FormatError if it is damaged. Where
+            columns can be without names, these come third.
+        count: Returns the number of points by the header of a file of so many bytes, or about their
+            number by its size, in no time. May raise anything of a damaged file.
+        write: Writes a cloud. Raises FormatError if the format cannot hold it. None for a kind that
+            is read only.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
         takes_columns: Whether columns can be without names.
     """
 
-    open: Callable[..., Table]
-    write: Callable[[Path, CloudStream], None]
-    count: Callable[[BinaryIO, int], int] | None = None  # type: ignore[assignment]
-    check: Callable[[Path, Cloud | CloudStream | None], None] | None = None
+    read: Callable[..., Cloud]
+    count: Callable[[Path, int], int]  # type: ignore[assignment]
+    write: Callable[[Path, Cloud], None] | None
+    check: Callable[[Path, Cloud | None], None] | None = None
     takes_columns: bool = False
 
 
 RESULT_FIELDS = ("labels", "normals", "curvature")
-"""What a segmentation writes of each point beside the fields of the cloud."""
+"""Fields that a segmentation adds to those of a cloud."""
 FORMATS: dict[str, Format] = {
-    ".npz": Format(open_npz, write_npz),
-    ".npy": Format(open_npy, write_npy, takes_columns=True),
-    ".ply": Format(open_ply, write_ply),
-    ".pcd": Format(open_pcd, write_pcd),
-    ".las": Format(open_las, write_las, count_las, check_las),
-    ".laz": Format(open_las, write_las, count_las, check_las),
-    ".e57": Format(open_e57, write_e57, count_e57, check_e57),
-    ".xyz": Format(open_text, write_text, count_text, takes_columns=True),
-    ".txt": Format(open_text, write_text, count_text, takes_columns=True),
+    ".npz": Format(read_npz, count_npz, write_npz),
+    ".npy": Format(read_npy, count_npy, write_npy, takes_columns=True),
+    ".ply": Format(read_ply, count_ply, write_ply),
+    ".pcd": Format(read_pcd, count_pcd, write_pcd),
+    ".las": Format(read_las, count_las, write_las, check_las),
+    ".laz": Format(read_las, count_las, write_las, check_las),
+    ".e57": Format(read_e57, count_e57, None),
+    ".xyz": Format(read_text, count_text, write_text, takes_columns=True),
+    ".txt": Format(read_text, count_text, write_text, takes_columns=True),
 }
-"""What is known of each format that holds any field, by suffix."""
-GROUP_FORMATS: dict[str, Format] = {
-    ".vg": Format(open_vg, write_vg),
-    ".bvg": Format(open_bvg, write_bvg),
-}
-"""Formats of planes, which hold coordinates, normals and labels, and ``.vg`` also colours."""
+"""Formats that are read, by suffix. All but E57 are written, and hold any field."""
+_PLANES_SUFFIX = ".vg"
+"""Suffix of vertex groups, which are written only, and hold coordinates, colours and planes."""
 
 
 def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Cloud:
@@ -107,7 +87,7 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         from which side points were seen, :attr:`torchrg.Cloud.front`.
 
     Args:
-        path: A file with a suffix of :data:`FORMATS` or :data:`GROUP_FORMATS`, in any case.
+        path: A file with a suffix of :data:`FORMATS`, in any case.
         columns: Names of the columns of text and of a bare ``.npy`` array, in their order: ``x``,
             ``y``, ``z`` and any others, ``_`` for one to leave out. Default: those that the file
             says, else those of :data:`torchrg.io.fields.COLUMNS_RULE`.
@@ -130,52 +110,31 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
     source = Path(path)
-    with reporting_unreadable(source):
-        return read_table(source, _open(source, columns))
+    with _reporting_unreadable(source), np.errstate(over="ignore", invalid="ignore"):
+        # Files may hold any bits as numbers: those that overflow or signal are kept, not reported.
+        size, found = check_file(source), _format_of(source)
+        if columns is None:
+            return found.read(source, size)
+        if not found.takes_columns:
+            raise FormatError(
+                f"{source}: expected text or .npy for names of columns, got a file that has its "
+                "own; leave them out."
+            )
+        return found.read(source, size, columns)
 
 
-def stream_cloud(
-    path: str | os.PathLike[str],
-    *,
-    columns: Sequence[str] | None = None,
-    chunk_size: int = POINTS_A_CHUNK,
-) -> CloudStream:
-    r"""Read a point cloud in chunks, for clouds larger than memory; the suffix says how.
-
-    Convention:
-        The chunks put one after the other are what :func:`read_cloud` gives, bit for bit. What
-        depends on all points (the range of floating-point or 16-bit colours, which dimensions of a
-        LAS file are empty, the names of six or seven columns without names) is found in a pass over
-        the file before the first chunk. Memory is that of a few chunks, but for
-        ``binary_compressed`` PCD files, which hold all points in one lump and are unpacked whole.
-
-    Args:
-        path: A file with a suffix of :data:`FORMATS`, in any case.
-        columns: As of :func:`read_cloud`.
-        chunk_size: Most points of a chunk, at least 1. Chunks may be smaller.
-
-    Returns:
-        The chunks, read anew each time they are iterated.
-
-    Raises:
-        FormatError: As :func:`read_cloud`, with the same message; damaged points are reported at
-            the latest when they are reached.
-        ConfigError: If ``chunk_size`` is less than 1.
-        MissingDependencyError: If the format needs an optional package.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "corner.xyz"
-        ...     _ = path.write_text("0 0 0\n1 0 0\n0 1 0\n")
-        ...     [chunk.coordinates.tolist() for chunk in stream_cloud(path, chunk_size=2)]
-        [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]]
-    """
-    if chunk_size < 1:
-        raise ConfigError(f"stream_cloud: expected chunk_size of at least 1, got {chunk_size}.")
-    source = Path(path)
-    with reporting_unreadable(source):
-        return stream_table(source, _open(source, columns), chunk_size)
+@contextmanager
+def _reporting_unreadable(path: Path) -> Iterator[None]:
+    """Raise errors of the operating system, and of memory, as a FormatError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from error
+    except MemoryError as error:
+        raise FormatError(
+            f"{path}: its points do not fit into memory; use a machine with more, or cut the cloud "
+            "into parts."
+        ) from error
 
 
 def takes_columns(path: str | os.PathLike[str]) -> bool:
@@ -189,21 +148,9 @@ def takes_columns(path: str | os.PathLike[str]) -> bool:
     return found is not None and found.takes_columns
 
 
-def _open(path: Path, columns: Sequence[str] | None) -> Table:
-    """Open a file by its suffix."""
-    size, found = check_file(path), _format_of(path)
-    if columns is not None and not found.takes_columns:
-        raise FormatError(
-            f"{path}: expected text or .npy for names of columns, got a file that has its own; "
-            "leave them out."
-        )
-    with np.errstate(**SILENT):
-        return found.open(path, size) if columns is None else found.open(path, size, columns)
-
-
 def write_cloud(
     path: str | os.PathLike[str],
-    cloud: Cloud | CloudStream,
+    cloud: Cloud,
     segmentation: Segmentation | None = None,
     *,
     superpoints: Superpoints | None = None,
@@ -219,22 +166,17 @@ def write_cloud(
         cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. A field of
         the cloud whose name a result takes is kept under another: ``label_input``,
         ``normals_input`` and so on; where there is such a field already, it is that which stays.
-        ``.npz``
-        holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the table of
-        planes as :meth:`torchrg.structures.Planes.to_arrays` gives it in the input's coordinates,
-        and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
-        identifiers). Superpoints are ``superpoints``, and ``superpoints_1`` and so on for the
-        coarser levels; in ``.npz`` also ``plane_of_superpoint``. ``.vg`` and ``.bvg`` hold
-        coordinates, normals and the planes as vertex groups, numbered from zero, and ``.vg`` holds
-        colours; see :mod:`torchrg.io.vg`.
+        ``.npz`` holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the
+        table of planes as :meth:`torchrg.structures.Planes.to_arrays` gives it in the input's
+        coordinates, and ``provenance``. Equal input gives equal bytes. Superpoints are
+        ``superpoints``, and ``superpoints_1`` and so on for the coarser levels; in ``.npz`` also
+        ``plane_of_superpoint``. ``.vg`` holds coordinates, colours, normals and the planes as
+        vertex groups, see :mod:`torchrg.io.vg`; it is not read.
 
     Args:
-        path: The file; an older one is replaced. Its suffix is one of :data:`FORMATS`
-            or :data:`GROUP_FORMATS`.
-        cloud: The cloud; one larger than memory as :func:`stream_cloud` gives it, which leaves the
-            same bytes. Its chunks are gone through up to four times, for ``.npz`` without a
-            segmentation once for each field. Tensors of the results are taken chunk by chunk, too,
-            so they may be mapped from files.
+        path: The file; an older one is replaced. Its suffix is ``.vg`` or one of :data:`FORMATS`
+            but ``.e57``.
+        cloud: The cloud.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
         superpoints: What :func:`torchrg.make_superpoints` said about them.
         provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
@@ -252,67 +194,42 @@ def write_cloud(
         [0, 0, -1]
     """
     target = Path(path)
-    found = _format_of(target)
-    if not isinstance(cloud, Cloud | CloudStream):
+    given: object = cloud
+    if not isinstance(given, Cloud):
         raise FormatError(
-            f"{target}: expected a Cloud, or a stream of one, got {type(cloud).__name__}; "
+            f"{target}: expected a Cloud, got {type(given).__name__}; "
             "Cloud(coordinates) makes one of a NumPy array."
         )
     check_output(target, cloud)
-    if isinstance(cloud, Cloud):
-        for name, values in cloud.fields.items():
-            check_length(target, name, values, len(cloud))
-        points = checked_coordinates(target, cloud.coordinates)
-        stream = CloudStream.of(replace(cloud, coordinates=points), chunk_size=POINTS_A_CHUNK)
-    else:
-        stream = cloud
+    for name, values in cloud.fields.items():
+        check_length(target, name, values, len(cloud))
+    cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
-        if result is not None and len(result.labels) != stream.count:
+        if result is not None and len(result.labels) != len(cloud):
             raise FormatError(
-                f"{target}: expected {what} of {stream.count} points, got {len(result.labels)}; "
+                f"{target}: expected {what} of {len(cloud)} points, got {len(result.labels)}; "
                 "pass the cloud that was segmented."
             )
-    if found.write is write_npz:
-        own = segmentation is None
-        write_npz(target, _checked(target, stream, own), segmentation, provenance, superpoints)
+    suffix = target.suffix.lower()
+    if suffix == ".npz":
+        write_npz(target, cloud, segmentation, provenance, superpoints)
         return
+    fields = cloud.fields
     if superpoints is not None:
-        stream = stream.with_results(lambda rows: superpoints.rows(rows).by_level())
+        fields = put_results(fields, superpoints.by_level())
     if segmentation is not None:
-        results = {name: getattr(segmentation, name) for name in RESULT_FIELDS}
-        stream = stream.with_results(
-            lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
-        )
-    if found in GROUP_FORMATS.values() and segmentation is not None:
-        table = segmentation.planes.to_arrays(stream.origin)
+        results = {name: getattr(segmentation, name).numpy(force=True) for name in RESULT_FIELDS}
+        fields = put_results(fields, results)
+    labelled = replace(cloud, fields=fields)
+    if suffix == _PLANES_SUFFIX and segmentation is not None:
+        table = segmentation.planes.to_arrays(cloud.origin)
         equations = np.column_stack([table["plane_normal"], -table["plane_offset"]])
-        found.write(target, _checked(target, stream), equations)  # type: ignore[call-arg]
+        write_vg(target, labelled, equations)
         return
-    found.write(target, _checked(target, stream))
+    _writer_of(target)(target, labelled)
 
 
-def _checked(path: Path, stream: CloudStream, has_fields: bool = True) -> CloudStream:
-    """Check the chunks while they are written, as far as formats do not differ.
-
-    Without ``has_fields`` they are left out.
-    """
-
-    def chunks() -> Iterator[Cloud]:
-        count = 0
-        for chunk in stream:
-            fields = chunk.fields if has_fields else {}
-            for name, values in fields.items():
-                check_length(path, name, values, len(chunk))
-            count += len(chunk)
-            points = checked_coordinates(path, chunk.coordinates)
-            yield replace(chunk, coordinates=points, fields=fields)
-        if count != stream.count:
-            raise FormatError(f"{path}: expected {stream.count} points in chunks, got {count}.")
-
-    return replace(stream, chunks=chunks, measure=lambda: stream.extent)
-
-
-def check_output(path: str | os.PathLike[str], cloud: Cloud | CloudStream | None = None) -> None:
+def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:
     """Check before long work that its result has a place: known suffix, folder there.
 
     ``cloud`` is the one that shall be written, if it is known yet: LAS holds no points that are not
@@ -328,10 +245,12 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | CloudStream | None
             ...
         torchrg.errors.FormatError: planes.stl: expected a file that ends in one of .npz ...'.stl'.
     """
-    found = _format_of(Path(path))
+    target = Path(path)
+    _writer_of(target)
     check_place(path)
-    if found.check is not None:
-        found.check(Path(path), cloud)
+    found = FORMATS.get(target.suffix.lower())
+    if found is not None and found.check is not None:
+        found.check(target, cloud)
 
 
 def estimate_points(path: Path) -> int:
@@ -349,22 +268,30 @@ def estimate_points(path: Path) -> int:
         3
     """
     try:
-        size, found = path.stat().st_size, _format_of(path)
-        if found.count is None:
-            return found.open(path, size).num_points or 0
-        with path.open("rb") as stream:
-            return found.count(stream, size)
+        return _format_of(path).count(path, path.stat().st_size)
     except (OSError, FormatError, *ARCHIVE_DAMAGES):
         return 0
 
 
-def _format_of(path: Path) -> Format:
-    """Return the format of a path."""
+def _format_of(path: Path, *, is_written: bool = False) -> Format:
+    """Return how a file is read, or written, by its suffix."""
     suffix = path.suffix.lower()
-    found = FORMATS.get(suffix) or GROUP_FORMATS.get(suffix)
-    if found is None:
-        known = " ".join(FORMATS)
+    if suffix not in FORMATS:
+        known = [kind for kind, format_ in FORMATS.items() if format_.write or not is_written]
         raise FormatError(
-            f"{path}: expected a file that ends in one of {known}, got {path.suffix!r}."
+            f"{path}: expected a file that ends in one of {' '.join(known)}, got {path.suffix!r}."
         )
-    return found
+    return FORMATS[suffix]
+
+
+def _writer_of(path: Path) -> Callable[[Path, Cloud], None]:
+    """Return the function that writes a file, by its suffix."""
+    if path.suffix.lower() == _PLANES_SUFFIX:
+        return write_vg
+    write = _format_of(path, is_written=True).write
+    if write is None:
+        raise FormatError(
+            f"{path}: expected a format that is written, got {path.suffix}, which is only read; "
+            "write .laz or .ply."
+        )
+    return write

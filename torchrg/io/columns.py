@@ -1,22 +1,19 @@
 """From a cloud to the columns of a file, by the format's own names and types."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import LARGEST_WHOLE, LEFT_OUT, WIDEN, Columns, name_aside
+from torchrg.io.fields import LARGEST_WHOLE, LEFT_OUT, WIDEN, Columns, Values, name_aside
 from torchrg.io.files import atomic_path
-from torchrg.io.stream import CloudStream
 from torchrg.structures import Cloud
 
-Limits = tuple[int, int]
-"""Least and largest of whole numbers."""
-_LABELS_ASIDE = name_aside("labels")
+_RECORDS_AT_ONCE = 1 << 20
+"""Records that are made and written together, which bounds the memory beside the cloud."""
+_LABELS = ("labels", name_aside("labels"))
 
 
 class Spelling(NamedTuple):
@@ -39,32 +36,20 @@ class Spelling(NamedTuple):
     blanks: bool = False
 
 
-def flatten_stream(path: Path, stream: CloudStream, spelling: Spelling) -> Iterator[Columns]:
-    """Spread the chunks of a cloud over columns, which have the same types in all of them."""
-    limits = wide_limits(path, stream, spelling)
-    for chunk in stream:
-        yield flatten_cloud(path, chunk, spelling, limits)
-
-
-def flatten_cloud(
-    path: Path, cloud: Cloud, spelling: Spelling, limits: Mapping[str, Limits] | None = None
-) -> dict[str, NDArray[Any]]:
+def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, Values]:
     """Spread a cloud over columns by the format's names: ``x y z`` first, then its fields.
 
-    Labels are int32 where the limits of the whole cloud say that they fit, colours uint8 (or uint16
-    if the format holds it), truth values uint8, half precision float32. A field of several columns
-    is ``name_0``, ``name_1`` and so on, unless the format has ``vectors``.
+    Labels are int32 where that holds them, colours uint8 (or uint16 if the format holds it), truth
+    values uint8, half precision float32. A field of several columns is ``name_0``, ``name_1`` and
+    so on, unless the format has ``vectors``.
     """
-    columns: dict[str, NDArray[Any]] = {
-        axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")
-    }
+    columns: dict[str, Values] = {axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")}
     for name, values in cloud.fields.items():
         if name == LEFT_OUT:
             raise FormatError(f"{path}: expected names of fields, got {name!r}; rename it.")
         values = _storable(path, name, values, spelling)
-        if name in ("labels", _LABELS_ASIDE):
-            limit = (limits or {}).get("label" if name == "labels" else name)
-            values = narrow_integers(values, ("i4",), limit)
+        if name in _LABELS:
+            values = narrow_integers(values, ("i4",))
         for column_name, column in _spread(name, values, spelling):
             if column_name in columns:
                 raise FormatError(
@@ -75,7 +60,7 @@ def flatten_cloud(
     return columns
 
 
-def check_length(path: Path, name: str, values: NDArray[Any], num_points: int) -> None:
+def check_length(path: Path, name: str, values: Values, num_points: int) -> None:
     """Check that a field has a value for each point."""
     if values.shape[:1] != (num_points,):
         raise FormatError(
@@ -84,7 +69,7 @@ def check_length(path: Path, name: str, values: NDArray[Any], num_points: int) -
         )
 
 
-def _storable(path: Path, name: str, values: NDArray[Any], spelling: Spelling) -> NDArray[Any]:
+def _storable(path: Path, name: str, values: Values, spelling: Spelling) -> Values:
     """Return a field as real numbers that files hold."""
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
         raise FormatError(
@@ -109,16 +94,16 @@ def _storable(path: Path, name: str, values: NDArray[Any], spelling: Spelling) -
     return values if spelling.color_bits == 16 else np.rint(values / WIDEN).astype(np.uint8)
 
 
-def _spread(name: str, values: NDArray[Any], spelling: Spelling) -> list[tuple[str, NDArray[Any]]]:
+def _spread(name: str, values: Values, spelling: Spelling) -> list[tuple[str, Values]]:
     """Cut a field into named columns."""
-    names = spell(name, values.shape[1:], spelling)
+    names = _spell(name, values.shape[1:], spelling)
     parts = [values.reshape(-1)] if values.shape[1:] == (1,) else [values]
     if len(names) > 1:
         parts = [values[:, i] for i in range(len(names))]
     return list(zip(names, parts, strict=True))
 
 
-def spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[str, ...]:
+def _spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[str, ...]:
     """Return the names of the columns of a field of which rows have a shape."""
     word = (name if spelling.blanks else "_".join(name.split())) or "field"
     if row_shape in ((), (1,)):
@@ -129,75 +114,60 @@ def spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[st
     return (word,) if spelling.vectors else tuple(f"{word}_{i}" for i in range(row_shape[0]))
 
 
-def wide_limits(path: Path, stream: CloudStream, spelling: Spelling) -> dict[str, Limits]:
-    """Return the limits of all columns of 64-bit integers of a cloud, by a pass over its chunks."""
-    limits: dict[str, Limits] = {}
-    for chunk in stream:
-        wide = {name: values for name, values in chunk.fields.items() if _is_wide(values.dtype)}
-        if not wide:
-            break
-        merge_limits(limits, flatten_cloud(path, replace(chunk, fields=wide), spelling))
-    return limits
-
-
-def exact_limits(path: Path, stream: CloudStream, spelling: Spelling) -> dict[str, Limits]:
-    """Return the limits of :func:`wide_limits`, all of which float64 holds exactly."""
-    limits = wide_limits(path, stream, spelling)
-    for name, limit in limits.items():
-        if max(map(abs, limit)) >= LARGEST_WHOLE:
+def check_exact(path: Path, columns: Columns) -> None:
+    """Check that float64, and so text, holds all 64-bit integers exactly."""
+    for name, column in columns.items():
+        if _is_wide(column) and max(-int(column.min()), int(column.max())) >= LARGEST_WHOLE:
             raise FormatError(
                 f"{path}: expected field {name} within 2^53, got 64-bit integers beyond; "
                 "leave it out or write .npz."
             )
-    return limits
 
 
-def merge_limits(limits: dict[str, Limits], columns: Columns) -> None:
-    """Widen limits by those of the columns of 64-bit integers of a chunk."""
-    for name, column in columns.items():
-        if _is_wide(column.dtype) and column.size:
-            low, high = int(column.min()), int(column.max())
-            known_low, known_high = limits.get(name, (low, high))
-            limits[name] = (min(low, known_low), max(high, known_high))
+def _is_wide(values: Values) -> bool:
+    """Whether values are integers of 64 bits, one of them at least."""
+    return values.dtype.kind in "iu" and values.dtype.itemsize == 8 and values.size > 0
 
 
-def _is_wide(dtype: np.dtype[Any]) -> bool:
-    """Whether values are integers of 64 bits."""
-    return dtype.kind in "iu" and dtype.itemsize == 8
+def narrow_integers(values: Values, codes: Collection[str]) -> Values:
+    """Return 64-bit integers in the first of the types, as ``("i4", "u4")``, that holds them all.
 
+    Values that none of them holds, and values that are no 64-bit integers, stay as they are.
 
-def narrow_integers(
-    values: NDArray[Any], codes: Collection[str], limits: Limits | None
-) -> NDArray[Any]:
-    """Return 64-bit integers in the first of some types, as ``("i4", "u4")``, that holds them all.
-
-    What none of them holds, what has no limits, and what is no 64-bit integers, stays as it is.
+    Example:
+        >>> narrow_integers(np.array([0, 2**31]), ("i4", "u4")).dtype
+        dtype('uint32')
     """
-    if not _is_wide(values.dtype) or limits is None:
+    if not _is_wide(values):
         return values
+    low, high = int(values.min()), int(values.max())
     for code in codes:
         held = np.iinfo(code)
-        if held.min <= limits[0] and limits[1] <= held.max:
+        if held.min <= low and high <= held.max:
             return values.astype(code)
     return values
 
 
-def to_records(columns: Columns) -> NDArray[Any]:
-    """Return columns as one structured array, little-endian, shape ``(N,)``."""
-    length = len(next(iter(columns.values())))
-    parts = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in columns.items()]
-    records = np.empty(length, parts)
-    for name, column in columns.items():
+def to_records(columns: Columns, rows: slice = slice(None)) -> Values:
+    """Return rows of columns as one structured array, little-endian, shape ``(n,)``."""
+    parts = {name: column[rows] for name, column in columns.items()}
+    types = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in parts.items()]
+    records = np.empty(len(next(iter(parts.values()))), types)
+    for name, column in parts.items():
         records[name] = column
     return records
 
 
-def write_records(
-    path: Path, header: Callable[[Columns], list[str]], chunks: Iterator[Columns]
-) -> None:
-    """Write lines that follow from the first columns, and all columns as binary records."""
+def write_records(path: Path, header: Sequence[str], columns: Columns) -> None:
+    """Write the lines of a header, and columns as binary records."""
+    num_rows = len(next(iter(columns.values())))
     with atomic_path(path) as beside, beside.open("wb") as stream:
-        for number, columns in enumerate(chunks):
-            if number == 0:
-                stream.write("".join(f"{line}\n" for line in header(columns)).encode())
-            to_records(columns).tofile(stream)
+        stream.write("".join(f"{line}\n" for line in header).encode())
+        for rows in slices(num_rows, _RECORDS_AT_ONCE):
+            to_records(columns, rows).tofile(stream)
+
+
+def slices(num_rows: int, at_once: int) -> Iterator[slice]:
+    """Cut so many rows into pieces of at most so many."""
+    for start in range(0, num_rows, at_once):
+        yield slice(start, min(start + at_once, num_rows))

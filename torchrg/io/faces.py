@@ -4,14 +4,19 @@ A face is a list of three or more vertices, counter-clockwise as seen from its f
 kept of it but what it adds to sums at its vertices.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
+Fronts = tuple[NDArray[np.float32] | None, tuple[str, ...]]
+"""Front of each point of a cloud, as :attr:`torchrg.Cloud.front`, and notes on it."""
 _CORNERS_AT_ONCE = 1 << 18
 """Corners of faces that are added up together, which take some tens of megabytes."""
+_FACES_AT_ONCE = 1 << 16
+"""Faces with lists of different lengths that are in memory together."""
 _LONGEST_LIST = 1 << 20
 """Bytes, or words of text, of the longest list; a longer one is taken for damage."""
 _LEAST_AGREEMENT = 1e-3
@@ -81,87 +86,29 @@ def _vector_areas(places: NDArray[np.float64], faces: NDArray[np.int64]) -> NDAr
     return normals
 
 
-class ListOf(NamedTuple):
-    """A list in the records of faces: what comes between the one before and it, and its parts.
-
-    Attributes:
-        skipped: Bytes, or words, before its length.
-        length_of: Returns the length from the data and its place in them.
-        length_size: Bytes, or words, of the length.
-        item_size: Bytes, or words, of each item.
-        is_corners: Whether the items are the vertices of a face.
-    """
-
-    skipped: int
-    length_of: Callable[[Any, int], int]
-    length_size: int
-    item_size: int
-    is_corners: bool
-
-
-def split_lists(
-    blocks: Iterable[Any],
-    lists: Sequence[ListOf],
-    tail: int,
-    count: int,
-    as_corners: Callable[[Any, NDArray[np.int64], int], NDArray[np.int64]],
-) -> Iterator[NDArray[np.int64]]:
-    """Take apart records whose lists differ in length, and yield those of equal length together.
-
-    Args:
-        blocks: The data one after the other, bytes or lists of words.
-        lists: The lists of a record.
-        tail: Bytes, or words, behind the last of them.
-        count: Number of records.
-        as_corners: Returns the items of lists of one length, from the data, where they begin, and
-            the length.
+def stack_faces(faces: Iterable[Sequence[float]], count: int) -> Iterator[NDArray[np.int64]]:
+    """Yield so many faces, those with equally many corners together, shape ``(n, corners)``.
 
     Raises:
-        BrokenFacesError: If there are fewer records, or a list is longer than any.
+        BrokenFacesError: If there are fewer faces.
+
+    Example:
+        >>> [part.shape for part in stack_faces([(0, 1, 2), (0, 1, 2, 3), (2, 1, 0)], 3)]
+        [(2, 3), (1, 4)]
     """
-    rest: Any = None
-    for block in blocks:
-        data = block if rest is None else rest + block
-        starts, lengths, end = _walk(data, lists, tail, count)
-        for length in np.unique(lengths).tolist():
-            own = starts[lengths == length]
-            at_once = max(_CORNERS_AT_ONCE // max(length, 1), 1)
-            for start in range(0, len(own), at_once):
-                yield as_corners(data, own[start : start + at_once], length)
-        count, rest = count - len(starts), data[end:]
-        if not count:
-            return
+    rest = islice(faces, min(count, sys.maxsize))
+    while block := list(islice(rest, _FACES_AT_ONCE)):
+        count -= len(block)
+        for length in sorted({len(face) for face in block}):
+            same = [face for face in block if len(face) == length]
+            # Not a number becomes a vertex that there is not.
+            yield np.array(same, np.float64).reshape(len(same), length).astype(np.int64)
     if count:
         raise BrokenFacesError(f"{count:,} are missing")
 
 
-def _walk(
-    data: Any,  # noqa: ANN401
-    lists: Sequence[ListOf],
-    tail: int,
-    count: int,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Return where the corners of each record begin, how many they are, and the end of the last.
-
-    Records are those that are whole, at most so many.
-    """
-    starts, lengths, end = list[int](), list[int](), 0
-    while len(starts) < count:
-        place, start, corners = end, 0, 0
-        for skipped, length_of, length_size, item_size, is_corners in lists:
-            place += skipped + length_size
-            if place > len(data):
-                break
-            length = length_of(data, place - length_size)
-            if not 0 <= length * item_size <= _LONGEST_LIST:
-                raise BrokenFacesError(f"a list of {length:,}")
-            if is_corners:
-                start, corners = place, length
-            place += length * item_size
-        place += tail
-        if place > len(data):
-            break
-        starts.append(start)
-        lengths.append(corners)
-        end = place
-    return np.array(starts, np.int64), np.array(lengths, np.int64), end
+def check_list(length: float, num_bytes: int) -> int:
+    """Return the length of a list of items of so many bytes, which is none that is damage."""
+    if not 0 <= length * num_bytes <= _LONGEST_LIST:
+        raise BrokenFacesError(f"a list of {length:,}")
+    return int(length)

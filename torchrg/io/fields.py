@@ -9,11 +9,9 @@ else keeps its name.
 """
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import reduce
-from operator import or_
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +19,9 @@ from numpy.typing import NDArray
 from torchrg.errors import FormatError
 from torchrg.structures import UNLABELED, Cloud
 
-Columns = Mapping[str, NDArray[Any]]
+Values = NDArray[Any]
+"""An array of any type, as files hold them."""
+Columns = Mapping[str, Values]
 """Values of each point by name, each of shape ``(N, ...)``."""
 
 _ALIASES = {
@@ -47,23 +47,18 @@ _TRIPLES = {
     ("rf", "gf", "bf"): "color",
 }
 """torchrg's names by those of three columns, in lower case."""
-_MAY_BE_COLOR = re.compile(
-    r"(scalar_)?((diffuse_)?(red|green|blue)|[rgb]f?|rgb|colors?)(_[0-9]+|_value)*|column_[4567]",
-    re.IGNORECASE,
-)
-"""Names of columns that may turn out to be colours, ``column_4`` to ``column_7`` without names."""
 _GUESSED_WIDTHS = (6, 7)
 """Columns of a table without names whose meaning the values tell."""
 LEFT_OUT = "_"
 """Name of a column that is not read, as in PCD."""
-_MOST_GUESSED = max(_GUESSED_WIDTHS)
-FIRST_ROWS = _MOST_GUESSED + 1
-"""Rows that :func:`check_first_rows` looks at."""
+_GUESSED_ROWS = 1000
+"""Rows from which the meaning of such columns is guessed."""
 COLUMNS_RULE = (
     "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
-    "a unit normal, or a colour of whole numbers from 0 to 255, where all values fit. Of seven, "
-    "the same is asked of the last three and of the three before the last; if one of both fits, it "
-    "is taken, with intensity before a colour. Any other column is column_4, column_5 and so on."
+    "a unit normal, or a colour of whole numbers from 0 to 255, where the first 1,000 rows fit. Of "
+    "seven, the same is asked of the last three and of the three before the last; if one of both "
+    "fits, it is taken, with intensity before a colour. Any other column is column_4, column_5 and "
+    "so on."
 )
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
@@ -74,63 +69,19 @@ WIDEN = 257
 """65535 / 255: what eight bits become in sixteen, and back without loss."""
 
 
-def _row_text(values: NDArray[Any]) -> str:
-    """Return the shape of a field for a message, which is the same for a chunk and the whole."""
-    return f"({', '.join(['N', *map(str, values.shape[1:])])})"
-
-
-class Span(NamedTuple):
-    """What the values of a column are between: all that the type of a colour depends on.
-
-    Attributes:
-        low: Least value; of floating-point columns the least once not-a-number is zero.
-        high: Largest value, likewise.
-        fine: Whether some value is no multiple of :data:`WIDEN`, so that 8 bits do not hold it.
-    """
-
-    low: Any
-    high: Any
-    fine: bool
-
-    @classmethod
-    def of(cls, values: NDArray[Any]) -> "Span":
-        """Return the span of some values, of which there may be none."""
-        if values.size == 0:
-            return cls(0, 0, False)
-        if values.dtype.kind == "f":
-            values = np.nan_to_num(values)
-            return cls(values.min(), values.max(), False)
-        low, high = values.min(), values.max()
-        return cls(low, high, bool(high > 0 if high <= 255 else (values % WIDEN).any()))
-
-    def __or__(self, other: "Span") -> "Span":
-        """Return the span of the values of both."""
-        fine = self.fine or other.fine
-        return Span(min(self.low, other.low), max(self.high, other.high), fine)
-
-
-def color_spans(columns: Columns) -> dict[str, Span]:
-    """Return the spans of all columns by the file's names that may be colours, or parts of them."""
-    return {
-        name: Span.of(values)
-        for name, values in columns.items()
-        if _MAY_BE_COLOR.fullmatch(name) and values.dtype.kind in "biuf"
-    }
-
-
 def assemble_cloud(
     path: Path,
     columns: Columns,
     *,
     coordinates: str | None = None,
-    spans: Mapping[str, Span] | None = None,
     grid_shape: tuple[int, int] | None = None,
     header: Mapping[str, Any] | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Cloud:
     """Build a cloud from columns by the file's own names.
 
     ``x``, ``y`` and ``z`` are among them unless ``coordinates`` names the column that holds all
-    three. If the columns are a chunk of a file, ``spans`` are those of the whole file.
+    three.
     """
     rest = dict(columns)
     if coordinates is None:
@@ -146,21 +97,33 @@ def assemble_cloud(
     else:
         places = rest.pop(coordinates)
     points = checked_coordinates(path, places)
-    sources = sources_of(rest)
-    fields = {name: _joined(path, [rest[n] for n in parts]) for name, parts in sources.items()}
-    if "labels" in fields:
-        fields["labels"] = _labels(path, fields["labels"])
-    if "normals" in fields:
-        fields["normals"] = _normals(path, fields["normals"])
-    if "color" in fields:
-        if spans is None and fields["color"].dtype != np.uint8:
-            spans = color_spans({part: columns[part] for part in sources["color"]})
-        known = (spans or {}).get
-        fields["color"] = _color(path, fields["color"], [*map(known, sources["color"])])
-    return Cloud(points, fields, grid_shape, source=str(path), header=header or {})
+    fields = {
+        name: _joined(path, [rest[part] for part in parts])
+        for name, parts in _sources_of(rest).items()
+    }
+    for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
+        if name in fields:
+            fields[name] = check(path, fields[name])
+    return Cloud(points, fields, grid_shape, str(path), header or {}, notes)
 
 
-def checked_coordinates(path: Path, coordinates: NDArray[Any]) -> NDArray[np.floating]:
+def assemble_table(
+    path: Path, table: Values, names: Sequence[str] | None, notes: tuple[str, ...] = ()
+) -> Cloud:
+    """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule."""
+    if names is None:
+        _check_table(path, table)
+        names = names_by_rule(table[:_GUESSED_ROWS])
+        if len(names) > 3:
+            notes += (
+                f"its columns have no names and are taken as {' '.join(names)}; if they are "
+                "others, name them with --columns",
+            )
+    columns = {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
+    return assemble_cloud(path, columns, notes=notes)
+
+
+def checked_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]:
     """Return coordinates as float32 or float64 in native byte order.
 
     Whole numbers of at most 16 bits and half precision become float32, which holds them exactly;
@@ -199,9 +162,7 @@ def name_aside(name: str) -> str:
     return f"{'label' if name == 'labels' else name}_input"
 
 
-def put_results(
-    fields: Mapping[str, NDArray[Any]], results: Mapping[str, NDArray[Any]]
-) -> dict[str, NDArray[Any]]:
+def put_results(fields: Mapping[str, Values], results: Mapping[str, Values]) -> dict[str, Values]:
     """Return the fields of a cloud with those of a result beside them.
 
     What a result has the name of is kept as :func:`name_aside` says, unless there is such a field
@@ -233,111 +194,42 @@ def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[
     return notes
 
 
-class Naming(NamedTuple):
-    """Names that depend on the values of all points, and which columns are kept.
+def names_by_rule(rows: Values) -> list[str]:
+    """Name the columns of a table by :data:`COLUMNS_RULE` from its first rows, shape ``(n, C)``.
 
-    Attributes:
-        facts: What a chunk of columns shows.
-        names: Columns by the names they get, from the columns of the file and the facts that any
-            of the chunks showed.
-        is_guess: Whether the names are taken for granted, which people are told.
-    """
-
-    facts: Callable[[Columns], set[str]]
-    names: Callable[[Collection[str], Collection[str]], dict[str, str]]
-    is_guess: bool = False
-
-
-def number_columns(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table without names, shape ``(N, C)`` with at least three columns.
-
-    The first three are ``x y z``, a fourth alone is ``intensity``, others are ``column_4``,
-    ``column_5`` and so on; where there are six or seven, :func:`name_numbered` knows better.
-    """
-    return {name: values[:, i] for i, name in enumerate(_numbers(values.shape[1]))}
-
-
-def _numbers(num_columns: int) -> list[str]:
-    """Return the names that columns without names have before their values are looked at."""
-    names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
-    return names if num_columns != 4 else [*names[:3], "intensity"]
-
-
-def rule_for(num_columns: int) -> tuple[Naming | None, tuple[str, ...]]:
-    """Return how so many columns without names get better ones, and what to tell people of them.
-
-    Nothing of three columns, and of others nothing yet where the values tell.
-    """
-    if num_columns in _GUESSED_WIDTHS:
-        return Naming(numbered_facts, name_numbered, is_guess=True), ()
-    return None, (note_on_names(_numbers(num_columns)),) if num_columns > 3 else ()
-
-
-def note_on_names(names: Iterable[str]) -> str:
-    """Return the line that says which names columns without any were given."""
-    return (
-        f"its columns have no names and are taken as {' '.join(names)}; if they are others, name "
-        "them with --columns"
-    )
-
-
-def name_numbered(columns: Collection[str], facts: Collection[str]) -> dict[str, str]:
-    """Name the six or seven columns of a table of which :func:`numbered_facts` are known.
-
-    By :data:`COLUMNS_RULE`. Of seven columns of small whole numbers, programs mean ``intensity red
-    green blue`` or ``red green blue label``; which of these is not told by values, so both keep
-    their numbers.
+    Of seven columns of small whole numbers, programs mean ``intensity red green blue`` or ``red
+    green blue label``; which of these is not told by values, so both keep their numbers.
 
     Example:
-        >>> columns = number_columns(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
-        >>> list(name_numbered(columns, numbered_facts(columns)))
+        >>> names_by_rule(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
         ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
     """
-    old, names = list(columns), list(columns)
-    found: dict[int, tuple[str, str, str]] = {}
-    for start in _triples_of(columns):
-        if f"lengths {start}" in facts and f"not unit {start}" not in facts:
-            found[start] = ("nx", "ny", "nz")
-        elif f"not bytes {start}" not in facts:
-            found[start] = ("red", "green", "blue")
-    if len(found) == 1:
-        ((start, triple),) = found.items()
+    num_columns = rows.shape[1]
+    names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
+    if num_columns == 4:
+        return [*names[:3], "intensity"]
+    if num_columns not in _GUESSED_WIDTHS:
+        return names
+    starts = range(3, num_columns - 2)
+    triples = {i: triple for i in starts if (triple := _triple_by_values(rows[:, i : i + 3]))}
+    if len(triples) == 1:
+        ((start, triple),) = triples.items()
         names[start : start + 3] = triple
         if start > 3 and "red" in triple:
             names[3] = "intensity"
-    return dict(zip(names, old, strict=True))
+    return names
 
 
-def _triples_of(columns: Collection[str]) -> range:
-    """Return where three columns next to each other begin that are not the coordinates."""
-    return range(3, len(columns) - 2)
-
-
-def numbered_facts(columns: Columns) -> set[str]:
-    """Return what the columns of a table without names show that three of them are not.
-
-    Each fact ends in the number of the first of the three, from zero.
-    """
-    values, facts = list(columns.values()), set[str]()
-    for start in _triples_of(columns):
-        three = np.stack(values[start : start + 3], axis=1)
-        squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
-        # Unit vectors may be zero or not numbers where there is none.
-        lengths = squares[np.isfinite(squares) & (squares != 0)]
-        if len(lengths):
-            facts.add(f"lengths {start}")
-        if (np.abs(lengths - 1) >= _UNIT_TOLERANCE).any():
-            facts.add(f"not unit {start}")
-        if three.size and not (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
-            facts.add(f"not bytes {start}")
-    return facts
-
-
-def name_columns(table: NDArray[Any], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table, shape ``(N, C)``, by names that are given, or by the rule."""
-    if names is None:
-        return number_columns(table)
-    return {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
+def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
+    """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a colour."""
+    squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
+    # Unit vectors may be zero or not numbers where there is none.
+    lengths = squares[np.isfinite(squares) & (squares != 0)]
+    if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
+        return ("nx", "ny", "nz")
+    if three.size == 0 or (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
+        return ("red", "green", "blue")
+    return None
 
 
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
@@ -355,31 +247,28 @@ def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
         )
 
 
-def check_first_rows(path: Path, rows: NDArray[Any]) -> None:
-    """Refuse tables of numbers without names that are no points: a pose, or points across.
-
-    The rows are the first :data:`FIRST_ROWS`, or all if there are fewer, shape ``(n, C)``.
-    """
-    num_rows, num_columns = rows.shape
-    if rows.shape == (4, 4) and rows[3].tolist() == [0, 0, 0, 1]:
+def _check_table(path: Path, table: Values) -> None:
+    """Refuse tables of numbers without names that are no points: a pose, or points across."""
+    num_rows, num_columns = table.shape
+    if table.shape == (4, 4) and table[3].tolist() == [0, 0, 0, 1]:
         raise FormatError(
             f"{path}: expected points, got a matrix of 4 x 4, a pose; name the file of the cloud."
         )
-    if 3 <= num_rows <= _MOST_GUESSED < num_columns:
+    if 3 <= num_rows <= max(_GUESSED_WIDTHS) < num_columns:
         raise FormatError(
             f"{path}: expected a row for each point, got {num_rows} rows of {num_columns:,} "
             "numbers; transpose them."
         )
 
 
-def are_whole(values: NDArray[Any]) -> bool:
+def are_whole(values: Values) -> bool:
     """Whether all values are finite whole numbers."""
     if values.dtype.kind in "iub":
         return True
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
-def sources_of(columns: Columns) -> dict[str, list[str]]:
+def _sources_of(columns: Columns) -> dict[str, list[str]]:
     """Return the columns that each field is made of; the first of two equal names wins it.
 
     Triples and numbered columns are joined, the others renamed. Shapes and types decide, no values.
@@ -401,14 +290,14 @@ def sources_of(columns: Columns) -> dict[str, list[str]]:
     return fields
 
 
-def _joined(path: Path, parts: list[NDArray[Any]]) -> NDArray[Any]:
+def _joined(path: Path, parts: list[Values]) -> Values:
     """Return several single columns as one field, or one column as it is, in native byte order."""
     if len(parts) > 1:
         return _stacked(path, parts)
     return np.ascontiguousarray(parts[0], dtype=parts[0].dtype.newbyteorder("="))
 
 
-def _free_name(name: str, values: NDArray[Any], taken: Collection[str]) -> str:
+def _free_name(name: str, values: Values, taken: Collection[str]) -> str:
     """Return torchrg's name for a column if its shape fits and no other has it yet."""
     target = _ALIASES.get(_plain(name), name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
@@ -440,7 +329,7 @@ def _numbered(columns: Columns) -> dict[str, list[str]]:
     }
 
 
-def _stacked(path: Path, columns: list[NDArray[Any]]) -> NDArray[Any]:
+def _stacked(path: Path, columns: list[Values]) -> Values:
     """Put single columns side by side, in native byte order."""
     try:
         dtype = np.result_type(*columns)
@@ -456,7 +345,7 @@ def _stacked(path: Path, columns: list[NDArray[Any]]) -> NDArray[Any]:
     return stacked
 
 
-def _labels(path: Path, labels: NDArray[Any]) -> NDArray[np.int64]:
+def _labels(path: Path, labels: Values) -> NDArray[np.int64]:
     """Return labels as int64, shape ``(N,)``; not-a-number means no label, as in CloudCompare."""
     flat = labels.reshape(-1) if labels.shape[1:] == (1,) else labels
     if flat.ndim != 1 or flat.dtype.kind not in "biuf":
@@ -479,40 +368,44 @@ def _labels(path: Path, labels: NDArray[Any]) -> NDArray[np.int64]:
     return flat.astype(np.int64)
 
 
-def _normals(path: Path, normals: NDArray[Any]) -> NDArray[np.floating]:
+def _normals(path: Path, normals: Values) -> NDArray[np.floating]:
     """Return normals as float32 or float64, shape ``(N, 3)``."""
     _check_triples(path, "normals", normals)
     return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
 
 
-def _color(path: Path, color: NDArray[Any], spans: Iterable[Span | None]) -> NDArray[Any]:
+def _color(path: Path, color: Values) -> Values:
     """Return colours as uint8 0..255, shape ``(N, 3)``; uint16 where 8 bits do not hold them.
 
-    Floating-point colours are 0..1 if none is larger, otherwise 0..255. The spans are those of its
-    parts over the whole file.
+    Floating-point colours are 0..1 if none is larger, otherwise 0..255.
     """
     _check_triples(path, "color", color)
     if color.dtype == np.uint8 or color.size == 0:
-        return color.astype(np.uint8)
-    low, high, fine = reduce(or_, (span for span in spans if span is not None))
+        return color.astype(np.uint8, copy=False)
     is_float = color.dtype.kind == "f"
+    color = np.nan_to_num(color) if is_float else color
+    low, high = color.min(), color.max()
     if low < 0 or high > (255 if is_float else 65535):
         raise FormatError(
             f"{path}: expected color in 0..255, got {low} to {high}; rename or remove that field."
         )
     if is_float:
-        known = np.nan_to_num(color)
-        rounded: NDArray[Any] = np.rint(known * 255 if high <= 1 else known)
-        return rounded.astype(np.uint8)
+        rounded: Values = np.rint(color * 255 if high <= 1 else color).astype(np.uint8)
+        return rounded
     if high <= 255:
         return color.astype(np.uint8)
-    if fine:
+    if (color % WIDEN).any():
         return color.astype(np.uint16)
-    narrow: NDArray[Any] = color // WIDEN
-    return narrow.astype(np.uint8)
+    narrow: Values = (color // WIDEN).astype(np.uint8)
+    return narrow
 
 
-def _check_triples(path: Path, name: str, values: NDArray[Any]) -> None:
+def _row_text(values: Values) -> str:
+    """Return the shape of a field for a message, without the number of points."""
+    return f"({', '.join(['N', *map(str, values.shape[1:])])})"
+
+
+def _check_triples(path: Path, name: str, values: Values) -> None:
     """Check that a field is three real numbers a point."""
     if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
         raise FormatError(

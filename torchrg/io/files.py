@@ -8,6 +8,8 @@ import shutil
 import stat
 import struct
 import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -28,16 +30,17 @@ DAMAGES = (
     SyntaxError,
     tokenize.TokenError,
     struct.error,
-    tokenize.TokenError,
 )
-"""What libraries raise on damaged files beside their own errors, found by flipping bytes."""
+"""Errors that libraries raise of damaged files beside their own, found by flipping bytes."""
+ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
+"""Errors that reading a damaged archive raises."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, and of a user who may not fill it further."""
 _MORE_BYTES = 1 << 20
 """Bytes that are tried on a disk that may be full. They are more than a library writes at a time,
 and do not fit where its last ones did not."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
-"""What the names have in common that :func:`atomic_path` writes under here."""
+"""Mark in the names that :func:`atomic_path` writes under here."""
 
 
 @contextmanager

@@ -8,18 +8,18 @@ came with keep their name, type, scale, offset, value for no data and descriptio
 import copy
 import math
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.columns import Limits, Spelling, flatten_cloud, merge_limits, spell
-from torchrg.io.fields import WIDEN, Columns, Naming, are_whole, name_aside, sources_of
+from torchrg.io.columns import Spelling, flatten_cloud, slices
+from torchrg.io.fields import WIDEN, Columns, Values, are_whole, assemble_cloud
 from torchrg.io.files import (
     DAMAGES,
     asking_system,
@@ -28,12 +28,18 @@ from torchrg.io.files import (
     first_line,
     refusing,
 )
-from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Table
 from torchrg.structures import Cloud
 
 _SPELLING = Spelling(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True
 )
+_ASIDE = {
+    **{name: f"normals_input_{i}" for i, name in enumerate(_SPELLING.normals)},
+    _SPELLING.curvature: "curvature_input",
+}
+"""Names of columns that gave way to a result, where they do not end in ``_input`` alone."""
+_POINTS_AT_ONCE = 1 << 20
+"""Points that are read or written together. They take tens of megabytes."""
 _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 """By point format without colour, the one that adds it."""
 _FIRST_LAYERED_FORMAT = 6
@@ -49,15 +55,16 @@ _UNFIT_DESCRIPTION = "more than the standard one holds"
 program gave such a name."""
 LARGEST_INTEGER = 2**31 - 1
 """Largest coordinate of a LAS file, in steps of its scale from its offset."""
-_VERSION_AT, _RECORDS_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 100, 107, 235, 247
-"""Places in the header: minor version, number of records, of points, extended records, and the
-number of points of 64 bits that version 1.4 has beside the old one, which may be 0 there."""
+_VERSION_AT, _START_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 96, 107, 235, 247
+"""Places in the header: minor version, first byte of points and number of records, number of
+points, extended records, and the number of points of 64 bits that version 1.4 has beside the old
+one, which may be 0 there."""
 _DATE_AT, _DATE_BYTES = 90, 4
 """Place in the header of the day and the year of creation, and how many bytes they are."""
 
 
-def open_las(path: Path, size: int) -> Table:
-    """Open a LAS, LAZ or COPC file.
+def read_las(path: Path, size: int) -> Cloud:
+    """Read a LAS, LAZ or COPC file.
 
     The cloud is float64, with every extra dimension and every standard one that is not zero
     everywhere; colours are uint8 where eight bits hold them, else uint16. The header is kept for
@@ -67,39 +74,38 @@ def open_las(path: Path, size: int) -> Table:
     _check_header(path, size)
     with _reading(laspy, path) as reader:
         header = reader.header
+        if header.point_count == 0:
+            raise FormatError(
+                f"{path}: expected at least one point, got none; fetch the file again."
+            )
         _check_points(path, header, size)
-    if header.point_count == 0:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+        # By parts, memory grows with the points that are there, whatever the header promises.
+        parts = list(map(_columns, reader.chunk_iterator(_POINTS_AT_ONCE)))
     # How the points are packed is not about the points, and laspy cannot write an octree.
     for records in (header.vlrs, header.evlrs or []):
         records[:] = [r for r in records if r.user_id not in _PACKING]
-
-    def read(chunk_size: int) -> Iterator[Columns]:
-        with _reading(laspy, path) as reader:
-            yield from map(_columns, reader.chunk_iterator(chunk_size))
-
     standard = set(header.point_format.standard_dimension_names)
+    names = list(parts[0])
+    unused = {n for n in names if n in standard and not any(part[n].any() for part in parts)}
+    if not unused.issuperset(_SPELLING.color):
+        unused.difference_update(_SPELLING.color)
     extra = header.point_format.extra_dimensions
     ours = {dim.name for dim in extra if dim.description == _UNFIT_DESCRIPTION}
+    columns = {
+        name.removesuffix(_UNFIT) if name in ours else name: _joined(parts, name)
+        for name in names
+        if name not in unused
+    }
+    return assemble_cloud(path, columns, header={"las": header})
 
-    def facts(columns: Columns) -> set[str]:
-        return {name for name in standard if name in columns and columns[name].any()}
 
-    def names(columns: Collection[str], used: Collection[str]) -> dict[str, str]:
-        unused = _unused(columns, standard, used)
-        return {
-            name.removesuffix(_UNFIT) if name in ours else name: name
-            for name in columns
-            if name not in unused
-        }
-
-    naming = Naming(facts, names)
-    # By chunks, memory grows with the points that are there, whatever the header promises.
-    return Table(read, header.point_count, POINTS_A_CHUNK, naming, header={"las": header})
+def _joined(parts: Sequence[dict[str, Values]], name: str) -> Values:
+    """Return a column of all parts, and take it out of them."""
+    return np.concatenate([part.pop(name) for part in parts])
 
 
 @contextmanager
-def _reading(laspy: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
+def _reading(laspy: ModuleType, path: Path) -> Iterator[Any]:
     """Open a reader; what is wrong with the file is an error that names it."""
     message = f"{path}: expected a LAS or LAZ file, got: "
     damages = (laspy.errors.LaspyException, *DAMAGES)
@@ -119,31 +125,28 @@ def _reading(laspy: Any, path: Path) -> Iterator[Any]:  # noqa: ANN401
         ) from error
 
 
-def check_las(path: Path, cloud: Cloud | CloudStream | None) -> None:
+def check_las(path: Path, cloud: Cloud | None) -> None:
     """Check that laspy is installed, and that all points of a cloud that is known are finite."""
     _laspy("write")
-    num_before, num_lost, first = 0, 0, 0
-    for chunk in [cloud] if isinstance(cloud, Cloud) else cloud or ():
-        lost = np.flatnonzero(~chunk.finite)
-        if len(lost) and not num_lost:
-            first = num_before + int(lost[0])
-        num_lost += len(lost)
-        num_before += len(chunk)
-    if num_lost:
+    lost = np.flatnonzero([] if cloud is None else ~cloud.finite)
+    if len(lost):
         raise FormatError(
-            f"{path}: expected finite coordinates, as LAS has no others, got {num_lost} points "
-            f"that are not (first: {first}); write .npz, .ply or .pcd."
+            f"{path}: expected finite coordinates, as LAS has no others, got {len(lost)} points "
+            f"that are not (first: {lost[0]}); write .npz, .ply or .pcd."
         )
 
 
-def write_las(path: Path, stream: CloudStream) -> None:
+def write_las(path: Path, cloud: Cloud) -> None:
     """Write a LAS file, or a LAZ file if the suffix says so.
 
     If the cloud came from a LAS file, scale, offset, reference system and point format are kept;
     otherwise the scale is the smallest power of ten that the grid of 32 bits allows.
     """
     laspy = _laspy("write")
-    plan = _plan(path, laspy, stream)
+    columns = flatten_cloud(path, cloud, _SPELLING)
+    has_date = "las" in cloud.header and cloud.header["las"].creation_date is not None
+    header = _header(laspy, cloud, colored=all(name in columns for name in _SPELLING.color))
+    columns = _add_dimensions(path, laspy, header, cloud, columns)
     errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
     with (
         refusing(f"{path}: cannot be written: ", *errors),
@@ -154,21 +157,84 @@ def write_las(path: Path, stream: CloudStream) -> None:
         # laspy leaves a file open that it cannot end.
         with (
             beside.open("wb+") as file,
-            laspy.open(
-                file, mode="w", header=plan.header, do_compress=packed, closefd=False
-            ) as writer,
+            laspy.open(file, mode="w", header=header, do_compress=packed, closefd=False) as writer,
         ):
-            for chunk in stream:
-                record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=plan.header)
-                data = laspy.LasData(plan.header, record)
-                data.x, data.y, data.z = chunk.coordinates.T.astype(np.float64)
-                for name, column in plan.columns(path, chunk).items():
-                    data[name] = column
+            for rows in slices(len(cloud), _POINTS_AT_ONCE):
+                points = cloud.coordinates[rows].astype(np.float64, copy=False)
+                record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+                data = laspy.LasData(header, record)
+                data.x, data.y, data.z = points.T
+                for name, column in columns.items():
+                    data[name] = column[rows]
                 writer.write_points(data.points)
-            if plan.header.version.minor >= 4 and plan.header.evlrs is not None:
-                writer.write_evlrs(plan.header.evlrs)
-        if not plan.has_date:
+            if header.version.minor >= 4 and header.evlrs is not None:
+                writer.write_evlrs(header.evlrs)
+        if not has_date:
             _erase_date(beside)
+
+
+def _header(laspy: ModuleType, cloud: Cloud, *, colored: bool) -> Any:  # noqa: ANN401
+    """Return the header that the cloud came with, or a new one, without extra dimensions."""
+    stored = cloud.header.get("las")
+    if stored is None:
+        header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
+        low, high = cloud.coordinates.min(axis=0), cloud.coordinates.max(axis=0)
+        low, high = low.astype(np.float64), high.astype(np.float64)
+        middle = np.rint((low + high) / 2)
+        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
+        header.offsets = middle
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
+        return header
+    number = stored.point_format.id
+    number = _WITH_COLOR.get(number, number) if colored else number
+    least = laspy.LasHeader(point_format=number).version
+    header = copy.deepcopy(stored)
+    header.set_version_and_point_format(max(stored.version, least), laspy.PointFormat(number))
+    return header
+
+
+def _add_dimensions(
+    path: Path,
+    laspy: ModuleType,
+    header: Any,  # noqa: ANN401
+    cloud: Cloud,
+    columns: Columns,
+) -> dict[str, Values]:
+    """Add to a header the extra dimensions that columns need, and return all dimensions by name.
+
+    Those that the cloud came with keep type, scale and description as long as these hold its
+    values exactly. A column that the standard dimension of its name cannot hold gets one more.
+    """
+    dimensions, params = dict[str, Values](), list[Any]()
+    for own in _own_dimensions(cloud.header.get("las"), columns):
+        if own.holds(columns):
+            known = own.dimension
+            more = (known.description, known.offsets, known.scales, known.no_data)
+            params.append(laspy.ExtraBytesParams(known.name, known.dtype, *more))
+            dimensions[known.name] = own.join(columns)
+            columns = {name: c for name, c in columns.items() if name not in own.columns}
+    standard = set(header.point_format.dimension_names)
+    for name, column in columns.items():
+        if name in ("x", "y", "z"):
+            continue
+        if name in _SPELLING.color and column.dtype == np.uint8:
+            column = column.astype(np.uint16) * WIDEN
+        is_unfit = name in standard and not _holds(
+            header.point_format.dimension_by_name(name), column
+        )
+        name = f"{name}{_UNFIT}" if is_unfit else name
+        if name in ("X", "Y", "Z") or len(name.encode()) > 32:
+            raise FormatError(
+                f"{path}: expected names of at most 32 bytes other than X, Y, Z, got {name!r}; "
+                "rename the field."
+            )
+        if name not in standard:
+            description = _UNFIT_DESCRIPTION if is_unfit else ""
+            params.append(laspy.ExtraBytesParams(name, column.dtype.str[1:], description))
+        dimensions[name] = column
+    header.add_extra_dims(params)
+    _claim_no_ranges(header)
+    return dimensions
 
 
 class _Own(NamedTuple):
@@ -194,105 +260,28 @@ class _Own(NamedTuple):
             return _fits(steps, dtype) and bool((back == values).all())
         return _fits(values, dtype)
 
-    def join(self, columns: Columns) -> NDArray[Any]:
+    def join(self, columns: Columns) -> Values:
         """Return the values of the dimension, shape ``(N,)`` or ``(N, K)``."""
         parts = [columns[name] for name in self.columns]
         return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
 
 
-class _Plan(NamedTuple):
-    """What has to be known of all points before the first is written.
-
-    The header holds the extra dimensions, of which ``own`` are those that the cloud came with;
-    ``unfit`` are the columns that the standard dimension of their name cannot hold; without a date,
-    that of the day is erased.
-    """
-
-    header: Any
-    has_date: bool
-    unfit: set[str]
-    limits: dict[str, Limits]
-    own: list[_Own]
-
-    def columns(self, path: Path, chunk: Cloud) -> dict[str, NDArray[Any]]:
-        """Return the dimensions of a chunk but for its coordinates."""
-        columns = flatten_cloud(path, chunk, _SPELLING, self.limits)
-        joined = {own.dimension.name: own.join(columns) for own in self.own}
-        taken = {name for own in self.own for name in own.columns}
-        others = {name: column for name, column in columns.items() if name not in taken}
-        return joined | _fitted(path, others, self.unfit)
-
-
-def _plan(path: Path, laspy: Any, stream: CloudStream) -> _Plan:  # noqa: ANN401
-    """Look at all points for what the header has to say of them."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    unfit, limits = set[str](), dict[str, Limits]()
-    for number, chunk in enumerate(stream):
-        columns = flatten_cloud(path, chunk, _SPELLING)
-        if number == 0:
-            colored = all(name in columns for name in _SPELLING.color)
-            header, has_date = _header(laspy, stream, colored=colored)
-            own = _own_dimensions(stream.header.get("las"), chunk)
-        merge_limits(limits, columns)
-        own = [dimension for dimension in own if dimension.holds(columns)]
-        fitted = _fitted(path, columns, set())
-        unfit |= {
-            name
-            for name in fitted.keys() & set(header.point_format.dimension_names)
-            if not _holds(header.point_format.dimension_by_name(name), fitted[name])
-        }
-        low = np.minimum(low, chunk.coordinates.min(axis=0))
-        high = np.maximum(high, chunk.coordinates.max(axis=0))
-    if "las" not in stream.header:
-        middle = np.rint((low + high) / 2)
-        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
-        header.offsets = middle
-        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
-    plan = _Plan(header, has_date, unfit, limits, own)
-    described = {known.dimension.name: known.dimension for known in own}
-    standard = set(header.point_format.dimension_names)
-    params = []
-    for name, column in plan.columns(path, chunk).items():
-        known = described.get(name)
-        if known is not None:
-            more = (known.description, known.offsets, known.scales, known.no_data)
-            params.append(laspy.ExtraBytesParams(name, known.dtype, *more))
-        elif name not in standard:
-            ours = _UNFIT_DESCRIPTION if name.removesuffix(_UNFIT) in unfit else ""
-            params.append(laspy.ExtraBytesParams(name, column.dtype.str[1:], ours))
-    header.add_extra_dims(params)
-    _claim_no_ranges(header)
-    return plan
-
-
-def _own_dimensions(header: Any, cloud: Cloud) -> list[_Own]:  # noqa: ANN401
+def _own_dimensions(header: Any, columns: Columns) -> list[_Own]:  # noqa: ANN401
     """Return the extra dimensions of the file that a cloud came from, as far as it still has them.
 
     A field that was put aside for a result takes its dimension along, under its new name.
     """
-    if header is None:
-        return []
-    dimensions = {name: dim for dim in header.point_format.dimensions for name in _parts_of(dim)}
-    fields = sources_of({name: np.empty(0, _type_of(dim)) for name, dim in dimensions.items()})
-    found = dict[str, tuple[str, str]]()
-    for field, parts in fields.items():
-        aside = name_aside(field)
-        is_aside = aside in cloud.fields and aside not in fields
-        name = aside if is_aside else field
-        if name not in cloud.fields:
-            continue
-        spelled = spell(name, cloud.fields[name].shape[1:], _SPELLING)
-        if len(spelled) != len(parts):
-            continue
-        for part, column in zip(parts, spelled, strict=True):
-            new = column if dimensions[part].num_elements == 1 else name
-            found[part] = (column, new if is_aside else dimensions[part].name)
-    own = []
-    for dim in header.point_format.extra_dimensions:
-        elements = [found[part] for part in _parts_of(dim) if part in found]
-        if len(elements) == dim.num_elements:
-            columns, names = zip(*elements, strict=True)
-            own.append(_Own(dim._replace(name=names[0]), columns))
+    own = list[_Own]()
+    dimensions = [] if header is None else [*header.point_format.extra_dimensions]
+    names = {dimension.name for dimension in dimensions}
+    for dimension in dimensions:
+        parts = list[str]()
+        for part in _parts_of(dimension):
+            aside = _ASIDE.get(part, f"{part}_input")
+            parts.append(aside if aside in columns and aside not in names else part)
+        if all(part in columns for part in parts):
+            name = parts[0] if len(parts) == 1 else dimension.name
+            own.append(_Own(dimension._replace(name=name), tuple(parts)))
     return own
 
 
@@ -300,13 +289,6 @@ def _parts_of(dimension: Any) -> list[str]:  # noqa: ANN401
     """Return the names of the columns that a dimension is read as."""
     name, count = dimension.name, dimension.num_elements
     return [name] if count == 1 else [f"{name}_{i}" for i in range(count)]
-
-
-def _type_of(dimension: Any) -> np.dtype[Any]:  # noqa: ANN401
-    """Return the type of the columns that a dimension is read as."""
-    if dimension.is_scaled:
-        return np.dtype(np.float64)
-    return np.dtype(np.uint8) if dimension.dtype is None else dimension.dtype.base
 
 
 def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401
@@ -318,16 +300,17 @@ def _claim_no_ranges(header: Any) -> None:  # noqa: ANN401
                 described.options &= ~_RANGE_BITS
 
 
-def count_las(stream: BinaryIO, size: int) -> int:
+def count_las(path: Path, size: int) -> int:
     """Return the number of points by the header, for which laspy need not be installed."""
-    head = stream.read(_COUNT14_AT + 8)
+    with path.open("rb") as stream:
+        head = stream.read(_COUNT14_AT + 8)
     (count,) = struct.unpack_from("<I", head, _COUNT_AT)
     if head[_VERSION_AT] >= 4:
         (count,) = struct.unpack_from("<Q", head, _COUNT14_AT)
     return int(count)
 
 
-def _laspy(verb: str) -> Any:  # noqa: ANN401
+def _laspy(verb: str) -> ModuleType:
     """Return the module."""
     return require("laspy", extra="las", purpose=f"{verb} LAS and LAZ files")
 
@@ -338,8 +321,9 @@ def _check_header(path: Path, size: int) -> None:
         head = stream.read(255)
         if head[:4] != b"LASF" or len(head) < 227:
             raise FormatError(f"{path}: byte 0: expected the header of a LAS file; fetch it again.")
-        (num_records,) = struct.unpack_from("<I", head, _RECORDS_AT)
-        check_promise(path, _RECORDS_AT, 54 * num_records, "header records", available=size)
+        start, num_records = struct.unpack_from("<II", head, _START_AT)
+        check_promise(path, _START_AT, start, "what comes before points", available=size)
+        check_promise(path, _START_AT + 4, 54 * num_records, "header records", available=size)
         if head[_VERSION_AT] < 4 or len(head) < 247:
             return
         start, num_extended = struct.unpack_from("<QI", head, _EXTENDED_AT)
@@ -415,9 +399,9 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
         start += num_bytes
 
 
-def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
+def _columns(block: Any) -> dict[str, Values]:  # noqa: ANN401
     """Return the dimensions of a block of points."""
-    columns: dict[str, NDArray[Any]] = {axis: np.asarray(block[axis]) for axis in "xyz"}
+    columns = {axis: np.asarray(block[axis]) for axis in "xyz"}
     for dimension in block.point_format.dimensions:
         values = np.asarray(block[dimension.name])
         if dimension.name in ("X", "Y", "Z"):
@@ -427,54 +411,14 @@ def _columns(block: Any) -> dict[str, NDArray[Any]]:  # noqa: ANN401
     return columns
 
 
-def _unused(columns: Collection[str], standard: set[str], used: Collection[str]) -> set[str]:
-    """Return the standard dimensions that are zero everywhere; the channels of a colour as one."""
-    kept = {name for name in columns if name not in standard or name in used}
-    if not kept.isdisjoint(_SPELLING.color):
-        kept.update(_SPELLING.color)
-    return set(columns) - kept
-
-
-def _header(laspy: Any, stream: CloudStream, *, colored: bool) -> tuple[Any, bool]:  # noqa: ANN401
-    """Return the header the cloud came with, or a new one, and whether it has a date."""
-    stored = stream.header.get("las")
-    if stored is None:
-        return laspy.LasHeader(version="1.4", point_format=7 if colored else 6), False
-    number = stored.point_format.id
-    number = _WITH_COLOR.get(number, number) if colored else number
-    least = laspy.LasHeader(point_format=number).version
-    header = copy.deepcopy(stored)
-    header.set_version_and_point_format(max(stored.version, least), laspy.PointFormat(number))
-    return header, stored.creation_date is not None
-
-
-def _fitted(path: Path, columns: Columns, unfit: Collection[str]) -> dict[str, NDArray[Any]]:
-    """Return all columns but x, y, z; those that a standard dimension cannot hold renamed."""
-    fitted = {}
-    for name, column in columns.items():
-        if name in ("x", "y", "z"):
-            continue
-        if name in _SPELLING.color and column.dtype == np.uint8:
-            column = column.astype(np.uint16) * WIDEN
-        if name in unfit:
-            name = f"{name}{_UNFIT}"
-        if name in ("X", "Y", "Z") or len(name.encode()) > 32:
-            raise FormatError(
-                f"{path}: expected names of at most 32 bytes other than X, Y, Z, got {name!r}; "
-                "rename the field."
-            )
-        fitted[name] = column
-    return fitted
-
-
-def _holds(dimension: Any, column: NDArray[Any]) -> bool:  # noqa: ANN401
+def _holds(dimension: Any, column: Values) -> bool:  # noqa: ANN401
     """Whether a standard dimension holds all values of a column exactly."""
     if dimension.dtype is not None:
         return _fits(column, dimension.dtype)
     return _fits(column, np.dtype(np.uint8)) and bool(column.max() <= dimension.max)
 
 
-def _fits(values: NDArray[Any], dtype: np.dtype[Any]) -> bool:
+def _fits(values: Values, dtype: np.dtype[Any]) -> bool:
     """Whether a type holds all values exactly."""
     if dtype.kind == "f":
         with np.errstate(over="ignore"):

@@ -6,19 +6,18 @@ needs every header line in place, and writes ASCII with ten decimals.
 """
 
 import struct
-from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_stream, write_records
-from torchrg.io.fields import Columns
+from torchrg.io.columns import Spelling, flatten_cloud, write_records
+from torchrg.io.fields import Columns, Values, assemble_cloud
 from torchrg.io.files import check_promise
-from torchrg.io.stream import CloudStream, Table, slices
-from torchrg.io.text import LINES_AT_ONCE, read_ascii, words_of
+from torchrg.io.text import read_rows, words_of
+from torchrg.structures import Cloud
 
 _LONGEST_HEADER = 1 << 16
 """Bytes of the longest header; a longer one is taken for damage."""
@@ -33,75 +32,66 @@ _SPELLING = Spelling(normals=("normal_x", "normal_y", "normal_z"), vectors=True)
 _PACKED_COLORS = ("rgb", "rgba")
 _LARGEST_LZF_RATIO = 88
 """Most bytes that one byte of LZF becomes: three bytes refer to at most 264."""
-_Fields = dict[str, NDArray[Any]]
 
 
-def open_pcd(path: Path, size: int) -> Table:
-    """Open a PCD file.
+def read_pcd(path: Path, size: int) -> Cloud:
+    """Read a PCD file.
 
     Packed colours become ``color``, and the fourth channel of ``rgba`` becomes ``alpha``. An
-    organised cloud has its ``grid_shape``, and the viewpoint is kept for writing. A compressed file
-    holds its fields one after the other in one lump, so its first chunk takes the memory of all.
+    organised cloud has its ``grid_shape``, and the viewpoint is kept for writing.
     """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
-    read_stored = {"ascii": _read_text, "binary": _read_binary}.get(
-        header.encoding, _read_compressed
-    )
-
-    def read(chunk_size: int) -> Iterator[Columns]:
-        with path.open("rb") as stream:
-            for stored in read_stored(path, stream, header, size, chunk_size):
-                columns: _Fields = {}
-                for name in header.field_names:
-                    columns |= _unpacked(name, stored[name])
-                yield columns
-
-    return Table(
-        read,
-        header.num_points,
-        LINES_AT_ONCE if header.encoding == "ascii" else None,
-        grid_shape=(header.height, header.width) if header.height > 1 else None,
-        header={"viewpoint": header.viewpoint},
-    )
+        read = {"ascii": _read_text, "binary": _read_binary}.get(header.encoding, _read_compressed)
+        stored = read(path, stream, header, size)
+    columns: dict[str, Values] = {}
+    for name in header.field_names:
+        columns |= _unpacked(name, stored[name])
+    grid_shape = (header.height, header.width) if header.height > 1 else None
+    about = {"viewpoint": header.viewpoint}
+    return assemble_cloud(path, columns, grid_shape=grid_shape, header=about)
 
 
-def write_pcd(path: Path, stream: CloudStream) -> None:
+def count_pcd(path: Path, size: int) -> int:
+    """Return the number of points by the header."""
+    with path.open("rb") as stream:
+        return _read_header(path, stream).num_points
+
+
+def write_pcd(path: Path, cloud: Cloud) -> None:
     """Write a binary file; equal clouds give equal bytes.
 
     Coordinates keep their precision, colours are packed as PCL does, an organised cloud keeps its
     width and height. (Open3D's older reader, and PCL's own point types, take float32 coordinates
     only; ``open3d.t.io`` takes both.)
     """
-    height, width = stream.grid_shape or (1, stream.count)
-    if height * width != stream.count:
+    height, width = cloud.grid_shape or (1, len(cloud))
+    if height * width != len(cloud):
         raise FormatError(
-            f"{path}: expected a grid of {stream.count} points, got {height} rows of {width}; "
+            f"{path}: expected a grid of {len(cloud)} points, got {height} rows of {width}; "
             "set grid_shape to None."
         )
-    viewpoint = stream.header.get("viewpoint", DEFAULT_VIEWPOINT)
-
-    def header(columns: Columns) -> list[str]:
-        values = columns.values()
-        return [
-            "# .PCD v0.7 - Point Cloud Data file format",
-            "VERSION 0.7",
-            f"FIELDS {' '.join(columns)}",
-            f"SIZE {' '.join(str(column.dtype.itemsize) for column in values)}",
-            f"TYPE {' '.join(column.dtype.kind.upper() for column in values)}",
-            f"COUNT {' '.join(str(int(np.prod(column.shape[1:]))) for column in values)}",
-            f"WIDTH {width}",
-            f"HEIGHT {height}",
-            f"VIEWPOINT {' '.join(f'{value:.17g}' for value in viewpoint)}",
-            f"POINTS {width * height}",
-            "DATA binary",
-        ]
-
-    write_records(path, header, map(_packed, flatten_stream(path, stream, _SPELLING)))
+    viewpoint = cloud.header.get("viewpoint", DEFAULT_VIEWPOINT)
+    columns = _packed(flatten_cloud(path, cloud, _SPELLING))
+    values = columns.values()
+    header = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(columns)}",
+        f"SIZE {' '.join(str(column.dtype.itemsize) for column in values)}",
+        f"TYPE {' '.join(column.dtype.kind.upper() for column in values)}",
+        f"COUNT {' '.join(str(int(np.prod(column.shape[1:]))) for column in values)}",
+        f"WIDTH {width}",
+        f"HEIGHT {height}",
+        f"VIEWPOINT {' '.join(f'{value:.17g}' for value in viewpoint)}",
+        f"POINTS {width * height}",
+        "DATA binary",
+    ]
+    write_records(path, header, columns)
 
 
 class _Header(NamedTuple):
-    """What a header says, and how long it is.
+    """What a header says, and how many lines it has.
 
     A point has ``dtype``, whose padding fields are called ``_ 0``, ``_ 1`` and so on; a cloud
     without order is one row of ``width`` points.
@@ -113,7 +103,6 @@ class _Header(NamedTuple):
     viewpoint: tuple[float, ...]
     encoding: str
     num_lines: int
-    num_bytes: int
 
     @property
     def num_points(self) -> int:
@@ -158,9 +147,8 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     encoding = " ".join(entries.words("DATA"))
     if encoding not in _ENCODINGS:
         raise entries.error("DATA", f"one of {', '.join(_ENCODINGS)}")
-    viewpoint = entries.numbers("VIEWPOINT", 7, DEFAULT_VIEWPOINT)
-    dtype = _record_type(entries)
-    return _Header(dtype, width, height, viewpoint, encoding, number, stream.tell())
+    dtype, viewpoint = _record_type(entries), entries.viewpoint()
+    return _Header(dtype, width, height, viewpoint, encoding, number)
 
 
 class _Entries(NamedTuple):
@@ -198,17 +186,15 @@ class _Entries(NamedTuple):
             raise self.error(key, "a size that fits a file")
         return [int(word) for word in words]
 
-    def numbers(self, key: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
-        """Return numbers after a key."""
-        if key not in self.lines:
-            return default
-        try:
-            values = tuple(float(word) for word in self.words(key))
-        except ValueError:
-            values = ()
-        if len(values) != count:
-            raise self.error(key, f"{count} numbers")
-        return values
+    def viewpoint(self) -> tuple[float, ...]:
+        """Return position and quaternion of the sensor."""
+        if "VIEWPOINT" not in self.lines:
+            return DEFAULT_VIEWPOINT
+        with suppress(ValueError):
+            values = tuple(map(float, self.words("VIEWPOINT")))
+            if len(values) == len(DEFAULT_VIEWPOINT):
+                return values
+        raise self.error("VIEWPOINT", "7 numbers")
 
 
 def _record_type(entries: _Entries) -> np.dtype[np.void]:
@@ -225,7 +211,7 @@ def _record_type(entries: _Entries) -> np.dtype[np.void]:
     num_bytes = [size * count for size, count in zip(sizes, counts, strict=True)]
     if 0 in num_bytes or sum(num_bytes) > _LARGEST_RECORD:
         raise entries.error("COUNT", f"sizes of 1 to {_LARGEST_RECORD} bytes")
-    parts: list[tuple[Any, ...]] = []
+    parts: list[tuple[str, str, tuple[int, ...]]] = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         shape = () if count == 1 else (count,)
         if name == _PADDING:
@@ -237,42 +223,28 @@ def _record_type(entries: _Entries) -> np.dtype[np.void]:
     return np.dtype(parts)
 
 
-def _read_text(
-    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
-) -> Iterator[NDArray[np.void]]:
+def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the points of an ASCII file."""
     # Padding has no type of its own; in ASCII it is COUNT words to skip.
     parts = [
         (name, "f8" if _is_padding(name) else header.dtype[name].base, header.dtype[name].shape)
         for name in header.dtype.names or ()
     ]
-    return read_ascii(
-        path,
-        stream,
-        np.dtype(parts),
-        chunk_size,
-        start=header.num_bytes,
-        num_rows=header.num_points,
-        size=size,
-        num_lines=header.num_lines,
-        content="points",
+    line_number = header.num_lines + 1
+    return read_rows(
+        path, stream, np.dtype(parts), header.num_points, "points", line_number=line_number
     )
 
 
-def _read_binary(
-    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
-) -> Iterator[NDArray[np.void]]:
+def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the points of a binary file."""
     promised, content = header.num_points * header.dtype.itemsize, f"{header.num_points:,} points"
-    check_promise(path, header.num_bytes, promised, content, available=size - header.num_bytes)
-    stream.seek(header.num_bytes)
-    for rows in slices(header.num_points, chunk_size):
-        yield np.fromfile(stream, header.dtype, count=rows.stop - rows.start)
+    start = stream.tell()
+    check_promise(path, start, promised, content, available=size - start)
+    return np.fromfile(stream, header.dtype, count=header.num_points)
 
 
-def _read_compressed(
-    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
-) -> Iterator[_Fields]:
+def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -> dict[str, Values]:
     """Read the fields of a compressed file: one field after the other, in one block of LZF."""
     import lzf
 
@@ -280,9 +252,8 @@ def _read_compressed(
     # PCL leaves padding out of the block; writers that copy whole records do not.
     needed = header.num_points * sum(header.dtype[name].itemsize for name in names)
     padded = header.num_points * header.dtype.itemsize
-    start = header.num_bytes
+    start = stream.tell()
     check_promise(path, start, 8, "two block sizes", available=size - start)
-    stream.seek(start)
     packed_size, full_size = struct.unpack("<II", stream.read(8))
     content = f"a block of {header.num_points:,} points"
     start += 8
@@ -308,11 +279,10 @@ def _read_compressed(
         values = np.frombuffer(block, dtype.base, count, offset)
         fields[name] = values.reshape(header.num_points, *dtype.shape)
         offset += values.nbytes
-    for rows in slices(header.num_points, chunk_size):
-        yield {name: values[rows] for name, values in fields.items()}
+    return fields
 
 
-def _unpacked(name: str, values: NDArray[Any]) -> _Fields:
+def _unpacked(name: str, values: Values) -> dict[str, Values]:
     """Cut a packed colour into channels; give back any other field as it is."""
     if name.lower() not in _PACKED_COLORS or values.ndim != 1 or values.dtype.itemsize != 4:
         return {name: values}
@@ -323,9 +293,9 @@ def _unpacked(name: str, values: NDArray[Any]) -> _Fields:
     return unpacked | ({"alpha": quadruples[:, 3].copy()} if name.lower() == "rgba" else {})
 
 
-def _packed(columns: Columns) -> _Fields:
+def _packed(columns: Columns) -> dict[str, Values]:
     """Pack the channels of a colour as PCL does, and give normals the type of the coordinates."""
-    packed: _Fields = {}
+    packed: dict[str, Values] = {}
     has_color = all(name in columns for name in _SPELLING.color)
     for name, column in columns.items():
         if has_color and name == _SPELLING.color[0]:

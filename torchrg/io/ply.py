@@ -5,32 +5,31 @@ meshio reads ``uchar`` as signed, knows no ``short``, ends the process at elemen
 and face, and takes the memory a header promises; trimesh writes float32 and drops fields.
 """
 
-import io
 import struct
 import sys
 from collections.abc import Iterator
-from functools import partial
+from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.columns import (
-    Limits,
     Spelling,
-    exact_limits,
+    check_exact,
     flatten_cloud,
     narrow_integers,
+    slices,
     write_records,
 )
-from torchrg.io.faces import BrokenFacesError, ListOf, find_fronts, split_lists
-from torchrg.io.fields import Columns
+from torchrg.io.faces import BrokenFacesError, Fronts, check_list, find_fronts, stack_faces
+from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import check_promise
-from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Fronts, Table, slices
-from torchrg.io.text import LINES_AT_ONCE, read_ascii, words_of
+from torchrg.io.text import read_rows, words_of
 from torchrg.structures import Cloud
 
 _TYPES = {
@@ -48,15 +47,15 @@ _NUMPY_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", 
 _READ_TYPES = _TYPES | {
     name: np.dtype(name).str[1:] for name in (*_NUMPY_NAMES, "float32", "float64")
 }
-_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
-"""Letters of the module struct by NumPy's codes of whole numbers."""
+_LETTERS = {code: np.dtype(code).char for code in _TYPES.values()} | {"i8": "q", "u8": "Q"}
+"""Letters of the module struct by NumPy's codes."""
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
 """Bytes of the longest header; a longer one is taken for damage."""
 _LONGEST_LIST = 1 << 20
 """Bytes of the longest list; a longer one is taken for damage."""
 _CORNERS = ("vertex_indices", "vertex_index")
-"""What the list of a face's vertices is called."""
+"""Names of the list of a face's vertices."""
 _BYTES_AT_ONCE = 1 << 22
 """Bytes of faces that are read together."""
 _SHOWN = 60
@@ -66,42 +65,44 @@ _LENGTH, _LIST = " length", " list"
 that no property is called so."""
 
 
-def open_ply(path: Path, size: int) -> Table:
-    """Open a PLY file: every property of the element ``vertex``, and its front by the faces.
+def read_ply(path: Path, size: int) -> Cloud:
+    """Read a PLY file: every property of the element ``vertex``, and its front by the faces.
 
     Other elements are left out, and so are faces that come before the vertices.
     """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
-    elements = [element for element in header.elements if element.properties]
-    names = [element.name for element in elements]
-    if "vertex" not in names:
-        raise FormatError(
-            f"{path}: expected an element vertex with properties, got elements "
-            f"{', '.join(names) or 'none'}; write the points as vertices."
-        )
-    vertex = names.index("vertex")
-    face = next((i for i in range(vertex + 1, len(names)) if _is_mesh(elements[i])), vertex)
+        vertex = header.place_of_vertices(path)
+        up_to_vertex = header._replace(elements=header.elements[: vertex + 1])
+        read = _read_binary if header.byte_order else _read_text
+        records = read(path, stream, up_to_vertex, size)
+    names = [name for name in records.dtype.names or () if not name.endswith(_LENGTH)]
+    columns = {name.removesuffix(_LIST): records[name] for name in names}
+    places = range(vertex + 1, len(header.elements))
+    face = next((i for i in places if _is_mesh(header.elements[i])), vertex)
     others = [
         f"{element.num_records:,} of {element.name}"
-        for i, element in enumerate(elements)
+        for i, element in enumerate(header.elements)
         if i not in (vertex, face) and element.num_records
     ]
-    notes = (f"elements left out, as only vertices and their faces are read: {', '.join(others)}",)
-    mesh = header._replace(elements=elements[: face + 1])
-    header = header._replace(elements=elements[: vertex + 1])
-    read_records = _read_binary if header.byte_order else _read_text
+    notes: tuple[str, ...] = ()
+    if others:
+        left = ", ".join(others)
+        notes = (f"elements left out, as only vertices and their faces are read: {left}",)
+    cloud = assemble_cloud(path, columns, notes=notes)
+    if face == vertex:
+        return cloud
+    del records, columns
+    mesh = header._replace(elements=header.elements[: face + 1])
+    front, more = _fronts(path, mesh, vertex, size, cloud)
+    return replace(cloud, front=front, notes=notes + more)
 
-    def read(chunk_size: int) -> Iterator[Columns]:
-        with path.open("rb") as stream:
-            for records in read_records(path, stream, header, size, chunk_size):
-                names = [name for name in records.dtype.names or () if not name.endswith(_LENGTH)]
-                yield {name.removesuffix(_LIST): records[name] for name in names}
 
-    at_once = None if header.byte_order else LINES_AT_ONCE
-    num_points = header.elements[-1].num_records
-    find = None if face == vertex else partial(_fronts, path, mesh, vertex, size)
-    return Table(read, num_points, at_once, notes=notes if others else (), fronts=find)
+def count_ply(path: Path, size: int) -> int:
+    """Return the number of vertices by the header."""
+    with path.open("rb") as stream:
+        header = _read_header(path, stream)
+    return header.elements[header.place_of_vertices(path)].num_records
 
 
 def _is_mesh(element: "_Element") -> bool:
@@ -110,39 +111,29 @@ def _is_mesh(element: "_Element") -> bool:
     return element.name == "face" and element.num_records > 0 and len(corners) == 1
 
 
-def write_ply(path: Path, stream: CloudStream) -> None:
+def write_ply(path: Path, cloud: Cloud) -> None:
     """Write a little-endian file; coordinates keep their precision, equal clouds give equal bytes.
 
     64-bit integers become 32-bit ones, or ``double`` where that holds them.
     """
-    spelling = Spelling()
-    limits = exact_limits(path, stream, spelling)
+    columns = flatten_cloud(path, cloud, Spelling())
+    check_exact(path, columns)
+    columns = {name: _storable(column) for name, column in columns.items()}
     words = {code: word for word, code in _TYPES.items()}
-
-    def header(columns: Columns) -> list[str]:
-        return [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment written by torchrg",
-            f"element vertex {stream.count}",
-            *(f"property {words[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
-            "end_header",
-        ]
-
-    chunks = (flatten_cloud(path, chunk, spelling, limits) for chunk in stream)
-    write_records(
-        path,
-        header,
-        (
-            {name: _storable(c, limits.get(name)) for name, c in columns.items()}
-            for columns in chunks
-        ),
-    )
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment written by torchrg",
+        f"element vertex {len(cloud)}",
+        *(f"property {words[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
+        "end_header",
+    ]
+    write_records(path, header, columns)
 
 
-def _storable(column: NDArray[Any], limits: Limits | None) -> NDArray[Any]:
-    """Return a column in a type that PLY has and that holds its limits."""
-    column = narrow_integers(column, ("i4", "u4"), limits)
+def _storable(column: Values) -> Values:
+    """Return a column in a type that PLY has and that holds its values."""
+    column = narrow_integers(column, ("i4", "u4"))
     is_wide = column.dtype.kind in "iu" and column.dtype.itemsize == 8
     return column.astype(np.float64) if is_wide else column
 
@@ -174,6 +165,16 @@ class _Header(NamedTuple):
     num_lines: int
     num_bytes: int
 
+    def place_of_vertices(self, path: Path) -> int:
+        """Return which of the elements holds the points."""
+        names = [element.name for element in self.elements]
+        if "vertex" not in names:
+            raise FormatError(
+                f"{path}: expected an element vertex with properties, got elements "
+                f"{', '.join(names) or 'none'}; write the points as vertices."
+            )
+        return names.index("vertex")
+
 
 def _read_header(path: Path, stream: BinaryIO) -> _Header:
     """Read the header and leave the stream at the first byte of data."""
@@ -198,6 +199,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
                 byte_order = _BYTE_ORDERS[word]
                 continue
             case ["end_header"] if byte_order is not None:
+                elements = [element for element in elements if element.properties]
                 return _Header(byte_order, elements, number, stream.tell())
             case ["element", name, count] if (
                 count.isascii() and count.isdecimal() and len(count) < 19
@@ -230,34 +232,28 @@ def _shown(raw: bytes) -> str:
     return repr(raw[:40].decode("latin-1").strip())
 
 
-def _read_binary(
-    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
-) -> Iterator[NDArray[np.void]]:
+def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the last of the elements of a binary file."""
     *before, vertex = header.elements
-    start = _pass_elements(path, stream, header, before, size, chunk_size)
+    start = _pass_elements(path, stream, header, before, size)
     dtype = _check_element(path, stream, vertex, header.byte_order, start, size)
-    for rows in slices(vertex.num_records, chunk_size):
-        records = _read_records(stream, dtype, rows)
-        _check_lists(path, vertex, records)
-        yield records
+    records = np.fromfile(stream, dtype, count=vertex.num_records)
+    _check_lists(path, vertex, records)
+    return records
 
 
 def _pass_elements(
-    path: Path,
-    stream: BinaryIO,
-    header: _Header,
-    elements: list[_Element],
-    size: int,
-    chunk_size: int = POINTS_A_CHUNK,
+    path: Path, stream: BinaryIO, header: _Header, elements: list[_Element], size: int
 ) -> int:
     """Return the byte behind the first elements of a binary file, whose records have one size."""
     start = header.num_bytes
     for element in elements:
         dtype = _check_element(path, stream, element, header.byte_order, start, size)
         if any(prop.length_code for prop in element.properties):
-            for rows in slices(element.num_records, chunk_size):
-                _check_lists(path, element, _read_records(stream, dtype, rows))
+            at_once = max(_BYTES_AT_ONCE // dtype.itemsize, 1)
+            for rows in slices(element.num_records, at_once):
+                records = np.fromfile(stream, dtype, count=rows.stop - rows.start)
+                _check_lists(path, element, records)
         start += element.num_records * dtype.itemsize
     return start
 
@@ -266,8 +262,7 @@ def _check_element(
     path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
 ) -> np.dtype[np.void]:
     """Return the type of the records of an element, all of which are there; go to the first."""
-    stream.seek(start)
-    dtype = _record_type(path, stream, element, byte_order, size)
+    dtype = _record_type(path, stream, element, byte_order, start, size)
     promised = element.num_records * dtype.itemsize
     content = f"{element.num_records:,} records of {element.name}"
     check_promise(path, start, promised, content, available=size - start)
@@ -275,37 +270,30 @@ def _check_element(
     return dtype
 
 
-def _read_records(stream: BinaryIO, dtype: np.dtype[np.void], rows: slice) -> NDArray[np.void]:
-    """Read the next records, as many as there are rows."""
-    return np.fromfile(stream, dtype, count=rows.stop - rows.start)
-
-
 def _record_type(
-    path: Path, stream: BinaryIO, element: _Element, byte_order: str, size: int
+    path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
 ) -> np.dtype[np.void]:
     """Return the type of a record; lists have the length that the first record gives them."""
-    parts: list[tuple[Any, ...]] = []
+    parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for prop in element.properties:
+        code = byte_order + prop.code
         if prop.length_code is None:
-            parts.append((prop.name, byte_order + prop.code))
-            stream.seek(np.dtype(prop.code).itemsize, io.SEEK_CUR)
+            parts.append((prop.name, code))
             continue
-        length_type = np.dtype(byte_order + prop.length_code)
-        raw = stream.read(length_type.itemsize) if element.num_records else b""
-        length = int(np.frombuffer(raw, length_type)[0]) if len(raw) == length_type.itemsize else 0
-        num_bytes = length * np.dtype(prop.code).itemsize
-        if not 0 <= num_bytes <= min(size, _LONGEST_LIST):
+        parts.append((prop.name + _LENGTH, byte_order + prop.length_code))
+        stream.seek(start + np.dtype(parts).itemsize - np.dtype(prop.length_code).itemsize)
+        raw = np.fromfile(stream, byte_order + prop.length_code, min(element.num_records, 1))
+        length = int(raw[0]) if len(raw) else 0
+        if not 0 <= length * np.dtype(code).itemsize <= min(size, _LONGEST_LIST):
             raise FormatError(
                 f"{path}: byte {stream.tell()}: expected a list that fits the file, got length "
                 f"{length:,}; the file is damaged, fetch it again."
             )
-        stream.seek(num_bytes, io.SEEK_CUR)
-        parts.append((prop.name + _LENGTH, length_type))
-        parts.append((prop.name + _LIST, byte_order + prop.code, (length,)))
+        parts.append((prop.name + _LIST, code, (length,)))
     return np.dtype(parts)
 
 
-def _check_lists(path: Path, element: _Element, records: NDArray[np.void]) -> None:
+def _check_lists(path: Path, element: _Element, records: Values) -> None:
     """Check that the lists of an element all have one length, so that records have one size."""
     if not _have_one_length(records):
         raise FormatError(
@@ -314,33 +302,28 @@ def _check_lists(path: Path, element: _Element, records: NDArray[np.void]) -> No
         )
 
 
-def _have_one_length(records: NDArray[np.void]) -> bool:
+def _have_one_length(records: Values) -> bool:
     """Return whether each list has in all records the length that its type says."""
     names = [name for name in records.dtype.names or () if name.endswith(_LENGTH)]
     lengths = [records.dtype[name.removesuffix(_LENGTH) + _LIST].shape[0] for name in names]
     return all((records[n] == k).all() for n, k in zip(names, lengths, strict=True))
 
 
-def _read_text(
-    path: Path, stream: BinaryIO, header: _Header, size: int, chunk_size: int
-) -> Iterator[NDArray[np.void]]:
+def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the last of the elements of an ASCII file."""
     *before, vertex = header.elements
     if any(prop.length_code for prop in vertex.properties):
         raise FormatError(
             f"{path}: expected vertices without lists in an ASCII file; write it as binary."
         )
-    return read_ascii(
+    return read_rows(
         path,
         stream,
         np.dtype([(prop.name, prop.code) for prop in vertex.properties]),
-        chunk_size,
-        num_rows=vertex.num_records,
-        size=size,
-        num_lines=header.num_lines,
-        start=header.num_bytes,
+        vertex.num_records,
+        "vertices",
+        line_number=header.num_lines + 1,
         skipped=sum(element.num_records for element in before),
-        content="vertices",
     )
 
 
@@ -365,30 +348,51 @@ def _corners_of_binary(
     """Yield the vertices of faces, of many at a time as long as all lists have one length."""
     *before, faces = header.elements
     start = _pass_elements(path, stream, header, before, size)
-    stream.seek(start)
-    dtype = _record_type(path, stream, faces, header.byte_order, size)
+    dtype = _record_type(path, stream, faces, header.byte_order, start, size)
     name = next(prop.name for prop in faces.properties if prop.name in _CORNERS)
     done, at_once = 0, max(_BYTES_AT_ONCE // dtype.itemsize, 1)
     while done < faces.num_records:
         stream.seek(start + done * dtype.itemsize)
-        some = slice(done, min(done + at_once, faces.num_records))
-        records = _read_records(stream, dtype, some)
-        if len(records) < some.stop - some.start or not _have_one_length(records):
+        wanted = min(at_once, faces.num_records - done)
+        records = np.fromfile(stream, dtype, count=wanted)
+        if len(records) < wanted or not _have_one_length(records):
             break
         yield records[name + _LIST].astype(np.int64)
-        done = some.stop
+        done += wanted
     stream.seek(start + done * dtype.itemsize)
-    lists, tail = _layout(faces, header.byte_order)
-    code = next(np.dtype(header.byte_order + p.code) for p in faces.properties if p.name == name)
+    yield from stack_faces(
+        _faces_of_bytes(stream, faces, header.byte_order), faces.num_records - done
+    )
 
-    def gather(data: bytes, starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
-        raw = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(length * code.itemsize)]
-        read: NDArray[Any] = np.frombuffer(raw.tobytes(), code)
-        corners: NDArray[np.int64] = read.astype(np.int64).reshape(len(starts), length)
-        return corners
 
-    blocks = iter(partial(stream.read, _BYTES_AT_ONCE), b"")
-    yield from split_lists(blocks, lists, tail, faces.num_records - done, gather)
+def _faces_of_bytes(
+    stream: BinaryIO, element: _Element, byte_order: str
+) -> Iterator[tuple[float, ...]]:
+    """Yield the vertices of the faces from here to the end of a binary file."""
+
+    def take(letter: str, count: int) -> tuple[float, ...]:
+        form = f"{byte_order}{count}{letter}"
+        return struct.unpack(form, stream.read(struct.calcsize(form)))
+
+    lists = [
+        (
+            None if prop.length_code is None else _LETTERS[prop.length_code],
+            _LETTERS[prop.code],
+            np.dtype(prop.code).itemsize,
+            prop.name in _CORNERS,
+        )
+        for prop in element.properties
+    ]
+    corners: tuple[float, ...] = ()
+    with suppress(struct.error):  # Raised at the end of the file.
+        while True:
+            for length_letter, letter, size, is_corners in lists:
+                if length_letter is None:
+                    take(letter, 1)
+                    continue
+                values = take(letter, check_list(take(length_letter, 1)[0], size))
+                corners = values if is_corners else corners
+            yield corners
 
 
 def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator[NDArray[np.int64]]:
@@ -396,51 +400,27 @@ def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator
     stream.seek(header.num_bytes)
     *before, faces = header.elements
     counts = [element.num_records for element in before]
-    lines = islice(stream, sum(counts[:vertex]), None)
+    lines = islice(stream, min(sum(counts[:vertex]), sys.maxsize), None)
     between = min(sum(counts[vertex:]), sys.maxsize)
     lines = islice((line for line in lines if line.strip()), between, None)
-
-    def words() -> Iterator[list[float]]:
-        while block := list(islice(lines, LINES_AT_ONCE)):
-            try:
-                yield [float(word) for line in block for word in line.split()]
-            except ValueError as error:
-                raise BrokenFacesError(str(error)[:_SHOWN]) from None
-
-    def gather(data: list[float], starts: NDArray[np.int64], length: int) -> NDArray[np.int64]:
-        corners: NDArray[np.int64] = np.array(data)[starts[:, None] + np.arange(length)].astype(int)
-        return corners
-
-    lists, tail = _layout(faces, header.byte_order)
-    return split_lists(words(), lists, tail, faces.num_records, gather)
+    return stack_faces((_face_of_line(line, faces) for line in lines), faces.num_records)
 
 
-def _layout(element: _Element, byte_order: str) -> tuple[list[ListOf], int]:
-    """Return the lists of an element, and how much stands behind the last of them."""
-    lists, skipped = list[ListOf](), 0
-
-    def size(code: str) -> int:
-        return np.dtype(code).itemsize if byte_order else 1
-
+def _face_of_line(line: bytes, element: _Element) -> list[float]:
+    """Return the vertices of the face of a line."""
+    try:
+        words = [float(word) for word in line.split()]
+    except ValueError as error:
+        raise BrokenFacesError(str(error)[:_SHOWN]) from None
+    place, corners = 0, list[float]()
     for prop in element.properties:
-        if prop.length_code is None:
-            skipped += size(prop.code)
-            continue
-        read = _word_as_length
-        if byte_order:
-            read = partial(_read_length, struct.Struct(byte_order + _LETTERS[prop.length_code]))
-        is_corners = prop.name in _CORNERS
-        lists.append(ListOf(skipped, read, size(prop.length_code), size(prop.code), is_corners))
-        skipped = 0
-    return lists, skipped
-
-
-def _read_length(form: struct.Struct, data: bytes, place: int) -> int:
-    """Return the length of a list that begins at a byte."""
-    length: int = form.unpack_from(data, place)[0]
-    return length
-
-
-def _word_as_length(data: list[float], place: int) -> int:
-    """Return the length of a list that begins with a word; -1 for one that is none."""
-    return int(data[place]) if 0 <= data[place] < sys.maxsize else -1
+        length = 1
+        if prop.length_code is not None:
+            length = check_list(words[place] if place < len(words) else -1, 1)
+            place += 1
+        if prop.name in _CORNERS and prop.length_code is not None:
+            corners = words[place : place + length]
+        place += length
+    if place > len(words):
+        raise BrokenFacesError("a line of too few numbers")
+    return corners

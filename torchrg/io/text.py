@@ -8,27 +8,21 @@ in ASCII files of other formats are read here, too.
 """
 
 import csv
+import os
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TextIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, exact_limits, flatten_cloud
-from torchrg.io.fields import (
-    FIRST_ROWS,
-    Columns,
-    check_first_rows,
-    check_names,
-    name_columns,
-    rule_for,
-)
+from torchrg.io.columns import Spelling, check_exact, flatten_cloud
+from torchrg.io.fields import Values, assemble_table, check_names
 from torchrg.io.files import atomic_path, check_promise
-from torchrg.io.stream import CloudStream, Table
+from torchrg.structures import Cloud
 
 LINES_AT_ONCE = 65_536
 """Lines that are parsed or formatted together; bounds memory."""
@@ -60,130 +54,94 @@ _FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
 """The first that makes numbers of all words of a line is its form."""
 
 
-def open_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Table:
-    """Open points as text, always in float64; ``columns`` are names in place of the file's own."""
-    with _open_lines(path) as stream:
+def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
+    """Read points as text, always in float64; ``columns`` are names in place of the file's own."""
+    # Letters matter only in the names of columns.
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
         opening = _read_opening(path, stream, columns)
-    names = opening.names
-    dtype = np.dtype([("row", "f8", (opening.num_columns,))])
-
-    def read_rows(chunk_size: int) -> Iterator[NDArray[np.float64]]:
-        num_rows = 0
-        with _open_lines(path) as stream:
-            lines = islice(stream, opening.line_number - 1, None)
-            first, form = opening.line_number, opening.form
-            for rows in _read_table(path, lines, dtype, chunk_size, first_line=first, form=form):
-                num_rows += len(rows)
-                yield rows["row"]
-        if num_rows < opening.num_points:
-            raise FormatError(
-                f"{path}: expected {opening.num_points:,} points, as the line before them says, "
-                f"got {num_rows:,}; the file is cut off, fetch it again, or delete that line."
-            )
-
-    def read(chunk_size: int) -> Iterator[Columns]:
-        return (name_columns(table, names) for table in read_rows(chunk_size))
-
+        lines = chain([opening.line], stream)
+        dtype = np.dtype([("row", "f8", (opening.num_columns,))])
+        rows = _read_table(path, lines, dtype, opening.line_number, form=opening.form)
+    if len(rows) < opening.num_points:
+        raise FormatError(
+            f"{path}: expected {opening.num_points:,} points, as the line before them says, "
+            f"got {len(rows):,}; the file is cut off, fetch it again, or delete that line."
+        )
     is_comma = opening.form.decimal == ","
-    notes: tuple[str, ...] = ("its commas are taken as decimal points",) if is_comma else ()
-    if names is not None:
-        return Table(read, None, LINES_AT_ONCE, notes=notes)
-    check_first_rows(path, _first_rows(read_rows(FIRST_ROWS)))
-    naming, taken = rule_for(opening.num_columns)
-    return Table(read, None, LINES_AT_ONCE, naming, notes=notes + taken)
+    notes = ("its commas are taken as decimal points",) if is_comma else ()
+    return assemble_table(path, rows["row"], opening.names, notes)
 
 
-def _first_rows(tables: Iterator[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the first rows of tables that come one after the other, a few or all."""
-    rows = next(tables)
-    while len(rows) < FIRST_ROWS and (more := next(tables, None)) is not None:
-        rows = np.concatenate([rows, more])
-    return rows[:FIRST_ROWS]
-
-
-def _open_lines(path: Path) -> TextIO:
-    """Open a file whose letters matter only in the names of columns."""
-    return path.open(encoding="utf-8-sig", errors="replace")
-
-
-def write_text(path: Path, stream: CloudStream) -> None:
+def write_text(path: Path, cloud: Cloud) -> None:
     """Write points as text that reads back to the same values, names of fields in a comment."""
-    spelling = Spelling()
-    exact_limits(path, stream, spelling)
+    columns = flatten_cloud(path, cloud, Spelling())
+    check_exact(path, columns)
     with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
-        for number, chunk in enumerate(stream):
-            columns = flatten_cloud(path, chunk, spelling)
-            if number == 0 and chunk.fields:
-                file.write(f"# {' '.join(columns)}\n")
-            file.writelines(_format_table(columns.values()))
+        if cloud.fields:
+            file.write(f"# {' '.join(columns)}\n")
+        file.writelines(_format_table(columns.values()))
 
 
-def count_text(stream: BinaryIO, size: int) -> int:
+def count_text(path: Path, size: int) -> int:
     """Return about the number of lines, by the length of the first."""
-    sample = stream.read(_COUNTED_BYTES)
+    with path.open("rb") as stream:
+        sample = stream.read(_COUNTED_BYTES)
     return round(sample.count(b"\n") * size / max(len(sample), 1))
 
 
-def read_ascii(
+def read_rows(
     path: Path,
     stream: BinaryIO,
     dtype: np.dtype[Any],
-    chunk_size: int,
-    *,
-    start: int,
     num_rows: int,
-    size: int,
-    num_lines: int,
-    skipped: int = 0,
     content: str,
-) -> Iterator[NDArray[np.void]]:
-    """Read rows of a structured type from an ASCII file of ``size`` bytes, chunk by chunk.
+    *,
+    line_number: int,
+    skipped: int = 0,
+) -> Values:
+    """Read rows of a structured type from an ASCII file that is open behind its header.
 
-    The header has ``num_lines`` lines and ends before byte ``start``; ``skipped`` lines come before
-    the rows, of which the header promises ``num_rows``. ``content`` is what rows are, for messages.
+    Its next line has this number; so many lines are skipped before the rows. ``content`` is what
+    rows are, for messages.
     """
     # A digit and what separates it from the next; the last may end with the file.
-    least = num_rows * _num_columns(dtype) * 2 - 1
+    least, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
+    available = os.fstat(stream.fileno()).st_size - start
     content = f"{num_rows:,} {content}"
-    check_promise(path, start, least, content, available=size - start, at_least=True)
-    stream.seek(start)
+    check_promise(path, start, least, content, available=available, at_least=True)
     lines = (raw.decode("latin-1") for raw in stream)
-    first_line = num_lines + 1 + sum(1 for _ in islice(lines, skipped))
-    return _read_table(path, lines, dtype, chunk_size, first_line=first_line, num_rows=num_rows)
+    line_number += sum(1 for _ in islice(lines, min(skipped, sys.maxsize)))
+    return _read_table(path, lines, dtype, line_number, num_rows=num_rows)
 
 
 def _read_table(
     path: Path,
     lines: Iterator[str],
     dtype: np.dtype[Any],
-    chunk_size: int,
+    line_number: int,
     *,
-    first_line: int,
     num_rows: int | None = None,
     form: _Form | None = None,
-) -> Iterator[NDArray[np.void]]:
-    """Read rows of numbers, all by default, a few lines at a time; blank ones do not count.
+) -> Values:
+    """Read rows of numbers, all by default; blank lines do not count.
 
-    Lines are read only as far as needed, the first of them being number ``first_line`` of the file.
+    Lines are read only as far as needed, the first of them has this number in the file.
     """
-    count, line_number, at_once = 0, first_line, min(chunk_size, LINES_AT_ONCE)
+    parts, count = [np.empty(0, dtype)], 0
     while num_rows is None or count < num_rows:
-        limit = at_once if num_rows is None else min(at_once, num_rows - count)
+        limit = LINES_AT_ONCE if num_rows is None else min(LINES_AT_ONCE, num_rows - count)
         block = list(islice(lines, limit))
         if not block:
             break
-        rows = _parse(path, block, dtype, line_number, form)
-        if len(rows) > 0:
-            yield rows
-        count += len(rows)
+        parts.append(_parse(path, block, dtype, line_number, form))
+        count += len(parts[-1])
         line_number += len(block)
     if num_rows is not None and count < num_rows:
         raise FormatError(
             f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got {count:,}; "
             "the file is cut off or its header is wrong, fetch it again."
         )
-    if count == 0:
-        yield np.empty(0, dtype)
+    return np.concatenate(parts)
 
 
 def _parse(
@@ -192,14 +150,14 @@ def _parse(
     dtype: np.dtype[Any],
     line_number: int,
     form: _Form | None,
-) -> NDArray[np.void]:
+) -> Values:
     """Parse a block of lines, and name the first one that is wrong.
 
     Without a form numbers stand between white space, and there are no comments.
     """
     delimiter, decimal, comments = (None, ".", None) if form is None else (*form, _COMMENTS[0])
 
-    def parse(lines: list[str]) -> NDArray[np.void]:
+    def parse(lines: list[str]) -> Values:
         if decimal != ".":
             lines = [line.replace(decimal, ".") for line in lines]
         # Before version 2.3 NumPy cuts numbers to fit an integer, and warns that it will not.
@@ -258,7 +216,7 @@ def _num_columns(dtype: np.dtype[Any]) -> int:
 
 
 class _Opening(NamedTuple):
-    """What the lines up to the first point say, and the number of that point's line, from one.
+    """What the lines up to the first point say, that point's line, and its number, from one.
 
     Names are None without a header. The number of points is 0 where none is said.
     """
@@ -266,8 +224,9 @@ class _Opening(NamedTuple):
     names: list[str] | None
     form: _Form
     num_columns: int
-    line_number: int
     num_points: int
+    line: str
+    line_number: int
 
 
 def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None) -> _Opening:
@@ -311,7 +270,7 @@ def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None)
                 names: list[str] | None = list(given)
             else:
                 names = _names_of(path, header, words, number) if header else None
-            return _Opening(names, form, len(words), number, max(counts, default=0))
+            return _Opening(names, form, len(words), max(counts, default=0), line, number)
     raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
 
 
@@ -365,7 +324,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _format_table(columns: Iterable[NDArray[np.generic]]) -> Iterator[str]:
+def _format_table(columns: Iterable[Values]) -> Iterator[str]:
     """Yield columns as text that reads back to the same values, a block of lines at a time."""
     kept = list(columns)
     # Nine digits identify a float32; the shortest text of a Python float identifies a float64.

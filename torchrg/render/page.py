@@ -28,7 +28,6 @@ from torch.nn import functional
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
-from torchrg.io.stream import Extent
 from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
@@ -248,11 +247,10 @@ def _describe_cloud(
         if channel.colors is not None:
             arrays[f"{channel.mode} colors"] = channel.colors
     manifest, blob = _pack(arrays)
-    whole = result.whole or Extent.of(cloud)
     scene = {
         "name": Path(cloud.source).name or "cloud",
-        "count": whole.num_points,
-        "finite": whole.num_finite,
+        "count": len(cloud),
+        "finite": int(cloud.finite.sum()),
         "shown": len(shown.rows),
         "levels": shown.levels,
         "low": low.tolist(),
