@@ -331,21 +331,12 @@ class S3DISSource(CloudSource):
         begin("read")
         room = read_room(self.root / scan.name, class_order=self.class_order)
         cloud = Cloud(room.coord, source=scan.name)
-        notes = [
-            *check_finite(cloud),
-            *self.notes(cloud),
-            *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
-            *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
-        ]
+        notes = (*check_finite(cloud), *self.notes(cloud), *room.notes)
         seg, parts = self.segment(cloud, self.settings, room.color, begin)
         begin("write")
         arrays = {name: getattr(room, name) for name in ("coord", "color", "segment", "instance")}
         files = self.write(scan, folder, cloud, arrays, seg, parts)
-        repairs = tuple(
-            f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
-            for r in room.report.repairs
-        )
-        return Converted(len(cloud), len(seg.planes.count), tuple(files), repairs, tuple(notes))
+        return Converted(len(cloud), len(seg.planes.count), tuple(files), room.repairs, notes)
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ Each repair is reported, and every other line that is not six numbers is an erro
 """
 
 import filecmp
+import itertools
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,50 +47,6 @@ _LARGEST = float(np.finfo(np.float32).max)
 _NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
-class Repair(NamedTuple):
-    """A byte of an input file that was read as another one; the file itself is not changed.
-
-    Attributes:
-        file: The file.
-        line: Line of the byte, counted from one.
-        column: Place of the byte in its line, counted from one.
-        before: The line as it is in the file, without its end.
-        after: The line as it was read.
-    """
-
-    file: Path
-    line: int
-    column: int
-    before: bytes
-    after: bytes
-
-
-class Skipped(NamedTuple):
-    """A file beside the objects that is not read.
-
-    Attributes:
-        file: The file.
-        reason: Why.
-    """
-
-    file: Path
-    reason: str
-
-
-class RoomReport(NamedTuple):
-    """What was unusual about a room.
-
-    Attributes:
-        repairs: Bytes that were read as others.
-        skipped: Entries of the folder that are no objects.
-        as_clutter: Files whose class is not among the 13, ``stairs`` for example.
-    """
-
-    repairs: tuple[Repair, ...] = ()
-    skipped: tuple[Skipped, ...] = ()
-    as_clutter: tuple[Path, ...] = ()
-
-
 class Room(NamedTuple):
     """The points of a room; those of an object follow each other.
 
@@ -99,14 +56,18 @@ class Room(NamedTuple):
         segment: Class of each point, a place in :data:`CLASS_ORDERS`, shape ``(N,)``, int16.
         instance: Object of each point, counted from zero in natural order of the file names, shape
             ``(N,)``, int16, or int32 with more objects than that holds.
-        report: What was unusual.
+        repairs: A line for each byte that was read as another one: file, line and column, counted
+            from one, and the line before and after. The file itself is not changed.
+        notes: A line for each entry of the folder that is no object, and for each file whose class
+            is not among the 13, ``stairs`` for example.
     """
 
     coord: NDArray[np.float32]
     color: NDArray[np.uint8]
     segment: NDArray[np.signedinteger]
     instance: NDArray[np.signedinteger]
-    report: RoomReport
+    repairs: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
@@ -116,30 +77,25 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
         path: Folder of the room, the one above ``Annotations``.
         class_order: What the numbers in ``segment`` mean: a key of :data:`CLASS_ORDERS`.
 
-    Returns:
-        The room and what was unusual about it.
-
     Raises:
         FormatError: If there is no object, or a line of one is not a point.
         ConfigError: If the class order is unknown.
         MissingDependencyError: If pyarrow is not installed.
     """
     classes = class_names(class_order)
-    objects, skipped = _list_room(path)
-    parts = [read_annotation(file) for _, file in objects]
-    known = [name if name in classes else _OTHER_CLASS for name, _ in objects]
-    counts = [len(part.coord) for part in parts]
-    dtype = np.int16 if len(parts) <= np.iinfo(np.int16).max else np.int32
+    objects, notes = _list_room(path)
+    coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
+    numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
+    notes += [f"{file.name} taken as clutter" for name, file in objects if name not in classes]
+    counts = [len(coord) for coord in coords]
+    dtype = np.int16 if len(objects) <= np.iinfo(np.int16).max else np.int32
     return Room(
-        np.concatenate([part.coord for part in parts]),
-        np.concatenate([part.color for part in parts]),
-        np.repeat(np.array([classes.index(name) for name in known], np.int16), counts),
-        np.repeat(np.arange(len(parts), dtype=dtype), counts),
-        RoomReport(
-            tuple(repair for part in parts for repair in part.repairs),
-            tuple(skipped),
-            tuple(file for name, file in objects if name not in classes),
-        ),
+        np.concatenate(coords),
+        np.concatenate(colors),
+        np.repeat(np.array(numbers, np.int16), counts),
+        np.repeat(np.arange(len(objects), dtype=dtype), counts),
+        tuple(itertools.chain.from_iterable(repairs)),
+        tuple(notes),
     )
 
 
@@ -161,43 +117,35 @@ def object_files(room: Path) -> tuple[Path, ...]:
         return ()
 
 
-def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[Skipped]]:
-    """Return class and file of each object of a room in natural order, and what is no object.
+def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
+    """Return class and file of each object of a room in natural order, and notes on the others.
 
-    That is hidden files, files that are not named ``CLASS_NUMBER.txt``, and copies named
+    These are hidden files, files that are not named ``CLASS_NUMBER.txt``, and copies named
     ``CLASS_NUMBER (2).txt`` of a file that is there.
     """
     folder = path / ANNOTATIONS
     if not folder.is_dir():
         raise FormatError(f"{path}: expected a folder {ANNOTATIONS}, got none; fetch it again.")
-    objects, skipped = [], []
+    objects, notes = [], []
     for file in listed(folder):
         match = _OBJECT.fullmatch(file.stem)
         if file.name.startswith(".") or file.suffix != ".txt" or not match or file.is_dir():
-            skipped.append(Skipped(file, "not named CLASS_NUMBER.txt"))
+            notes.append(f"{file.name} not read: not named CLASS_NUMBER.txt")
         elif match[3] and (original := folder / f"{match[1]}_{match[2]}.txt").is_file():
             equal = filecmp.cmp(file, original, shallow=False)
             but = "" if equal else " by its name, but it differs"
-            skipped.append(Skipped(file, f"a copy of {original.name}{but}"))
+            notes.append(f"{file.name} not read: a copy of {original.name}{but}")
         else:
             objects.append((match[1], file))
     if not objects:
         raise FormatError(
             f"{folder}: expected objects as CLASS_NUMBER.txt, got none; fetch it again."
         )
-    return objects, skipped
+    return objects, notes
 
 
-class _Annotation(NamedTuple):
-    """The points of one object: coordinates, colours, and bytes that were repaired."""
-
-    coord: NDArray[np.float32]
-    color: NDArray[np.uint8]
-    repairs: tuple[Repair, ...]
-
-
-def read_annotation(path: Path) -> _Annotation:
-    """Read the points of one object, in the order of the file.
+def read_annotation(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8], list[str]]:
+    """Read coordinates and colours of one object in the order of the file, and list the repairs.
 
     Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
     Colours may be written as ``106.000000`` and are rounded.
@@ -210,13 +158,13 @@ def read_annotation(path: Path) -> _Annotation:
         table = _parse_lines(path, content, original)
     coord = np.stack([column.astype(np.float32) for column in table[:3]], axis=1)
     color = np.stack([np.rint(column).astype(np.uint8) for column in table[3:]], axis=1)
-    return _Annotation(coord, color, repairs)
+    return coord, color, repairs
 
 
-def _repair(path: Path, original: bytes) -> tuple[bytes, tuple[Repair, ...]]:
-    """Set the lost bit of control bytes."""
+def _repair(path: Path, original: bytes) -> tuple[bytes, list[str]]:
+    """Set the lost bit of control bytes, and list where."""
     if len(original.translate(None, _CONTROL_BYTES)) == len(original):
-        return original, ()
+        return original, []
     table = bytes(byte | _LOST_BIT if byte in _CONTROL_BYTES else byte for byte in range(256))
     content = original.translate(table)
     places = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
@@ -226,8 +174,11 @@ def _repair(path: Path, original: bytes) -> tuple[bytes, tuple[Repair, ...]]:
         begin = int(ends[line - 1]) + 1 if line else 0
         end = int(ends[line]) if line < len(ends) else len(original)
         before, after = (text[begin:end].rstrip(b"\r") for text in (original, content))
-        repairs.append(Repair(path, line + 1, place - begin + 1, before, after))
-    return content, tuple(repairs)
+        column = place - begin + 1
+        repairs.append(
+            f"{path.name}: line {line + 1}, column {column}: {before!r} read as {after!r}"
+        )
+    return content, repairs
 
 
 def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
@@ -277,7 +228,7 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np
             or b"\r" in text
             or not _are_points([np.array([x]) for x in row])
         ):
-            shown: Any = original.split(b"\n")[number - 1].removesuffix(b"\r")
+            shown = original.split(b"\n")[number - 1].removesuffix(b"\r")
             shown = shown if len(shown) <= 80 else shown[:77] + b"..."
             raise FormatError(
                 f"{path}: line {number}: expected x y z and colours in 0 to 255, six numbers, "

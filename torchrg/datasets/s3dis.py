@@ -1,42 +1,28 @@
-"""The Stanford rooms, S3DIS, as they are released, and a cache of them as arrays.
-
-Mapped into memory, arrays are there at once; the text is read once.
-"""
+"""The Stanford rooms, S3DIS, as they are released, and a cache of them as arrays."""
 
 import hashlib
 import json
 import os
-import secrets
-import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
 from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
-from torchrg.datasets.rooms import (
-    ANNOTATIONS,
-    Repair,
-    Room,
-    RoomReport,
-    Skipped,
-    class_names,
-    object_files,
-    read_room,
-)
+from torchrg.datasets.rooms import ANNOTATIONS, Room, class_names, object_files, read_room
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.files import DAMAGES
-from torchrg.io.npy import map_array
+from torchrg.io import atomic_path
+from torchrg.io.files import DAMAGES, first_line, make_folder
 
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms of each area in the release, 272 in all."""
 USER_CACHE = "~/.cache/torchrg"
-_VERSION = 1
+_VERSION = 2
 """To be raised when the same files are read as other arrays."""
-_ARRAYS = ("coord", "color", "segment", "instance")
 _STORED_ORDER = "pointcept"
 
 
@@ -102,7 +88,7 @@ class S3DIS(SceneDataset):
         }
 
     def read_room(self, index: int) -> Room:
-        """Return the arrays of the room of a scene and the report of what was unusual about it."""
+        """Return the room of a scene, with the notes and repairs that a sample has not."""
         scene = self.scenes[index]
         if self.cache is None:
             return read_room(scene.path, class_order=self.class_order)
@@ -135,15 +121,21 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
 def _read_cached(scene: SceneFiles, cache: Path, class_order: str) -> Room:
     """Read a room from the cache, and put it there first if it is not.
 
-    An entry counts as long as path, size and time of change of every input file are what they were
-    and torchrg reads them the same way; a damaged entry is made again. Processes may share a cache.
-    The cache is a folder that is made; old entries are not removed. Its arrays are mapped
-    copy-on-write: changing them changes no file.
+    An entry is one ``.npz``. It counts as long as path, size and time of change of every input file
+    are what they were and torchrg reads them the same way; a damaged entry is made again. Processes
+    may share a cache. The cache is a folder that is made; old entries are not removed.
     """
-    entry = cache / "s3dis" / f"{scene.name.replace('/', '-')}-{_fingerprint(scene)}"
+    entry = cache / "s3dis" / f"{scene.name.replace('/', '-')}-{_fingerprint(scene)}.npz"
     room = _load(entry)
     if room is None:
-        room = _store(entry, read_room(scene.path, class_order=_STORED_ORDER))
+        room = read_room(scene.path, class_order=_STORED_ORDER)
+        try:
+            make_folder(entry.parent)
+            with atomic_path(entry) as beside:
+                np.savez(beside, *map(np.asarray, room))
+        except FormatError as error:
+            repair = "choose another folder with cache=..., or none with cache=None"
+            raise FormatError(f"{first_line(error)}; {repair}.") from error
     if class_order != _STORED_ORDER:
         stored, wanted = class_names(_STORED_ORDER), class_names(class_order)
         table = np.array([wanted.index(name) for name in stored], room.segment.dtype)
@@ -163,62 +155,9 @@ def _fingerprint(scene: SceneFiles) -> str:
 def _load(entry: Path) -> Room | None:
     """Return what an entry holds, None if it is not there or damaged."""
     try:
-        report = json.loads((entry / "report.json").read_text(encoding="utf-8"))
-        coord, color, segment, instance = (map_array(entry / f"{name}.npy") for name in _ARRAYS)
-        return Room(coord, color, segment, instance, _report_of(report))
-    except (OSError, *DAMAGES):
+        with entry.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            coord, color, segment, instance, *texts = (arrays[name] for name in arrays.files)
+            repairs, notes = (tuple(lines.tolist()) for lines in texts)
+    except (OSError, BadZipFile, *DAMAGES):
         return None
-
-
-def _store(entry: Path, room: Room) -> Room:
-    """Put a room into the cache in one step, and return it as it is there."""
-    beside = entry.with_name(f".{entry.name}.{secrets.token_hex(4)}")
-    try:
-        beside.mkdir(parents=True)
-        for name in _ARRAYS:
-            np.save(beside / f"{name}.npy", getattr(room, name), allow_pickle=False)
-        (beside / "report.json").write_text(json.dumps(_plain(room.report)), encoding="utf-8")
-        # On the disk before the folder has its name, which says that all is there.
-        for path in beside.iterdir():
-            with path.open("rb+") as stream:
-                os.fsync(stream.fileno())
-        if entry.exists() and _load(entry) is None:
-            shutil.rmtree(entry, ignore_errors=True)
-        try:
-            beside.rename(entry)
-        except OSError:
-            # Another process has put the same room there in the meantime.
-            if not entry.is_dir():
-                raise
-    except OSError as error:
-        raise FormatError(
-            f"{entry}: cannot be written: {error.strerror or error}; choose another folder with "
-            "cache=..., or none with cache=None."
-        ) from error
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return _load(entry) or room
-
-
-def _plain(report: RoomReport) -> dict[str, Any]:
-    """Return a report as JSON can hold it; latin-1 keeps every byte."""
-    return {
-        "repairs": [
-            [str(file), line, column, before.decode("latin-1"), after.decode("latin-1")]
-            for file, line, column, before, after in report.repairs
-        ],
-        "skipped": [[str(file), reason] for file, reason in report.skipped],
-        "as_clutter": [[str(file)] for file in report.as_clutter],
-    }
-
-
-def _report_of(plain: dict[str, Any]) -> RoomReport:
-    """Return the report that JSON holds."""
-    return RoomReport(
-        tuple(
-            Repair(Path(file), line, column, before.encode("latin-1"), after.encode("latin-1"))
-            for file, line, column, before, after in plain["repairs"]
-        ),
-        tuple(Skipped(Path(file), reason) for file, reason in plain["skipped"]),
-        tuple(Path(file) for (file,) in plain["as_clutter"]),
-    )
+    return Room(coord, color, segment, instance, repairs, notes)
