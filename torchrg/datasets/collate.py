@@ -12,6 +12,7 @@ from torch.utils.data import default_collate
 from torchrg._checks import as_tensor
 from torchrg.errors import ShapeError
 from torchrg.transforms.rows import LISTED, listed_keys
+from torchrg.transforms.sample import NeighborSearch
 
 
 def collate_offset(
@@ -25,7 +26,8 @@ def collate_offset(
 
     Args:
         samples: Samples with the same keys. Tensors and arrays are joined along their first axis,
-            scalars stacked, everything else becomes a list.
+            scalars stacked, everything else becomes a list. Neighbours that transforms search for
+            each other are left out.
         coord: Key that says how many points a sample has.
         inverse: Key of the numbers of points, as of :class:`torchrg.transforms.SampleVoxels`, that
             shall name rows of the batch.
@@ -43,6 +45,7 @@ def collate_offset(
         >>> batch["coord"].shape, batch["offset"]
         (torch.Size([5, 3]), tensor([2, 5]))
     """
+    samples = [{k: v for k, v in s.items() if not isinstance(v, NeighborSearch)} for s in samples]
     keys = list(samples[0]) if samples else []
     for i, sample in enumerate(samples):
         if set(sample) != set(keys):

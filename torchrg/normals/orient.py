@@ -18,7 +18,7 @@ from torchrg.structures import Neighbors
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
 """What normals can be turned towards."""
 
-_NUM_NEIGHBORS = 20
+NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""
 
 _NUM_LINKS = 12
@@ -154,7 +154,7 @@ def orient_normals(
     if len(rows) == 0:
         return upright
     kept, units = cloud[rows], upright[rows]
-    near = search_knn(kept, min(_NUM_NEIGHBORS, len(kept)), canonical=True)
+    near = search_knn(kept, min(NUM_NEIGHBORS, len(kept)), canonical=True)
     signs = turn(kept, units.detach().to(cloud.dtype), near)[:, None].to(given.dtype)
     return upright.index_copy(0, rows, units * signs)
 

@@ -15,6 +15,10 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 
+Sample = Any
+"""A sample: a dict of tensors or NumPy arrays, or a PyG ``Data`` or ``Batch``."""
+Entries = Mapping[str, object]
+"""What a sample holds by key."""
 LISTED = "index_valid_keys"
 """The entry that names those with a row for each point."""
 POINTCEPT_KEYS = ("coord", "color", "normal", "superpoint", "strength", "segment", "instance")
@@ -45,7 +49,7 @@ _FEW = 16
 may have as many rows."""
 
 
-def entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
+def entries_of(sample: Sample) -> Mapping[str, Any]:
     """Return what a sample holds by key, or say that it is none."""
     if isinstance(sample, Mapping):
         return sample
@@ -151,7 +155,7 @@ def check_in_step(caller: str, entries: Mapping[str, Any], num_points: int) -> N
 
 def select_points(
     caller: str,
-    sample: Any,  # noqa: ANN401
+    sample: Sample,
     rows: Tensor,
     num_points: int,
     *,
@@ -201,12 +205,12 @@ def follow_points(caller: str, inverse: Tensor, place: Tensor) -> Tensor:
     return moved
 
 
-def rows_of_clouds(sample: Any, num_points: int) -> list[slice]:  # noqa: ANN401
+def rows_of_clouds(sample: Sample, num_points: int) -> list[slice]:
     """Return the rows of each cloud of a sample, by its ``offset`` or ``batch`` if it has one."""
     return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
 
 
-def _cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
+def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
     """Return the row that each cloud of a sample ends before; one cloud ends at the last."""
     entries = entries_of(sample)
     if entries.get("offset") is not None:
