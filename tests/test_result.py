@@ -20,7 +20,7 @@ from torchrg.neighbors import finite_rows
 from torchrg.render.page import make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
-from torchrg.structures import Cloud, PlaneAdjacency, Planes
+from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes
 
 CLASSIC = load_config("classic")
 OUTLINED = replace(CLASSIC, planes=PlanesConfig(up="z", outline=True))
@@ -276,6 +276,19 @@ def test_labels_from_elsewhere_get_one_table(monkeypatch, cloud, seg):
     )
 
 
+def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud, seg):
+    bare = seg._replace(planes=seg.planes._replace(adjacency=None))
+    searched = Result.of(cloud, bare).planes
+    rows = finite_rows(cloud.points)
+    known = bare._replace(neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
+    monkeypatch.setattr("torchrg.result.search_knn", None)
+    result = Result.of(cloud, known)
+    assert_same_table(result.planes, searched)
+    assert result.segmentation.neighbors is known.neighbors
+    with pytest.raises(TypeError, match="not callable"):
+        _ = Result.of(cloud, bare).planes
+
+
 def test_without_labels_there_is_no_table(tmp_path, cloud):
     torchrg.write_cloud(tmp_path / "a.ply", cloud)
     result = torchrg.read_result(tmp_path / "a.ply")
@@ -341,8 +354,6 @@ def test_no_planes_are_read_back_too(tmp_path):
 
 
 def test_columns_of_files_are_those_of_the_table():
-    from torchrg.structures import PLANE_COLUMNS
-
     assert list(PLANE_COLUMNS) == list(Planes._fields[: len(PLANE_COLUMNS)])
     assert Planes._fields[len(PLANE_COLUMNS) :] == ("kind", "outline", "adjacency")
     assert PlaneAdjacency._fields[0] == "pairs"

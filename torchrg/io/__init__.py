@@ -35,6 +35,7 @@ from torchrg.io.stream import (
 )
 from torchrg.io.text import count_text, open_text, write_text
 from torchrg.io.vg import open_bvg, open_vg, write_bvg, write_vg
+from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
@@ -221,7 +222,7 @@ def write_cloud(
         ``normals_input`` and so on; where there is such a field already, it is that which stays.
         ``.npz``
         holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the table of
-        planes as :meth:`torchrg.structures.Planes.to_arrays` gives it in the input's coordinates,
+        planes as :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's coordinates,
         and ``provenance``. Equal input gives equal bytes (``.e57`` excepted: its files carry random
         identifiers). Superpoints are ``superpoints``, and ``superpoints_1`` and so on for the
         coarser levels; in ``.npz`` also ``plane_of_superpoint``. ``.vg`` and ``.bvg`` hold
@@ -284,7 +285,7 @@ def write_cloud(
             lambda rows: {name: values[rows].numpy(force=True) for name, values in results.items()}
         )
     if found in GROUP_FORMATS.values() and segmentation is not None:
-        table = segmentation.planes.to_arrays(stream.origin)
+        table = planes_to_arrays(segmentation.planes, stream.origin)
         equations = np.column_stack([table["plane_normal"], -table["plane_offset"]])
         found.write(target, _checked(target, stream), equations)  # type: ignore[call-arg]
         return

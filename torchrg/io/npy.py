@@ -37,6 +37,7 @@ from torchrg.io.fields import (
 )
 from torchrg.io.files import DAMAGES, atomic_path, check_file, check_promise, refusing
 from torchrg.io.stream import POINTS_A_CHUNK, CloudStream, Table, slices
+from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import PlaneAdjacency, Planes, Segmentation, Superpoints
 
 _COORDINATES = ("points", "coord")
@@ -199,7 +200,7 @@ def write_npz(
     else:
         for name in _RESULTS:
             arrays[name] = partial(_cut, getattr(segmentation, name))
-        arrays |= segmentation.planes.to_arrays(stream.origin)
+        arrays |= planes_to_arrays(segmentation.planes, stream.origin)
     if superpoints is not None:
         for name in superpoints.rows(slice(0)).by_level():
             if name in arrays:
