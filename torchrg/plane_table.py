@@ -8,11 +8,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, PlaneAdjacency, Planes
+from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Array, PlaneAdjacency, Planes
 
-Array = NDArray[Any]
 Arrays = dict[str, Array]
 """Parts of the table by their names in ``.npz``."""
+Json = dict[str, Any]
+"""Parts of the table as JSON can hold them, by name."""
 
 
 def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
@@ -111,7 +112,7 @@ def _check_planes(numbers: Array, num_planes: int) -> None:
         raise IndexError(f"plane {numbers.max()} of {num_planes}")
 
 
-def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
+def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> Json:
     """Return a plane table as JSON can hold it.
 
     Args:
@@ -139,24 +140,24 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
         columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
-    table: dict[str, Any] = {"planes": _rows(columns)}
+    table: Json = {"planes": _rows(columns)}
     if planes.adjacency is not None:
         pairs = _lists(arrays, "adjacency_")
         table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
     return table
 
 
-def _lists(arrays: Arrays, prefix: str) -> dict[str, list[Any]]:
+def _lists(arrays: Arrays, prefix: str) -> Json:
     """Return the arrays with a prefix as lists, by their names without it."""
     return {n.removeprefix(prefix): v.tolist() for n, v in arrays.items() if n.startswith(prefix)}
 
 
-def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+def _rows(columns: Json) -> list[Json]:
     """Turn a table of columns into a list of rows."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def arrays_of_description(described: Mapping[str, Any]) -> Arrays:
+def arrays_of_description(described: Json) -> Arrays:
     """Return what :func:`describe_planes` described as :func:`planes_to_arrays` gives it."""
     rows, pairs = described["planes"], described.get("adjacency")
     arrays = {

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ShapeError
@@ -25,7 +24,7 @@ from torchrg.io.npy import map_folder, read_beside
 from torchrg.io.stream import CloudStream, Extent
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
-from torchrg.plane_table import arrays_of_description, planes_from_arrays
+from torchrg.plane_table import Arrays, arrays_of_description, planes_from_arrays
 from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
@@ -352,7 +351,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
     return replace(result, cloud=replace(cloud, notes=(*cloud.notes, note)))
 
 
-def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
+def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
     """Return the cloud of a folder of arrays, and what is beside them as ``.npz`` would hold it."""
     arrays = map_folder(folder, ("coord", *_FOLDER_FIELDS))
     fields = {
@@ -365,7 +364,7 @@ def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
     coord = arrays["coord"]
     grid = coord.shape[:2] if coord.ndim == 3 else None
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder))
-    beside: dict[str, NDArray[Any]] = {}
+    beside: Arrays = {}
     if (folder / RECORD).is_file():
         beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
     if (folder / PLANES_FILE).is_file():

@@ -22,6 +22,8 @@ FARTHEST = 1e12
 float32, is beyond, and a room in any unit is not. Squares of these are far from float32's end."""
 
 
+Array = NDArray[Any]
+"""An array of numbers or text, of any shape."""
 Rows = slice | Tensor
 """A block of points, or the row numbers of some."""
 

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from torchrg._checks import check_shapes
 from torchrg.datasets.folder import (
     SceneDataset,
     SceneFiles,
+    Transform,
     check_folder,
     files_below,
     listed,
@@ -34,6 +35,7 @@ from torchrg.datasets.rgbd_files import (
 )
 from torchrg.depth.camera import check_camera, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
+from torchrg.transforms.rows import SampleDict
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 _TUM_INTRINSICS = {
@@ -132,7 +134,7 @@ class RGBDFrames(SceneDataset):
         self,
         frames: Sequence[RGBDFrame],
         *,
-        transform: Callable[[dict[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> None:
         self.frames = tuple(frames)
         self.transform = transform
@@ -154,7 +156,7 @@ class RGBDFrames(SceneDataset):
         *,
         intrinsics: Tensor | None = None,
         depth_scale: float | None = None,
-        transform: Callable[[dict[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> "RGBDFrames":
         """Find the frames of a folder.
 
@@ -179,7 +181,7 @@ class RGBDFrames(SceneDataset):
         frames = [*_find(Path(root), LAYOUTS[layout], intrinsics, depth_scale)]
         return cls(frames, transform=transform)
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a frame.
 
         Raises:
@@ -187,7 +189,7 @@ class RGBDFrames(SceneDataset):
         """
         frame = self.frames[index]
         depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
-        sample: dict[str, Any] = {
+        sample: SampleDict = {
             "depth": depth[None],
             "intrinsics": frame.intrinsics.to(torch.float64),
             "name": frame.name,

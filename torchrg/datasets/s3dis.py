@@ -4,19 +4,19 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
-from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
+from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
 from torchrg.datasets.rooms import ANNOTATIONS, Room, class_names, object_files, read_room
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import DAMAGES, first_line, make_folder
+from torchrg.transforms.rows import SampleDict
 
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms of each area in the release, 272 in all."""
@@ -67,7 +67,7 @@ class S3DIS(SceneDataset):
         *,
         class_order: str = "pointcept",
         cache: str | os.PathLike[str] | None = USER_CACHE,
-        transform: Callable[[Mapping[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> None:
         self.root = Path(root)
         self.class_order = class_order
@@ -76,7 +76,7 @@ class S3DIS(SceneDataset):
         self.transform = transform
         self.scenes = [scene for area in areas for scene in _scenes_of_area(self.root, area)]
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a room."""
         room = self.read_room(index)
         return {

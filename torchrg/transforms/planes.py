@@ -38,7 +38,6 @@ class EstimateNormals(CloudTransform):
         residual: Whether to add ``residual`` ``(N,)``, the root mean square distance of the
             neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
         chunk_size: Points handled at a time; bounds memory, changes no result.
-        keep_neighbors, keys: As of :class:`~torchrg.transforms.sample.CloudTransform`.
         **changes: Single settings, as in ``method="pca", k=30``.
 
     Example:
@@ -83,7 +82,6 @@ class OrientNormals(CloudTransform):
     Args:
         towards: What normals are turned to; ``"up"`` is ``"+z"``.
         viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
-        keep_neighbors, keys: As of :class:`~torchrg.transforms.sample.CloudTransform`.
 
     Raises:
         ConfigError: If ``towards`` is unknown, or does not go with ``viewpoint``.
@@ -165,7 +163,6 @@ class GrowRegions(CloudTransform):
         config: Settings of the growth, a whole configuration, or the name of a preset. Default:
             that of :func:`torchrg.load_config`.
         k: Number of neighbours, the point itself included.
-        keep_neighbors, keys: As of :class:`~torchrg.transforms.sample.CloudTransform`.
         **changes: Single settings, as in ``max_angle_deg=7``.
 
     Example:
@@ -224,7 +221,6 @@ class SegmentPlanes(CloudTransform):
     Args:
         config: Settings, or the name of a preset.
         compile: Whether to run kernels compiled; see :func:`torchrg.segment_planes`.
-        keep_neighbors, keys: As of :class:`~torchrg.transforms.sample.CloudTransform`.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -263,7 +259,6 @@ class MakeSuperpoints(CloudTransform):
         config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
         white: Largest value of a colour, 255 or 1, to read ``color`` ``(N, 3)`` too. Default:
             colours play no part.
-        keys: Other names for the keys.
         **changes: Single settings, as in ``strengths=(2.0,)``.
 
     Example:
@@ -309,7 +304,6 @@ class AlignAxes(SampleTransform):
         config: How the planes are found that say where floor and walls are: settings, or the name
             of a preset.
         up: Where up is, to within 30 degrees.
-        keys: Other names for the keys.
 
     Raises:
         ConfigError: If a cloud has neither floor nor walls, when it is called.

@@ -23,7 +23,9 @@ from torchrg.structures import UNLABELED, Neighbors
 from torchrg.transforms.rows import (
     LISTED,
     OUR_KEYS,
+    Entries,
     Sample,
+    SampleDict,
     check_in_step,
     entries_of,
     follow_points,
@@ -117,7 +119,7 @@ class SampleTransform(nn.Module):
     def changed(
         self,
         sample: Sample,
-        values: Mapping[str, Any],
+        values: Entries,
         *,
         per_point: Sequence[str] = (),
     ) -> Sample:
@@ -144,7 +146,7 @@ class SampleTransform(nn.Module):
             changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
         return changed
 
-    def selected(self, sample: Sample, rows: Tensor, num_points: int) -> dict[str, Any]:
+    def selected(self, sample: Sample, rows: Tensor, num_points: int) -> SampleDict:
         """Return the entries that change when only some rows are kept, given ascending."""
         whole = self._whole_keys(sample)
         return select_points(type(self).__name__, sample, rows, num_points, whole=whole)
@@ -213,7 +215,6 @@ class CloudTransform(SampleTransform):
         keep_neighbors: Whether the sample carries the neighbours on, as ``neighbors``, so that the
             next transform need not search them; see :class:`NeighborSearch`. They take 4 bytes for
             each neighbour of a point.
-        keys: Other names for the keys.
     """
 
     reads: tuple[str, ...] = ("coord",)
@@ -320,7 +321,6 @@ class SampleVoxels(SampleTransform):
 
     Args:
         size: Side of a voxel, in the unit of the cloud.
-        keys: Other names for the keys.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [0.04, 0, 0], [0.11, 0, 0]])
