@@ -49,22 +49,18 @@ if TYPE_CHECKING:
     from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud
 else:
-    _MODULES = {
-        "UNLABELED": "structures",
-        "align_axes": "regions",
-        "Cloud": "structures",
-        "TorchrgError": "errors",
-        "estimate_normals": "normals",
-        "grow_regions": "regions",
-        "load_config": "config",
-        "make_superpoints": "pipeline",
-        "read_cloud": "io",
-        "read_result": "result",
-        "search_knn": "neighbors",
-        "segment_mesh": "pipeline",
-        "segment_planes": "pipeline",
-        "write_cloud": "io",
+    _NAMES = {
+        "config": ("load_config",),
+        "errors": ("TorchrgError",),
+        "io": ("read_cloud", "write_cloud"),
+        "neighbors": ("search_knn",),
+        "normals": ("estimate_normals",),
+        "pipeline": ("make_superpoints", "segment_mesh", "segment_planes"),
+        "regions": ("align_axes", "grow_regions"),
+        "result": ("read_result",),
+        "structures": ("UNLABELED", "Cloud"),
     }
+    _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
     def __getattr__(name):  # noqa: ANN001, ANN202
         """Load a name or module when it is asked for: a command starts before torch is loaded."""
@@ -97,26 +93,8 @@ def _load_display() -> "ModuleType":
 _display.register(_load_display)
 
 __all__ = [
-    "UNLABELED",
-    "Cloud",
-    "TorchrgError",
-    "align_axes",
-    "datasets",
-    "depth",
-    "estimate_normals",
-    "grow_regions",
-    "load_config",
-    "make_superpoints",
-    "metrics",
-    "nn",
-    "normals",
-    "read_cloud",
-    "read_result",
-    "robust",
-    "scenes",
-    "search_knn",
-    "segment_mesh",
-    "segment_planes",
-    "transforms",
+    "UNLABELED", "Cloud", "TorchrgError", "align_axes", "datasets", "depth", "estimate_normals",
+    "grow_regions", "load_config", "make_superpoints", "metrics", "nn", "normals", "read_cloud",
+    "read_result", "robust", "scenes", "search_knn", "segment_mesh", "segment_planes", "transforms",
     "write_cloud",
-]
+]  # fmt: skip

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.datasets.s3dis_tree import BROKEN, rows_of, text_of
-from torchrg.datasets.rooms import read_annotation
+from torchrg.datasets.s3dis import read_annotation
 from torchrg.errors import FormatError, MissingDependencyError
 
 pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")

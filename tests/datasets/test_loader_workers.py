@@ -40,14 +40,14 @@ def two_threads():
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*rooms, got:UserWarning")
 @pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-def test_workers_give_what_the_main_process_gives(two_threads, root, tmp_path, start):
+def test_workers_give_what_the_main_process_gives(two_threads, root, start):
     pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
     steps = NoteProcess(nn.Sequential(SampleVoxels(0.2), CenterCloud(), SegmentPlanes("paper")))
-    plain = S3DIS(root, [1], cache=None, transform=steps)
+    plain = S3DIS(root, [1], transform=steps)
     expected = [plain[i] for i in range(3)]
     assert {int(sample["process"][0, 1]) for sample in expected} == {2}
     batches = DataLoader(
-        S3DIS(root, [1], cache=tmp_path, transform=steps),
+        S3DIS(root, [1], transform=steps),
         num_workers=2,
         multiprocessing_context=start,
         persistent_workers=True,
@@ -64,4 +64,3 @@ def test_workers_give_what_the_main_process_gives(two_threads, root, tmp_path, s
         assert len(set(processes)) == 2
         assert os.getpid() not in processes
         assert set(threads) == {1}
-    assert len(list((tmp_path / "s3dis").iterdir())) == 3

@@ -321,7 +321,7 @@ class S3DISSource(CloudSource):
                 "has the order pointcept; leave it out."
             )
         require("pyarrow", extra="s3dis", purpose="read S3DIS")
-        rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
+        rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
         return self.checked(
             [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
         )

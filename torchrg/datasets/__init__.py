@@ -19,8 +19,7 @@ from torchrg.datasets.folder import FolderOfClouds, SceneFiles, read_pointcept_a
 from torchrg.datasets.nag import make_nag
 from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
-from torchrg.datasets.rooms import CLASS_ORDERS, Room, read_room
-from torchrg.datasets.s3dis import S3DIS
+from torchrg.datasets.s3dis import CLASS_ORDERS, S3DIS, Room, read_room
 from torchrg.datasets.scannet import ScanNet, read_scannet_scan
 
 __all__ = [

@@ -14,8 +14,7 @@ import numpy as np
 
 from torchrg.datasets.folder import natural_key
 from torchrg.datasets.layouts import MODES
-from torchrg.datasets.rooms import CLASS_ORDERS
-from torchrg.datasets.s3dis import ROOMS_PER_AREA
+from torchrg.datasets.s3dis import CLASS_ORDERS, ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
