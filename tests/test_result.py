@@ -223,18 +223,6 @@ def test_the_page_shows_the_table_of_the_result():
     assert pairs_of_page(few) == pairs_of_page(shown)
 
 
-@pytest.mark.slow
-def test_the_page_makes_no_table_of_its_own(cloud, seg):
-    """A table that nobody would find in the points is shown as it is, in the notebook too."""
-    pytest.importorskip("pydeck", reason="needs the extra view")
-    adjacency = PlaneAdjacency(*(part[1::2] for part in seg.planes.adjacency))
-    table = seg.planes._replace(area=seg.planes.area + 1000, adjacency=adjacency)
-    shown = table_of_page(make_page(Result.of(cloud, seg._replace(planes=table))))
-    assert [plane["area"] for plane in shown] == table.area.tolist()
-    assert pairs_of_page(shown) == [tuple(pair) for pair in adjacency.pairs.tolist()]
-    assert f"<td>{float(table.area[0]):.4g}</td>" in seg._replace(planes=table)._repr_html_()
-
-
 def test_a_page_draws_the_outlines_of_the_result(cloud, seg):
     pytest.importorskip("pydeck", reason="needs the extra view")
     shown = table_of_page(make_page(Result.of(cloud, seg)))
