@@ -76,7 +76,6 @@ class DepthToCloud(DepthTransform):
 
     and replaces ``color`` by that of the points, ``(N, 3)``, of the nearest pixel.
 
-
     Example:
         >>> depth = torch.tensor([[[2.0, 0.0], [2.0, 2.0]]])
         >>> cloud = DepthToCloud()({"depth": depth, "intrinsics": torch.eye(3)})
