@@ -132,8 +132,6 @@ def test_missing_file_is_named(tmp_path):
         (DepthConfig, {"max_angle_deg": 91.0}, r"DepthConfig: expected max_angle_deg in \[0, 90\]"),
         (DepthConfig, {"max_step": -1.0}, "max_step >= 0"),
         (DepthConfig, {"min_size": 0}, "DepthConfig: expected min_size >= 1"),
-        (DepthConfig, {"absorb_reach": -1.0}, "DepthConfig: expected absorb_reach >= 0"),
-        (DepthConfig, {"merge_tolerance": 0.5}, "DepthConfig: expected merge_tolerance >= 1"),
     ],
 )
 def test_values_out_of_range_are_refused(kind, values, message):

@@ -12,7 +12,7 @@ LAYERS = [
     {"errors", "version", "_display", "_parallel"},
     {"precision"},
     {"_checks", "_compile", "_optional", "scratch", "structures"},
-    {"_opaque", "linalg", "neighbors", "config"},
+    {"_opaque", "linalg", "neighbors", "config", "plane_table"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},
     {"result"},

@@ -19,7 +19,7 @@ from torchrg.neighbors import finite_rows
 from torchrg.render.page import make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
-from torchrg.structures import Cloud, PlaneAdjacency, Planes
+from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes
 
 CLASSIC = load_config("classic")
 OUTLINED = replace(CLASSIC, planes=PlanesConfig(up="z", outline=True))
@@ -221,18 +221,6 @@ def test_the_page_shows_the_table_of_the_result():
     assert pairs_of_page(few) == pairs_of_page(shown)
 
 
-@pytest.mark.slow
-def test_the_page_makes_no_table_of_its_own(cloud, seg):
-    """A table that nobody would find in the points is shown as it is, in the notebook too."""
-    pytest.importorskip("pydeck", reason="needs the extra view")
-    adjacency = PlaneAdjacency(*(part[1::2] for part in seg.planes.adjacency))
-    table = seg.planes._replace(area=seg.planes.area + 1000, adjacency=adjacency)
-    shown = table_of_page(make_page(Result.of(cloud, seg._replace(planes=table))))
-    assert [plane["area"] for plane in shown] == table.area.tolist()
-    assert pairs_of_page(shown) == [tuple(pair) for pair in adjacency.pairs.tolist()]
-    assert f"<td>{float(table.area[0]):.4g}</td>" in seg._replace(planes=table)._repr_html_()
-
-
 def test_a_page_draws_the_outlines_of_the_result(cloud, seg):
     pytest.importorskip("pydeck", reason="needs the extra view")
     shown = table_of_page(make_page(Result.of(cloud, seg)))
@@ -272,6 +260,19 @@ def test_labels_from_elsewhere_get_one_table(monkeypatch, cloud, seg):
     assert torch.equal(
         result.segmentation.labels[:-1], torch.where(seg.labels >= 0, last - seg.labels, -1)
     )
+
+
+def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud, seg):
+    bare = seg._replace(planes=seg.planes._replace(adjacency=None))
+    searched = Result.of(cloud, bare).planes
+    rows = finite_rows(cloud.points)
+    known = bare._replace(neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
+    monkeypatch.setattr("torchrg.result.search_knn", None)
+    result = Result.of(cloud, known)
+    assert_same_table(result.planes, searched)
+    assert result.segmentation.neighbors is known.neighbors
+    with pytest.raises(TypeError, match="not callable"):
+        _ = Result.of(cloud, bare).planes
 
 
 def test_without_labels_there_is_no_table(tmp_path, cloud):
@@ -339,8 +340,6 @@ def test_no_planes_are_read_back_too(tmp_path):
 
 
 def test_columns_of_files_are_those_of_the_table():
-    from torchrg.structures import PLANE_COLUMNS
-
     assert list(PLANE_COLUMNS) == list(Planes._fields[: len(PLANE_COLUMNS)])
     assert Planes._fields[len(PLANE_COLUMNS) :] == ("kind", "outline", "adjacency")
     assert PlaneAdjacency._fields[0] == "pairs"

@@ -7,38 +7,16 @@ modules of :mod:`torchrg.transforms` do the same to the samples of a loader,
 :mod:`torchrg.datasets` reads data sets, :mod:`torchrg.metrics` scores, :mod:`torchrg.config` has
 every setting, and :mod:`torchrg.robust` and :mod:`torchrg.nn` are for patches of points.
 
-In PyTorch, functions of patches are like those of torch: they have gradients, and run under
-``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)`` and ``torch.export``. Functions of
-clouds search neighbours and grow regions on the CPU: a compiler breaks its graph there (``break``)
-and compiles the rest, and under ``vmap`` and ``torch.func`` they refuse in one line. Labels have no
-gradient (``none``). Every cell is a test, but on CUDA nothing was run yet.
-
-==================  ========  =======  =======  =======  =======  ========  =======
-function            autograd  vmap     func     compile  export   autocast  cuda
-==================  ========  =======  =======  =======  =======  ========  =======
-covariance          yes       yes      yes      yes      yes      yes       not run
-eigh3               yes       yes      yes      yes      yes      yes       not run
-fit_normals_pca     yes       yes      yes      yes      yes      yes       not run
-fit_normals_jet     yes       yes      yes      yes      yes      yes       not run
-fit_normals_irls    yes       yes      yes      yes      yes      yes       not run
-fit_normals_robust  yes       yes      yes      yes      yes      yes       not run
-median              yes       yes      yes      yes      yes      yes       not run
-mad                 yes       yes      yes      yes      yes      yes       not run
-qn                  yes       yes      yes      yes      yes      yes       not run
-tau                 yes       yes      yes      yes      yes      yes       not run
-fit_detmcd          yes       yes      yes      yes      yes      yes       not run
-fit_fastmcd         yes       yes      yes      yes      yes      yes       not run
-fit_mve             yes       yes      yes      yes      yes      yes       not run
-fit_dets            yes       yes      yes      yes      yes      yes       not run
-fit_detmm           yes       yes      yes      yes      yes      yes       not run
-estimate_normals    yes       refused  refused  break    no       yes       not run
-orient_normals      yes       refused  refused  break    no       yes       not run
-segment_planes      none      refused  refused  break    no       yes       not run
-grow_regions        none      refused  refused  break    no       yes       not run
-make_superpoints    none      refused  refused  break    no       yes       not run
-search_knn          none      refused  refused  break    no       yes       not run
-segment_depth       none      refused  refused  break    no       yes       not run
-==================  ========  =======  =======  =======  =======  ========  =======
+Functions of patches (``covariance``, ``eigh3``, ``median``, ``mad``, ``qn``, ``tau``,
+``fit_normals_pca``, ``fit_normals_jet``, ``fit_normals_irls``, ``fit_normals_robust``,
+``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are like those of torch:
+they have gradients, and run under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``,
+``torch.export`` and ``torch.autocast``. Functions of clouds (``search_knn``, ``estimate_normals``,
+``orient_normals``, ``grow_regions``, ``segment_planes``, ``make_superpoints``, ``segment_depth``)
+search neighbours and grow regions on the CPU: a compiler breaks its graph there and compiles the
+rest, ``vmap`` and ``torch.func`` are refused in one line, and ``torch.export`` does not take them.
+Normals of ``estimate_normals`` and ``orient_normals`` have gradients, labels have none. The tests
+show all of this; on CUDA nothing was run yet.
 
 The robust fits, scales and ``fit_normals_irls`` are one operation of their own to ``vmap`` (from
 torch 2.5), ``torch.func`` and compilers, and have no second derivatives there; the method
@@ -71,22 +49,18 @@ if TYPE_CHECKING:
     from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud
 else:
-    _MODULES = {
-        "UNLABELED": "structures",
-        "align_axes": "regions",
-        "Cloud": "structures",
-        "TorchrgError": "errors",
-        "estimate_normals": "normals",
-        "grow_regions": "regions",
-        "load_config": "config",
-        "make_superpoints": "pipeline",
-        "read_cloud": "io",
-        "read_result": "result",
-        "search_knn": "neighbors",
-        "segment_mesh": "pipeline",
-        "segment_planes": "pipeline",
-        "write_cloud": "io",
+    _NAMES = {
+        "config": ("load_config",),
+        "errors": ("TorchrgError",),
+        "io": ("read_cloud", "write_cloud"),
+        "neighbors": ("search_knn",),
+        "normals": ("estimate_normals",),
+        "pipeline": ("make_superpoints", "segment_mesh", "segment_planes"),
+        "regions": ("align_axes", "grow_regions"),
+        "result": ("read_result",),
+        "structures": ("UNLABELED", "Cloud"),
     }
+    _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
     def __getattr__(name):  # noqa: ANN001, ANN202
         """Load a name or module when it is asked for: a command starts before torch is loaded."""
@@ -119,26 +93,8 @@ def _load_display() -> "ModuleType":
 _display.register(_load_display)
 
 __all__ = [
-    "UNLABELED",
-    "Cloud",
-    "TorchrgError",
-    "align_axes",
-    "datasets",
-    "depth",
-    "estimate_normals",
-    "grow_regions",
-    "load_config",
-    "make_superpoints",
-    "metrics",
-    "nn",
-    "normals",
-    "read_cloud",
-    "read_result",
-    "robust",
-    "scenes",
-    "search_knn",
-    "segment_mesh",
-    "segment_planes",
-    "transforms",
+    "UNLABELED", "Cloud", "TorchrgError", "align_axes", "datasets", "depth", "estimate_normals",
+    "grow_regions", "load_config", "make_superpoints", "metrics", "nn", "normals", "read_cloud",
+    "read_result", "robust", "scenes", "search_knn", "segment_mesh", "segment_planes", "transforms",
     "write_cloud",
-]
+]  # fmt: skip

@@ -15,6 +15,6 @@ def register(load: Callable[[], ModuleType]) -> None:
     _loaders[:] = [load]
 
 
-def call(name: str, *arguments: Any, **settings: Any) -> Any:  # noqa: ANN401
+def call(name: str, *arguments: object, **settings: object) -> Any:  # noqa: ANN401
     """Call a function of the registered module by its name."""
     return getattr(_loaders[0](), name)(*arguments, **settings)

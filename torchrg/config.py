@@ -250,8 +250,6 @@ class SuperpointsConfig:
     max_extent: float | None = None
     """Longest side of the box around a superpoint, in the unit of the cloud. Whole planes may have
     longer ones. None: no limit."""
-    color_weight: float = 3.0
-    """Weight of a squared difference of colours in [0, 1], against one of unit normals."""
 
     def __post_init__(self) -> None:
         is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths, math.inf)
@@ -262,7 +260,6 @@ class SuperpointsConfig:
         _require(self, "min_size", ">= 1", self.min_size >= 1)
         extent = self.max_extent
         _require(self, "max_extent", "> 0 or none", extent is None or 0 < extent < math.inf)
-        _require(self, "color_weight", ">= 0", 0 <= self.color_weight < math.inf)
 
     @property
     def num_levels(self) -> int:
@@ -292,12 +289,6 @@ class DepthConfig:
     either by at most this many standard deviations of the noise."""
     min_size: int = 100
     """Regions of fewer pixels are not labelled."""
-    absorb_reach: float = 3.0
-    """A pixel at a border joins the flat region beside it when it is within this many standard
-    deviations of the noise of the plane of that region."""
-    merge_tolerance: float = 1.2
-    """Flat regions that touch become one when one plane explains both, that is when neither is
-    farther from it than this many times its distance from its own plane."""
 
     def __post_init__(self) -> None:
         parts = (1.0,) if self.noise is None else self.noise
@@ -307,8 +298,6 @@ class DepthConfig:
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
         _require(self, "max_step", ">= 0", self.max_step >= 0)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
-        _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
-        _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
 
 def preset_names() -> list[str]:

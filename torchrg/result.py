@@ -1,8 +1,7 @@
 """A cloud and what was found about it: what files, folders, pages and notebooks hold.
 
 :func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth`` write results, and
-:func:`read_result` reads them again. The plane table has one form in all of them, that of
-:meth:`torchrg.structures.Planes.to_arrays`; :func:`describe_planes` is the same as JSON.
+:func:`read_result` reads them again.
 """
 
 import json
@@ -15,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ShapeError
@@ -25,13 +23,15 @@ from torchrg.io.files import DAMAGES
 from torchrg.io.npy import map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
+from torchrg.plane_table import Arrays, arrays_of_description, planes_from_arrays
+from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.superpoints import main_planes
 from torchrg.structures import (
-    PLANE_COLUMNS,
     UNLABELED,
     Cloud,
+    Neighbors,
     PlaneAdjacency,
     Planes,
     Segmentation,
@@ -80,6 +80,7 @@ class Result:
             labels, ascending. Default: there is none.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
         provenance: How the result was made.
+        neighbors: See :attr:`torchrg.structures.Segmentation.neighbors`.
 
     Example:
         >>> points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [5, 5, 5]])
@@ -93,6 +94,7 @@ class Result:
     table: Planes | None = None
     plane_of_superpoint: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    neighbors: Neighbors | None = None
 
     @classmethod
     def of(
@@ -120,7 +122,8 @@ class Result:
             found |= superpoints.by_level()
         labelled = replace(cloud, fields=put_results(cloud.fields, found))
         plane_of_superpoint = None if superpoints is None else superpoints.plane
-        return cls(labelled, segmentation.planes, plane_of_superpoint)
+        neighbors = segmentation.neighbors
+        return cls(labelled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
 
     @cached_property
     def fields(self) -> dict[str, Tensor]:
@@ -170,19 +173,20 @@ class Result:
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):
             return table
         rows = finite_rows(self.cloud.points)
-        some = torch.from_numpy(np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED])
-        some = rows[some.sort().values]
+        some, neighbors = rows, self.neighbors
+        if neighbors is None and bool((self.labels[rows] >= 0).any()):
+            places = np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED]
+            some = rows[torch.from_numpy(places).sort().values]
+            k = min(_NEIGHBORS, len(some))
+            neighbors = search_knn(self.cloud.points[some], k, canonical=True)
         points, (present, labels) = self.cloud.points[some], number_labels(self.labels[some])
-        neighbors = None
-        if len(present):
-            neighbors = search_knn(points, min(_NEIGHBORS, len(some)), canonical=True)
         if table is None:
             has_normals = "normals" in self.fields
             cloud = (self.cloud.points, self._normals, self.labels)
             whole = neighbors if has_normals and len(some) == len(rows) else None
             table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
             table = table._replace(curved=table.curved & has_normals)
-        if neighbors is None or table.adjacency is not None:
+        if neighbors is None or not len(present) or table.adjacency is not None:
             return table
         normal, rms = (column[present].double() for column in (table.normal, table.rms))
         curved, dtype = table.curved[present], table.rms.dtype
@@ -216,6 +220,7 @@ class Result:
             self.fields.get("valid", has_normal),
             planes,
             points,
+            self.neighbors,
         )
 
     @property
@@ -287,7 +292,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         return result
     try:
         normals = result.fields.get("normals", cloud.points)
-        table = Planes.from_arrays(beside, cloud.origin, normals.dtype)
+        table = planes_from_arrays(beside, cloud.origin, normals.dtype)
         sizes = torch.bincount(result.labels + 1, minlength=1)[1:]
         named = torch.equal(result.names, torch.arange(len(sizes)))
         if named and torch.equal(sizes, table.count):
@@ -299,7 +304,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
     return replace(result, cloud=replace(cloud, notes=(*cloud.notes, note)))
 
 
-def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
+def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
     """Return the cloud of a folder of arrays, and what is beside them as ``.npz`` would hold it."""
     arrays = map_folder(folder, ("coord", *_FOLDER_FIELDS))
     fields = {
@@ -312,13 +317,13 @@ def _read_folder(folder: Path) -> tuple[Cloud, dict[str, NDArray[Any]]]:
     coord = arrays["coord"]
     grid = coord.shape[:2] if coord.ndim == 3 else None
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder))
-    beside: dict[str, NDArray[Any]] = {}
+    beside: Arrays = {}
     if (folder / RECORD).is_file():
         beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
     if (folder / PLANES_FILE).is_file():
         try:
             text = (folder / PLANES_FILE).read_text(encoding="utf-8")
-            beside |= _arrays_of(json.loads(text))
+            beside |= arrays_of_description(json.loads(text))
         except DAMAGES:
             beside["plane_count"] = np.zeros(0)
     return cloud, beside
@@ -331,68 +336,3 @@ def _record(text: str) -> dict[str, Any]:
     except DAMAGES:
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> dict[str, Any]:
-    """Return a plane table as JSON can hold it.
-
-    Args:
-        planes: The table.
-        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
-            Default: they are the same.
-
-    Returns:
-        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
-        :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
-        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
-
-    Example:
-        >>> from torchrg.pipeline import segment_planes
-        >>> grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
-        >>> plane = describe_planes(segment_planes(grid).planes, origin=[0, 0, 5])["planes"][0]
-        >>> plane["count"], plane["normal"], plane["offset"]
-        (81, [0.0, 0.0, 1.0], 6.0)
-    """
-    arrays = planes.to_arrays(np.array([0.0] * 3 if origin is None else origin, dtype=np.float64))
-    columns = {"id": [*range(len(planes.count))]} | _lists(arrays, "plane_")
-    if planes.outline is not None:
-        ends = arrays["outline_ring_sizes"].cumsum()[:-1]
-        rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
-        columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
-    table: dict[str, Any] = {"planes": _rows(columns)}
-    if planes.adjacency is not None:
-        pairs = _lists(arrays, "adjacency_")
-        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
-    return table
-
-
-def _lists(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, list[Any]]:
-    """Return the arrays with a prefix as lists, by their names without it."""
-    return {n.removeprefix(prefix): v.tolist() for n, v in arrays.items() if n.startswith(prefix)}
-
-
-def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    """Turn a table of columns into a list of rows."""
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _arrays_of(described: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Return what :func:`describe_planes` described as the arrays of ``Planes.to_arrays``."""
-    rows, pairs = described["planes"], described.get("adjacency")
-    arrays = {
-        f"plane_{name}": np.array([row[name] for row in rows], dtype).reshape(len(rows), *shape)
-        for name, (dtype, shape) in PLANE_COLUMNS.items()
-    }
-    if rows and "kind" in rows[0]:
-        arrays["plane_kind"] = np.array([row["kind"] for row in rows])
-    if rows and "outline" in rows[0]:
-        rings = [(row["id"], ring) for row in rows for ring in row["outline"]]
-        arrays["outline_points"] = np.array([p for _, ring in rings for p in ring]).reshape(-1, 3)
-        arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], np.int64)
-        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], np.int64)
-    if pairs is not None:
-        ends = np.array([pair["pair"] for pair in pairs], np.int64).reshape(-1, 2)
-        arrays["adjacency_pairs"] = ends
-        for name in PlaneAdjacency._fields[1:]:
-            arrays[f"adjacency_{name}"] = np.array([pair[name] for pair in pairs], np.float64)
-    return arrays

@@ -22,6 +22,8 @@ FARTHEST = 1e12
 float32, is beyond, and a room in any unit is not. Squares of these are far from float32's end."""
 
 
+Array = NDArray[Any]
+"""An array of numbers or text, of any shape."""
 Rows = slice | Tensor
 """A block of points, or the row numbers of some."""
 
@@ -284,99 +286,6 @@ class Planes(NamedTuple):
     kind: Tensor | None = None
     outline: tuple[tuple[Tensor, ...], ...] | None = None
     adjacency: PlaneAdjacency | None = None
-
-    def to_arrays(self, origin: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-        """Return the table as files hold it, by name; what it does not have is left out.
-
-        Args:
-            origin: Where the origin of its coordinates is in those of the file, shape ``(3,)``.
-                What is moved by it, places and offsets, is in float64.
-
-        Returns:
-            ``plane_normal`` and so on, of M rows; ``plane_kind`` as words; ``adjacency_pairs``,
-            ``adjacency_boundary_length`` and ``adjacency_dihedral_deg``; outlines as
-            ``outline_points``, rings one after the other, ``outline_ring_sizes``, their lengths,
-            and ``outline_ring_planes``, the planes that they belong to.
-        """
-
-        def moved(places: Tensor) -> NDArray[np.float64]:
-            return places.numpy(force=True).astype(np.float64) + origin
-
-        arrays = {f"plane_{name}": getattr(self, name).numpy(force=True) for name in PLANE_COLUMNS}
-        offset = arrays["plane_offset"].astype(np.float64)
-        arrays["plane_offset"] = offset + arrays["plane_normal"] @ origin
-        arrays |= {f"plane_{name}": moved(getattr(self, name)) for name in ("centroid", "center")}
-        if self.kind is not None:
-            arrays["plane_kind"] = np.array(PLANE_KINDS)[self.kind.numpy(force=True)]
-        if self.adjacency is not None:
-            for name, values in self.adjacency._asdict().items():
-                arrays[f"adjacency_{name}"] = values.numpy(force=True)
-        if self.outline is not None:
-            rings = [(plane, ring) for plane, own in enumerate(self.outline) for ring in own]
-            arrays["outline_points"] = moved(torch.cat([self.center[:0], *(r for _, r in rings)]))
-            arrays["outline_ring_sizes"] = np.array([len(r) for _, r in rings], dtype=np.int64)
-            arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)
-        return arrays
-
-    @classmethod
-    def from_arrays(
-        cls, arrays: Mapping[str, NDArray[Any]], origin: NDArray[np.float64], dtype: torch.dtype
-    ) -> "Planes":
-        """Return the table that :meth:`to_arrays` made arrays of; ``dtype`` is that of its numbers.
-
-        Raises:
-            LookupError: If an array is missing, or a number in it is that of no plane or kind.
-            ValueError: If an array is of another shape or type.
-        """
-
-        def read(name: str, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
-            values = arrays[name]
-            if values.dtype.kind != np.dtype(dtype).kind or values.shape != shape:
-                raise ValueError(f"{name} of {values.dtype} and shape {values.shape}")
-            return values
-
-        def tensor(values: NDArray[Any]) -> Tensor:
-            found = torch.from_numpy(np.ascontiguousarray(values))
-            return found.to(dtype) if found.is_floating_point() else found
-
-        num_planes = len(arrays["plane_count"])
-        columns = {
-            name: read(f"plane_{name}", number, (num_planes, *shape))
-            for name, (number, shape) in PLANE_COLUMNS.items()
-        }
-        columns["offset"] = columns["offset"] - columns["normal"] @ origin
-        columns |= {name: columns[name] - origin for name in ("centroid", "center")}
-        table = cls._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), None, None, None])
-        if "plane_kind" in arrays:
-            words = read("plane_kind", "U", (num_planes,))
-            kinds = [PLANE_KINDS.index(word) for word in words]
-            table = table._replace(kind=torch.tensor(kinds, dtype=torch.int64))
-        if "adjacency_pairs" in arrays:
-            num_pairs = len(arrays["adjacency_pairs"])
-            pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
-            length, angle = (
-                read(f"adjacency_{name}", "f8", (num_pairs,)) for name in PlaneAdjacency._fields[1:]
-            )
-            _check_planes(pairs, num_planes)
-            adjacency = PlaneAdjacency(tensor(pairs), tensor(length), tensor(angle))
-            table = table._replace(adjacency=adjacency)
-        if "outline_points" in arrays:
-            num_rings = len(arrays["outline_ring_sizes"])
-            sizes = read("outline_ring_sizes", "i8", (num_rings,))
-            owners = read("outline_ring_planes", "i8", (num_rings,))
-            points = read("outline_points", "f8", (int(sizes.sum()), 3)) - origin
-            _check_planes(owners, num_planes)
-            outline: list[tuple[Tensor, ...]] = [()] * num_planes
-            for owner, end, size in zip(owners, sizes.cumsum(), sizes, strict=True):
-                outline[owner] += (tensor(points[end - size : end]),)
-            table = table._replace(outline=tuple(outline))
-        return table
-
-
-def _check_planes(numbers: NDArray[Any], num_planes: int) -> None:
-    """Raise IndexError if a number is that of no plane."""
-    if numbers.size and not 0 <= numbers.min() <= numbers.max() < num_planes:
-        raise IndexError(f"plane {numbers.max()} of {num_planes}")
 
 
 PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {

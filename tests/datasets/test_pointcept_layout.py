@@ -1,8 +1,6 @@
 """Scene folders have Pointcept's types, and those of others are completed, never changed."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from tests.datasets.s3dis_tree import digest
 from torchrg.config import load_config
 from torchrg.datasets import read_pointcept_scene, write_pointcept_scene
 from torchrg.errors import FormatError
-from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.pipeline import segment_planes
 from torchrg.result import describe_planes
 from torchrg.scenes import make_room
 
@@ -179,8 +177,6 @@ def test_a_table_cannot_name_files_elsewhere(sample, seg, tmp_path):
 
 def test_a_run_that_was_cut_off_is_repeated_like_a_new_one(foreign, sample, seg, monkeypatch):
     """A process that dies between two files leaves a claim on all of them."""
-    from pathlib import Path
-
     replace = Path.replace
 
     def dying(self, target):
@@ -198,14 +194,6 @@ def test_a_run_that_was_cut_off_is_repeated_like_a_new_one(foreign, sample, seg,
 def test_normals_of_the_sample_are_written(sample, seg, tmp_path):
     write_pointcept_scene(tmp_path, {**sample, "normal": -seg.normals}, seg)
     assert np.array_equal(np.load(tmp_path / "normal.npy"), -seg.normals)
-
-
-def test_many_instances_are_written_in_full(sample, seg, tmp_path):
-    many = {**sample, "instance": torch.arange(3000) * 20}
-    write_pointcept_scene(tmp_path, many, seg)
-    found = np.load(tmp_path / "instance.npy")
-    assert found.dtype == np.int32
-    assert found.max() == 2999 * 20
 
 
 def test_other_points_are_refused(foreign, sample, seg):
@@ -264,31 +252,3 @@ def test_a_folder_that_cannot_be_made_is_named(sample, seg, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FormatError, match="cannot be made"):
         write_pointcept_scene(tmp_path / "file" / "room", sample, seg)
-
-
-READ_BY_POINTCEPT = """
-import sys
-import real
-from pointcept.datasets.scannetpp import ScanNetPPDataset
-sample = ScanNetPPDataset(split="Area_1", data_root=sys.argv[1], transform=[])[0]
-print(sample["superpoint"].dtype, sample["superpoint"].shape, *sample["superpoint"].tolist())
-"""
-
-
-@pytest.mark.slow
-def test_the_real_loader_of_scannetpp_reads_superpoints(sample, seg, tmp_path):
-    pointcept = Path(__file__).parents[3] / "shared" / "pointcept"
-    if not pointcept.exists():
-        pytest.skip("needs the data pipeline of Pointcept")
-    parts = make_superpoints(sample["coord"], seg).labels
-    write_pointcept_scene(tmp_path / "Area_1" / "office_1", sample, seg, superpoint=parts)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", READ_BY_POINTCEPT, str(tmp_path)],
-        cwd=pointcept,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    dtype, shape, *labels = done.stdout.split()
-    assert (dtype, shape) == ("int32", "(3000,)")
-    assert [int(label) for label in labels] == parts.tolist()

@@ -1,6 +1,5 @@
-"""The data set lists rooms in natural order, keeps a cache, and leaves the release alone."""
+"""The data set lists rooms in natural order and leaves the release alone."""
 
-import os
 import pickle
 import warnings
 
@@ -10,7 +9,6 @@ import torch
 
 from tests.datasets.s3dis_tree import digest, rows_of, text_of, write_clean_room, write_objects
 from torchrg.datasets import S3DIS, read_room
-from torchrg.datasets import s3dis as s3dis_module
 from torchrg.errors import ConfigError, FormatError
 
 pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
@@ -31,7 +29,7 @@ def root(tmp_path):
 
 
 def test_rooms_are_in_natural_order_with_all_their_files(root):
-    data = S3DIS(root, (1, 3), cache=None)
+    data = S3DIS(root, (1, 3))
     names = [scene.name for scene in data.scenes]
     assert names == ["Area_1/office_2", "Area_1/office_10", "Area_1/WC_1", "Area_3/hallway_1"]
     assert len(data) == 4
@@ -41,7 +39,7 @@ def test_rooms_are_in_natural_order_with_all_their_files(root):
 
 
 def test_a_sample_is_the_room(root):
-    data = S3DIS(root, [3], cache=None)
+    data = S3DIS(root, [3])
     sample, room = data[0], read_room(root / "Area_3" / "hallway_1")
     assert list(sample) == ["coord", "color", "segment", "instance", "name"]
     assert sample["name"] == "Area_3/hallway_1"
@@ -53,90 +51,27 @@ def test_a_sample_is_the_room(root):
 
 
 def test_the_transform_is_called_with_the_sample(root):
-    data = S3DIS(root, [3], cache=None, transform=lambda sample: sample["name"])
+    data = S3DIS(root, [3], transform=lambda sample: sample["name"])
     assert data[0] == "Area_3/hallway_1"
 
 
 def test_data_sets_survive_pickling(root):
-    data = pickle.loads(pickle.dumps(S3DIS(root, [1], cache=None)))
+    data = pickle.loads(pickle.dumps(S3DIS(root, [1])))
     assert data[2]["name"] == "Area_1/WC_1"
 
 
-@pytest.mark.parametrize("class_order", ["pointcept", "spt"])
-def test_the_cache_gives_the_same_room_and_report(root, tmp_path, class_order):
+def test_notes_and_repairs_are_those_of_the_room(root):
     before = digest(root)
-    cached = S3DIS(root, (1, 3), cache=tmp_path / "cache", class_order=class_order)
-    plain = S3DIS(root, (1, 3), cache=None, class_order=class_order)
-    for _ in range(2):
-        for i in range(4):
-            first, second = cached.read_room(i), plain.read_room(i)
-            assert first.report == second.report
-            for a, b in zip(first[:4], second[:4], strict=True):
-                assert a.dtype == b.dtype
-                assert np.array_equal(a, b)
-    assert cached.read_room(3).report.repairs[0].before == b"1 2 3 4 5 \x16"
+    (repair,), (note,) = S3DIS(root, [3]).read_room(0)[4:]
+    assert repair == r"floor_1.txt: line 11, column 11: b'1 2 3 4 5 \x16' read as b'1 2 3 4 5 6'"
+    assert note == "x.md not read: not named CLASS_NUMBER.txt"
     assert digest(root) == before
-
-
-def test_the_text_is_read_once(root, tmp_path, monkeypatch):
-    S3DIS(root, [1], cache=tmp_path)[0]
-    monkeypatch.setattr(s3dis_module, "read_room", None)
-    S3DIS(root, [1], cache=tmp_path)[0]
-    with pytest.raises(TypeError):
-        S3DIS(root, [1], cache=tmp_path)[1]
-
-
-def test_a_changed_file_is_read_again(root, tmp_path):
-    data = S3DIS(root, [3], cache=tmp_path)
-    assert len(data[0]["coord"]) == 11
-    file = data.scenes[0].files[0]
-    content = file.read_bytes()
-    file.write_bytes(content + b"7 8 9 1 2 3\n")
-    assert data[0]["coord"][11].tolist() == [7, 8, 9]
-    # The same size, another time of change.
-    file.write_bytes(content + b"6 8 9 1 2 3\n")
-    os.utime(file, ns=(1, 1))
-    assert data[0]["coord"][11].tolist() == [6, 8, 9]
-
-
-def test_changing_a_sample_changes_no_cache(root, tmp_path):
-    data = S3DIS(root, [3], cache=tmp_path)
-    data[0]
-    before = data[0]["coord"].clone()
-    data[0]["coord"].zero_()
-    assert torch.equal(data[0]["coord"], before)
-
-
-@pytest.mark.parametrize("damage", [b"", b"\x93NUMPY\1\0", None])
-@pytest.mark.parametrize("name", ["coord.npy", "report.json"])
-def test_a_damaged_cache_is_made_again(root, tmp_path, name, damage):
-    data = S3DIS(root, [3], cache=tmp_path / "cache")
-    before = data[0]["coord"].clone()
-    (file,) = (tmp_path / "cache").rglob(name)
-    file.unlink() if damage is None else file.write_bytes(damage)
-    assert torch.equal(data[0]["coord"], before)
-    assert file.stat().st_size > 10
-    assert not list((tmp_path / "cache").rglob(".*"))
-
-
-def test_a_cut_array_is_never_mapped_beyond_its_end(root, tmp_path):
-    data = S3DIS(root, [3], cache=tmp_path)
-    before = data[0]["coord"].clone()
-    (file,) = tmp_path.rglob("coord.npy")
-    file.write_bytes(file.read_bytes()[:-12])
-    assert torch.equal(data[0]["coord"], before)
-
-
-def test_a_cache_that_cannot_be_written_is_named(root, tmp_path):
-    (tmp_path / "cache").touch()
-    with pytest.raises(FormatError, match=r"cannot be written: .*choose another folder with cache"):
-        S3DIS(root, [3], cache=tmp_path / "cache")[0]
 
 
 def test_a_room_folder_without_annotations_is_named_in_the_warning(root):
     (root / "Area_3" / "lobby_1").mkdir()
     with pytest.warns(UserWarning, match=r"expected 23 rooms, got 1 \(lobby_1: no Annotations\)"):
-        assert len(S3DIS(root, [3], cache=None)) == 1
+        assert len(S3DIS(root, [3])) == 1
 
 
 def test_a_complete_area_warns_of_nothing(tmp_path):
@@ -144,7 +79,7 @@ def test_a_complete_area_warns_of_nothing(tmp_path):
         write_objects(tmp_path / "Area_3" / f"office_{i}", {"wall_1.txt": b"1 2 3 4 5 6\n"})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(S3DIS(tmp_path, [3], cache=None)) == 23
+        assert len(S3DIS(tmp_path, [3])) == 23
 
 
 def test_missing_areas_are_errors_with_the_repair(root):
@@ -159,7 +94,7 @@ def test_missing_areas_are_errors_with_the_repair(root):
 def test_a_room_without_objects_fails_when_it_is_read_and_not_before(root):
     (root / "Area_1" / "office_0" / "Annotations").mkdir(parents=True)
     with pytest.warns(UserWarning, match="rooms"):
-        data = S3DIS(root, [1], cache=None)
+        data = S3DIS(root, [1])
     names = [scene.name for scene in data.scenes]
     assert "Area_1/office_0" in names
     with pytest.raises(FormatError, match="expected objects"):

@@ -12,7 +12,6 @@ from torchrg.config import (
     PipelineConfig,
     SuperpointsConfig,
     load_config,
-    preset_names,
 )
 from torchrg.errors import ConfigError
 from torchrg.neighbors import search_knn
@@ -35,13 +34,6 @@ def test_segment_planes_is_the_function(coord):
     assert torch.equal(sample["normal"], seg.normals)
     assert torch.equal(sample["curvature"], seg.curvature)
     assert sample["name"] == "room"
-
-
-def test_two_steps_give_what_one_gives(coord):
-    config = load_config("classic")
-    steps = torch.nn.Sequential(EstimateNormals(config.normals), GrowRegions(config.growing))
-    whole = SegmentPlanes(config)({"coord": coord})
-    assert torch.equal(steps({"coord": coord})["plane"], whole["plane"])
 
 
 def test_the_given_sample_is_not_changed(coord):
@@ -91,11 +83,6 @@ def test_an_unknown_key_is_refused():
         SegmentPlanes("classic", keys={"points": "pos"})
 
 
-def test_settings_are_shown():
-    assert "max_angle_deg=7.0" in repr(GrowRegions(max_angle_deg=7.0))
-    assert "method='pca'" in repr(EstimateNormals(method="pca"))
-
-
 def test_normals_then_regions_with_the_residual_are_the_whole_method():
     config = load_config("consensus")
     sample = {"coord": make_room(4000, 0.003, 5).points}
@@ -120,17 +107,7 @@ def test_who_says_nothing_gets_the_same_everywhere():
     assert load_config() == PipelineConfig() == PipelineConfig(NormalsConfig(), GrowingConfig())
 
 
-QUICK_PRESETS = ("consensus", "paper", "s3dis")
-"""One of each kind of settings; the others are ``slow``."""
-
-
-@pytest.mark.parametrize(
-    "preset",
-    [
-        pytest.param(name, marks=[] if name in QUICK_PRESETS else [pytest.mark.slow])
-        for name in preset_names()
-    ],
-)
+@pytest.mark.parametrize("preset", ["consensus", "paper", "s3dis"])
 def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
     points, config = make_room(800, 0.003, 5).points, load_config(preset)
     seg = segment_planes(points, config)
@@ -182,6 +159,7 @@ def test_settings_are_shown_on_lines_that_can_be_read():
         lines = repr(module).splitlines()
         assert all(len(line) <= 100 for line in lines)
         assert len(lines) > 1
+    assert "max_angle_deg=7.0" in repr(GrowRegions(max_angle_deg=7.0))
     assert "method='consensus', k=50" in repr(SegmentPlanes())
     assert repr(GrowRegions(k=9)).splitlines()[1].strip() == "k=9,"
 

@@ -5,10 +5,8 @@ What a point's label must be is looked up by its coordinates in a table of the w
 
 import importlib
 import random
-import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +14,6 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from tests.datasets.s3dis_tree import text_of, write_objects
 from torchrg.config import load_config
 from torchrg.datasets import write_pointcept_scene
 from torchrg.errors import MissingDependencyError
@@ -278,26 +275,3 @@ def test_a_pointcept_without_the_function_is_named(datasets, monkeypatch):
         importlib.reload(sys.modules[OURS])
     monkeypatch.undo()
     importlib.reload(sys.modules[OURS])
-
-
-@pytest.mark.slow
-def test_workers_that_are_spawned_know_our_files(pointcept_folder, root):
-    script = Path(__file__).with_name("pointcept_spawn.py")
-    command = [sys.executable, str(script), str(pointcept_folder), str(root)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout.splitlines()[-2:] == ["made in step", "read in step"], done.stderr
-
-
-@pytest.mark.slow
-def test_the_trial_script_passes_for_what_convert_wrote(pointcept_folder, tmp_path):
-    """As ``python shared/pointcept/try_it.py OUT`` says it."""
-    pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
-    for seed in (0, 1):
-        points = make_room(15_000, 0.003, seed).points.numpy()
-        rows = [(*point, 1, 2, 3) for point in points]
-        write_objects(tmp_path / "S3DIS" / "Area_1" / f"hall_{seed}", {"wall_1.txt": text_of(rows)})
-    ours = [sys.executable, "-m", "torchrg", "convert", "s3dis", str(tmp_path / "S3DIS")]
-    subprocess.run([*ours, str(tmp_path / "OUT"), "--workers", "1"], check=True)
-    trial = [sys.executable, str(pointcept_folder / "try_it.py"), str(tmp_path / "OUT")]
-    done = subprocess.run(trial, capture_output=True, text=True, check=False)
-    assert done.stdout.splitlines()[-1] == "failed: []", done.stdout

@@ -129,22 +129,6 @@ def test_edges_are_refused_by_who_takes_points_out(pyg, data):
     assert SegmentPlanes("classic")(data[0]).edge_index.shape == (2, 2)
 
 
-def test_samples_of_superpoint_transformer_stay_what_they_are(pyg, clouds):
-    """Its ``Data`` is PyG's with more, and its configs build a transform by name and ``params``."""
-
-    class Data(pyg.data.Data):
-        pass
-
-    points = clouds[0]
-    more = {"grid_size": torch.tensor([0.03]), "node_id": torch.arange(len(points))}
-    sample = Data(pos=points, is_val=torch.ones(len(points), dtype=torch.bool), **more)
-    steps = pyg.transforms.Compose([SegmentPlanes(config="classic")])
-    found = steps(sample)
-    assert type(found) is Data
-    assert set(found.keys()) == {*sample.keys(), "plane", "normal", "curvature"}
-    assert found.plane.shape == found.node_id.shape
-
-
 def test_a_stored_data_set_and_its_loader_keep_clouds_in_step(pyg, data, clouds, tmp_path):
     class Stored(pyg.data.InMemoryDataset):
         def __init__(self, root, **transforms):

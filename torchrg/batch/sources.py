@@ -270,7 +270,7 @@ class S3DISSource(CloudSource):
                 "has the order pointcept; leave it out."
             )
         require("pyarrow", extra="s3dis", purpose="read S3DIS")
-        rooms = S3DIS(self.root, self.areas, class_order=self.class_order, cache=None)
+        rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
         return self.checked(
             [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
         )
@@ -278,17 +278,9 @@ class S3DISSource(CloudSource):
     def read(self, scan: Scan) -> Reading:
         """Read a room."""
         room = read_room(self.root / scan.name, class_order=self.class_order)
-        notes = (
-            *(f"{item.file.name} not read: {item.reason}" for item in room.report.skipped),
-            *(f"{file.name} taken as clutter" for file in room.report.as_clutter),
-        )
-        repairs = tuple(
-            f"{r.file.name}: line {r.line}, column {r.column}: {r.before!r} read as {r.after!r}"
-            for r in room.report.repairs
-        )
         arrays = {name: getattr(room, name) for name in ("coord", "color", "segment", "instance")}
         cloud = Cloud(room.coord, {"color": room.color}, source=scan.name)
-        return Reading(cloud, arrays, self.dataset, repairs=repairs, notes=notes)
+        return Reading(cloud, arrays, self.dataset, repairs=room.repairs, notes=room.notes)
 
 
 @dataclass(frozen=True)

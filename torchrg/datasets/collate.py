@@ -1,8 +1,7 @@
 """Ragged batches: clouds one after the other, and where each ends."""
 
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,12 +10,13 @@ from torch.utils.data import default_collate
 
 from torchrg._checks import as_tensor
 from torchrg.errors import ShapeError
-from torchrg.transforms.rows import LISTED, listed_keys
+from torchrg.transforms.rows import LISTED, Entries, SampleDict, listed_keys
+from torchrg.transforms.sample import NeighborSearch
 
 
 def collate_offset(
-    samples: Sequence[Mapping[str, Any]], *, coord: str = "coord", inverse: str = "inverse"
-) -> dict[str, Any]:
+    samples: Sequence[Entries], *, coord: str = "coord", inverse: str = "inverse"
+) -> SampleDict:
     """Join samples as Pointcept does: arrays end to end, ``offset`` the row each cloud ends before.
 
     Convention:
@@ -25,7 +25,8 @@ def collate_offset(
 
     Args:
         samples: Samples with the same keys. Tensors and arrays are joined along their first axis,
-            scalars stacked, everything else becomes a list.
+            scalars stacked, everything else becomes a list. Neighbours that transforms search for
+            each other are left out.
         coord: Key that says how many points a sample has.
         inverse: Key of the numbers of points, as of :class:`torchrg.transforms.SampleVoxels`, that
             shall name rows of the batch.
@@ -43,6 +44,7 @@ def collate_offset(
         >>> batch["coord"].shape, batch["offset"]
         (torch.Size([5, 3]), tensor([2, 5]))
     """
+    samples = [{k: v for k, v in s.items() if not isinstance(v, NeighborSearch)} for s in samples]
     keys = list(samples[0]) if samples else []
     for i, sample in enumerate(samples):
         if set(sample) != set(keys):
@@ -73,17 +75,17 @@ def collate_offset(
     return {**batch, "offset": torch.cat(counts).cumsum(0)}
 
 
-def _shifted(rows: Any, start: int) -> Tensor:  # noqa: ANN401
+def _shifted(rows: object, start: int) -> Tensor:
     """Return numbers of points in a sample as those in a batch, where it begins at ``start``."""
     tensor = as_tensor("collate_offset", "inverse", rows)
     return torch.where(tensor >= 0, tensor + start, tensor)
 
 
-def _join(key: str, values: list[Any]) -> Any:  # noqa: ANN401
+def _join(key: str, values: Sequence[object]) -> object:
     """Join the values of one key."""
     first = values[0]
     if isinstance(first, Tensor | np.ndarray) and first.ndim > 0:
         return torch.cat([as_tensor("collate_offset", key, value) for value in values])
     if isinstance(first, Tensor | np.ndarray | int | float):
-        return default_collate(values)
+        return default_collate(list(values))
     return list(values)

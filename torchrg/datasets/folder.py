@@ -4,9 +4,9 @@ import os
 import re
 import unicodedata
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch.utils.data import Dataset
@@ -16,7 +16,10 @@ from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, takes_columns
+from torchrg.transforms.rows import Sample, SampleDict
 
+Transform = Callable[[SampleDict], Sample]
+"""What data sets call with each sample."""
 _NUMBERED = {"instance", "plane", "superpoint"}
 """Arrays whose numbers begin again in each scene."""
 _FIELD_KEYS = {"normals": "normal"}
@@ -38,23 +41,23 @@ class SceneFiles(NamedTuple):
     files: tuple[Path, ...]
 
 
-class SceneDataset(Dataset[Any]):
+class SceneDataset(Dataset[Sample]):
     """A map-style data set whose items are known before they are read.
 
     A data set sets :attr:`scenes` and :attr:`transform`, and says how to read a sample.
     """
 
     scenes: list[SceneFiles]
-    transform: Callable[[dict[str, Any]], Any] | None
+    transform: Transform | None
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a scene."""
         raise NotImplementedError
 
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401
+    def __getitem__(self, index: int) -> Sample:
         """Return a sample, transformed."""
         sample = self.read_sample(index)
         return sample if self.transform is None else self.transform(sample)
@@ -93,7 +96,7 @@ class FolderOfClouds(SceneDataset):
         *,
         suffixes: Sequence[str] = tuple(FORMATS),
         columns: Sequence[str] | None = None,
-        transform: Callable[[Mapping[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> None:
         self.root = Path(root)
         self.transform = transform
@@ -123,7 +126,7 @@ class FolderOfClouds(SceneDataset):
         inside = path.relative_to(self.root)
         return (inside if path.is_dir() else inside.with_suffix("")).as_posix()
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a cloud."""
         name, path, _ = self.scenes[index]
         if path.is_dir():
@@ -138,7 +141,7 @@ class FolderOfClouds(SceneDataset):
         return {**fields, "coord": cloud.points, "origin": origin, "name": name}
 
 
-def read_pointcept_area(folder: str | os.PathLike[str]) -> dict[str, Any]:
+def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     """Read all scenes of a folder in Pointcept's layout as one cloud: an area of S3DIS, a split.
 
     Loaders that take whole areas read this; see :mod:`torchrg.datasets`.
@@ -159,7 +162,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> dict[str, Any]:
     paths = [path for path in files_below(Path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
         raise FormatError(f"{folder}: expected folders with coord.npy, got none.")
-    scenes: list[dict[str, Any]] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
+    scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
     for key in _NUMBERED & set(scenes[0]):
         first = 0
         for labels in (scene[key] for scene in scenes if key in scene):

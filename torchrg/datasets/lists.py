@@ -14,14 +14,15 @@ import numpy as np
 
 from torchrg.datasets.folder import natural_key
 from torchrg.datasets.layouts import MODES
-from torchrg.datasets.rooms import CLASS_ORDERS
-from torchrg.datasets.s3dis import ROOMS_PER_AREA
+from torchrg.datasets.s3dis import CLASS_ORDERS, ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import make_folder, marked_parts, refusing, remove_leftovers
 
-Entries = Mapping[str, Sequence[dict[str, Any]]]
+Entry = dict[str, Any]
+"""What a scan leaves for a list."""
+Entries = Mapping[str, Sequence[Entry]]
 """Entries of the scans of a list, by the folder that they are in."""
 
 
@@ -99,7 +100,7 @@ def _write(out: Path, name: str | Path, text: str) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def _read_entries(out: Path, folder: str) -> list[dict[str, Any]]:
+def _read_entries(out: Path, folder: str) -> list[Entry]:
     """Return the entries of a list, with files by their whole paths."""
     paths = sorted((out / folder).glob("[!.]*.json"), key=lambda path: natural_key(path.stem))
     entries = []
@@ -116,7 +117,7 @@ _FILES = {"filepath", "instance_gt_filepath"}
 """Parts of an entry that are files."""
 
 
-def _mask3d(entries: Entries) -> dict[str, Any]:
+def _mask3d(entries: Entries) -> dict[str, object]:
     """Databases of the splits of ScanNet, its classes, and the colours that are subtracted."""
     train, validation, test = (entries[f"{mode}_database"] for mode in MODES.values())
     labels = zip(NYU_IDS, CLASSES, strict=True)
@@ -128,9 +129,9 @@ def _mask3d(entries: Entries) -> dict[str, Any]:
     }
 
 
-def _mask3d_s3dis(entries: Entries) -> dict[str, Any]:
+def _mask3d_s3dis(entries: Entries) -> dict[str, object]:
     """Databases of the areas of S3DIS and, for each, of all others, which are trained on."""
-    contents: dict[str, Any] = {f"{folder}.yaml": [*found] for folder, found in entries.items()}
+    contents: dict[str, object] = {f"{folder}.yaml": [*found] for folder, found in entries.items()}
     for folder, own in entries.items():
         others = [entry for name, found in entries.items() if name != folder for entry in found]
         contents[f"train_{folder}.yaml"] = others
@@ -141,7 +142,7 @@ def _mask3d_s3dis(entries: Entries) -> dict[str, Any]:
     return contents
 
 
-def _color_mean_std(entries: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+def _color_mean_std(entries: Sequence[Entry]) -> dict[str, list[float]]:
     """Return mean and deviation of the colours of scans; entries have the mean of squares."""
     if not entries:
         return {"mean": [0.0] * 3, "std": [1.0] * 3}
@@ -153,7 +154,7 @@ def _color_mean_std(entries: Sequence[Mapping[str, Any]]) -> dict[str, list[floa
     return {"mean": mean.tolist(), "std": np.where(deviation > 0, deviation, 1.0).tolist()}
 
 
-_NONE: tuple[Sequence[str], Callable[[Entries], dict[str, Any]]] = ((), lambda entries: {})
+_NONE: tuple[Sequence[str], Callable[[Entries], dict[str, object]]] = ((), lambda entries: {})
 _DATABASES = {
     ("mask3d", "ScanNet"): ([f"{mode}_database" for mode in MODES.values()], _mask3d),
     ("mask3d", "S3DIS"): ([f"Area_{area}_database" for area in ROOMS_PER_AREA], _mask3d_s3dis),

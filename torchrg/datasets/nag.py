@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import MissingDependencyError, ShapeError
-from torchrg.structures import Superpoints
+from torchrg.structures import Array, Superpoints
 
 
 class Cluster(NamedTuple):
@@ -31,8 +31,8 @@ def make_nag(
     superpoints: Superpoints,
     *,
     data: Callable[..., Any] | None = None,
-    cluster: Callable[[Tensor, Tensor], Any] = Cluster,
-    **values: Tensor | NDArray[Any],
+    cluster: Callable[[Tensor, Tensor], object] = Cluster,
+    **values: Tensor | Array,
 ) -> list[Any]:
     """Return the levels of superpoints, the points first, as Superpoint Transformer nests them [1].
 

@@ -13,7 +13,6 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -26,7 +25,7 @@ from torchrg.io import atomic_path
 from torchrg.io.files import DAMAGES, make_folder
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, describe_planes
-from torchrg.structures import Segmentation
+from torchrg.structures import Array, Segmentation
 
 POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "segment20", "segment200", "instance",
@@ -70,7 +69,7 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 def write_pointcept_scene(
     folder: str | os.PathLike[str],
-    sample: Mapping[str, Any],
+    sample: Mapping[str, object],
     segmentation: Segmentation,
     *,
     superpoint: Tensor | NDArray[np.integer] | None = None,
@@ -116,14 +115,14 @@ def write_pointcept_scene(
 
 
 def write_arrays(
-    place: Path, arrays: Mapping[str, NDArray[Any]], planes: Mapping[str, Any]
+    place: Path, arrays: Mapping[str, Array], planes: Mapping[str, object]
 ) -> list[str]:
     """Write arrays by name as ``.npy`` and the table of planes; see :func:`write_files`."""
     return write_files(place, {f"{name}.npy": values for name, values in arrays.items()}, planes)
 
 
 def write_files(
-    place: Path, contents: Mapping[str, NDArray[Any] | bytes], planes: Mapping[str, Any]
+    place: Path, contents: Mapping[str, Array | bytes], planes: Mapping[str, object]
 ) -> list[str]:
     """Write files and the table of planes of a scene, beside what others have there.
 
@@ -173,19 +172,19 @@ def write_files(
 
 def _arrays_of(
     place: Path,
-    sample: Mapping[str, Any],
+    sample: Mapping[str, object],
     segmentation: Segmentation,
     *,
     superpoint: Tensor | NDArray[np.integer] | None,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Array]:
     """Return the arrays of a scene in Pointcept's types."""
-    found: dict[str, Any] = {"normal": segmentation.normals}
+    found: dict[str, object] = {"normal": segmentation.normals}
     found |= {name: sample[name] for name in GIVEN_ARRAYS if name in sample}
     found |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
     if superpoint is not None:
         found["superpoint"] = superpoint
     dtypes = {"color": np.uint8, "plane": np.int32, "superpoint": np.int32}
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, Array] = {}
     for name in (name for name in POINT_ARRAYS if name in found):
         values = as_tensor("write_pointcept_scene", name, found[name]).detach().cpu().numpy()
         check_rows(place / f"{name}.npy", values, segmentation.labels.shape)
@@ -200,7 +199,7 @@ def _arrays_of(
     return arrays
 
 
-def _short(labels: NDArray[Any]) -> NDArray[Any]:
+def _short(labels: Array) -> Array:
     """Return labels as int16, or as int32 where they do not fit."""
     limits = np.iinfo(np.int16)
     fit = labels.size == 0 or (labels.min() >= limits.min and labels.max() <= limits.max)
@@ -227,7 +226,7 @@ def _written(place: Path) -> list[str]:
         ) from error
 
 
-def _check_kept(place: Path, arrays: Mapping[str, NDArray[Any]], kept: set[str]) -> None:
+def _check_kept(place: Path, arrays: Mapping[str, Array], kept: set[str]) -> None:
     """Check that what stays in a folder belongs to the points that are written."""
     for name in sorted(kept):
         path = place / f"{name}.npy"

@@ -1,14 +1,14 @@
 """Depth frames with their cameras, poses and colours, and the folder shapes they are found in.
 
-A new shape is a function here that finds the frames of a folder, a row of :data:`LAYOUTS`, its name
+A new shape is a function here that lists the frames of a folder, a row of :data:`LAYOUTS`, its name
 among the choices of ``torchrg convert rgbd``, and a test.
 """
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from torchrg._checks import check_shapes
 from torchrg.datasets.folder import (
     SceneDataset,
     SceneFiles,
+    Transform,
     check_folder,
     files_below,
     listed,
@@ -34,12 +35,9 @@ from torchrg.datasets.rgbd_files import (
 )
 from torchrg.depth.camera import check_camera, make_intrinsics
 from torchrg.errors import ConfigError, FormatError
+from torchrg.transforms.rows import SampleDict
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
-_MILLIMETERS = 1000.0
-"""Stored value of one metre in ScanNet and 7-Scenes."""
-_TUM_SCALE = 5000.0
-"""Stored value of one metre in TUM and ICL-NUIM."""
 _TUM_INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
@@ -49,8 +47,6 @@ _TUM_INTRINSICS = {
 _ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
 """The scenes were rendered with y upwards: rows count against it."""
 _SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
-_SEVEN_SCENES_NO_DEPTH = 65535
-"""Stored value of a pixel without depth in 7-Scenes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +134,7 @@ class RGBDFrames(SceneDataset):
         self,
         frames: Sequence[RGBDFrame],
         *,
-        transform: Callable[[dict[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> None:
         self.frames = tuple(frames)
         self.transform = transform
@@ -160,7 +156,7 @@ class RGBDFrames(SceneDataset):
         *,
         intrinsics: Tensor | None = None,
         depth_scale: float | None = None,
-        transform: Callable[[dict[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> "RGBDFrames":
         """Find the frames of a folder.
 
@@ -182,10 +178,10 @@ class RGBDFrames(SceneDataset):
         if layout not in LAYOUTS:
             names = ", ".join(sorted(LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = LAYOUTS[layout](Path(root), intrinsics, depth_scale)
+        frames = [*_find(Path(root), LAYOUTS[layout], intrinsics, depth_scale)]
         return cls(frames, transform=transform)
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a frame.
 
         Raises:
@@ -193,7 +189,7 @@ class RGBDFrames(SceneDataset):
         """
         frame = self.frames[index]
         depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
-        sample: dict[str, Any] = {
+        sample: SampleDict = {
             "depth": depth[None],
             "intrinsics": frame.intrinsics.to(torch.float64),
             "name": frame.name,
@@ -205,15 +201,57 @@ class RGBDFrames(SceneDataset):
         return sample
 
 
-Finder = Callable[[Path, Tensor | None, float | None], list[RGBDFrame]]
-"""Finds the frames of a folder, of one recording or of several beside each other, in natural order.
+class ListedFrame(NamedTuple):
+    """A frame as a folder lists it; the fields are those of :class:`RGBDFrame`."""
 
-Intrinsics and scale that are not given are those of the layout. Raises ConfigError if it has none,
-FormatError if there is no frame, or a file that says where they are is damaged."""
+    name: str
+    depth: Path
+    color: Path | None = None
+    pose: Tensor | None = None
+    sources: tuple[Path, ...] = ()
 
 
-def _find_tum(root: Path, intrinsics: Tensor | None, depth_scale: float | None) -> list[RGBDFrame]:
-    """Find the frames of TUM RGB-D [1]: folders with ``depth.txt``, the camera in their names.
+Camera = Callable[[Path], tuple[Tensor, tuple[Path, ...]]]
+"""Returns the camera matrix of a recording, and the files that it was read from."""
+
+
+class FrameLayout(NamedTuple):
+    """The shape of a folder of frames.
+
+    Attributes:
+        frames: Yields the frames of a recording in natural order.
+        mark: Pattern of the name of an entry of every recording; nothing where a folder is one.
+        camera: The camera of a recording, None where it is not known.
+        depth_scale: Stored value of one metre, None where it is not known.
+        no_depth: As of :class:`RGBDFrame`.
+    """
+
+    frames: Callable[[Path], Iterable[ListedFrame]]
+    mark: str = ""
+    camera: Camera | None = None
+    depth_scale: float | None = None
+    no_depth: int | None = None
+
+
+def _find(
+    root: Path, layout: FrameLayout, intrinsics: Tensor | None, depth_scale: float | None
+) -> Iterator[RGBDFrame]:
+    """Yield the frames of a folder, of one recording or of several beside each other."""
+    scale = layout.depth_scale if depth_scale is None else depth_scale
+    camera = layout.camera if intrinsics is None else lambda folder: (intrinsics, ())
+    if scale is None or camera is None:
+        missing = "intrinsics" if camera is None else "depth_scale"
+        raise ConfigError(f"{root}: expected {missing}, which depth images do not hold; pass it.")
+    for prefix, folder in _recordings(root, layout.mark) if layout.mark else [("", root)]:
+        matrix, files = camera(folder)
+        for name, depth, color, pose, sources in layout.frames(folder):
+            yield RGBDFrame(
+                depth, matrix, scale, prefix + name, color, pose, layout.no_depth, files + sources
+            )
+
+
+def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of TUM RGB-D [1], which are listed in ``depth.txt``.
 
     Colour (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are those nearest in time,
     within 0.02 seconds; without one, the frame has none.
@@ -221,44 +259,30 @@ def _find_tum(root: Path, intrinsics: Tensor | None, depth_scale: float | None) 
     References:
         [1] J. Sturm et al. A benchmark for the evaluation of RGB-D SLAM systems. IROS, 2012.
     """
-    frames = []
-    for name, folder in _recordings(root, "depth.txt"):
-        camera = _tum_camera(folder) if intrinsics is None else intrinsics
-        times, images = read_timed(folder / "depth.txt")
-        lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
-        colors = read_nearest(times, lists[1], read_timed)
-        poses = read_nearest(times, lists[2], read_trajectory)
-        frames += [
-            RGBDFrame(
-                folder / image,
-                camera,
-                _TUM_SCALE if depth_scale is None else depth_scale,
-                f"{name}/{Path(image).stem}",
-                None if color is None else folder / color,
-                pose,
-                sources=tuple(path for path in lists if path.is_file()),
-            )
-            for image, color, pose in zip(images, colors, poses, strict=True)
-        ]
-    return frames
+    lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
+    times, images = read_timed(lists[0])
+    colors = read_nearest(times, lists[1], read_timed)
+    poses = read_nearest(times, lists[2], read_trajectory)
+    sources = tuple(path for path in lists if path.is_file())
+    for image, color, pose in zip(images, colors, poses, strict=True):
+        beside = None if color is None else folder / color
+        yield ListedFrame(Path(image).stem, folder / image, beside, pose, sources)
 
 
-def _tum_camera(folder: Path) -> Tensor:
+def _tum_camera(folder: Path) -> tuple[Tensor, tuple[Path, ...]]:
     """Return the camera matrix of a recording by its name."""
     name = folder.resolve().name.lower()
     for camera, values in _TUM_INTRINSICS.items():
         if camera in name:
-            return make_intrinsics(*values)
+            return make_intrinsics(*values), ()
     raise ConfigError(
         f"{folder}: expected intrinsics, as the name says none of {', '.join(_TUM_INTRINSICS)}; "
         "pass them."
     )
 
 
-def _find_icl_nuim(
-    root: Path, intrinsics: Tensor | None, depth_scale: float | None
-) -> list[RGBDFrame]:
-    """Find the frames of ICL-NUIM [1] in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
+def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of ICL-NUIM [1] in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
 
     There is perhaps one trajectory ``*.gt.freiburg``, whose first column is the number of the
     image.
@@ -267,120 +291,83 @@ def _find_icl_nuim(
         [1] A. Handa et al. A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM. ICRA,
         2014.
     """
-    camera = make_intrinsics(*_ICL_NUIM_INTRINSICS) if intrinsics is None else intrinsics
-    frames = []
-    for name, folder in _recordings(root, "depth"):
-        poses: dict[str, Tensor | None] = {}
-        tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
-        if tracks:
-            numbers, matrices = read_trajectory(tracks[0])
-            poses = {f"{n:.0f}": pose for n, pose in zip(numbers, matrices, strict=True)}
-        frames += [
-            RGBDFrame(
-                image,
-                camera,
-                _TUM_SCALE if depth_scale is None else depth_scale,
-                f"{name}/{image.stem}",
-                _image_beside(folder / "rgb", image.stem),
-                poses.get(image.stem),
-                sources=tracks,
-            )
-            for image in _numbered_images(folder / "depth")
-        ]
-    return frames
+    tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
+    numbers, matrices = read_trajectory(tracks[0]) if tracks else ([], [])
+    poses = {f"{number:.0f}": pose for number, pose in zip(numbers, matrices, strict=True)}
+    for image in _numbered_images(folder / "depth"):
+        color = _image_beside(folder / "rgb", image.stem)
+        yield ListedFrame(image.stem, image, color, poses.get(image.stem), tracks)
 
 
-def _find_scannet(
-    root: Path, intrinsics: Tensor | None, depth_scale: float | None
-) -> list[RGBDFrame]:
-    """Find the frames of ScanNet [1], as its reader exports it: ``depth/0.png``, ``color/0.jpg``.
+def _same_camera(*values: float) -> Camera:
+    """Return what gives every recording the same fx, fy, cx, cy."""
+    return lambda folder: (make_intrinsics(*values), ())
+
+
+def _scannet_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of ScanNet [1], as its reader exports it: ``depth/0.png``, ``color/0.jpg``.
 
     Poses are in ``pose/0.txt``, ..., intrinsics in ``intrinsic/intrinsic_depth.txt``.
 
     References:
         [1] A. Dai et al. ScanNet: richly-annotated 3D reconstructions of indoor scenes. CVPR, 2017.
     """
-    frames = []
-    for name, folder in _recordings(root, "depth"):
-        calibration = folder / "intrinsic" / "intrinsic_depth.txt"
-        camera = read_matrix(calibration)[:3, :3] if intrinsics is None else intrinsics
-        check_camera(f"{calibration if intrinsics is None else root}", camera)
-        frames += [
-            _posed_frame(
-                image,
-                camera,
-                depth_scale,
-                f"{name}/{image.stem}",
-                _image_beside(folder / "color", image.stem),
-                folder / "pose" / f"{image.stem}.txt",
-                sources=(calibration,) if intrinsics is None else (),
-            )
-            for image in _numbered_images(folder / "depth")
-        ]
-    return frames
+    for image in _numbered_images(folder / "depth"):
+        color = _image_beside(folder / "color", image.stem)
+        pose = _read_pose(folder / "pose" / f"{image.stem}.txt")
+        yield ListedFrame(image.stem, image, color, *pose)
 
 
-def _find_seven_scenes(
-    root: Path, intrinsics: Tensor | None, depth_scale: float | None
-) -> list[RGBDFrame]:
-    """Find the frames of 7-Scenes [1]: ``frame-000000.depth.png``, ``.color.png``, ``.pose.txt``.
+def _scannet_camera(folder: Path) -> tuple[Tensor, tuple[Path, ...]]:
+    """Return the camera matrix of a scan."""
+    calibration = folder / "intrinsic" / "intrinsic_depth.txt"
+    camera = read_matrix(calibration)[:3, :3]
+    check_camera(str(calibration), camera)
+    return camera, (calibration,)
 
-    The stored value 65535 means no depth.
+
+def _seven_scenes_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of 7-Scenes [1]: ``frame-000000.depth.png``, ``.color.png``, ``.pose.txt``.
 
     References:
         [1] J. Shotton et al. Scene coordinate regression forests for camera relocalization in RGB-D
         images. CVPR, 2013.
     """
-    camera = make_intrinsics(*_SEVEN_SCENES_INTRINSICS) if intrinsics is None else intrinsics
-    ending = ".depth.png"
-    return [
-        _posed_frame(
-            image,
-            camera,
-            depth_scale,
-            f"{name}/{stem}",
-            _image_beside(folder, f"{stem}.color"),
-            folder / f"{stem}.pose.txt",
-            no_depth=_SEVEN_SCENES_NO_DEPTH,
-        )
-        for name, folder in _recordings(root, f"frame-*{ending}")
-        for image in listed(folder)
-        if (stem := image.name.removesuffix(ending)) != image.name
-    ]
+    for image in listed(folder):
+        name = image.name.removesuffix(".depth.png")
+        if name != image.name:
+            pose = _read_pose(folder / f"{name}.pose.txt")
+            yield ListedFrame(name, image, _image_beside(folder, f"{name}.color"), *pose)
 
 
-def _find_images(
-    root: Path, intrinsics: Tensor | None, depth_scale: float | None
-) -> list[RGBDFrame]:
-    """Find all depth images below a folder, by one camera, without colours and poses.
-
-    They do not tell intrinsics and scale, and nothing is guessed.
-    """
-    if intrinsics is None or depth_scale is None:
-        missing = "intrinsics" if intrinsics is None else "depth_scale"
-        raise ConfigError(f"{root}: expected {missing}, which depth images do not hold; pass it.")
-    images = [path for path in files_below(root) if path.suffix.lower() in DEPTH_SUFFIXES]
+def _all_images(folder: Path) -> Iterator[ListedFrame]:
+    """Yield all depth images below a folder, by one camera, without colours and poses."""
+    images = [path for path in files_below(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
     if not images:
-        raise FormatError(f"{root}: expected depth images ({' '.join(DEPTH_SUFFIXES)}), got none.")
-    names = [image.relative_to(root).with_suffix("").as_posix() for image in images]
-    return [
-        RGBDFrame(image, intrinsics, depth_scale, name)
-        for image, name in zip(images, names, strict=True)
-    ]
+        known = " ".join(DEPTH_SUFFIXES)
+        raise FormatError(f"{folder}: expected depth images ({known}), got none.")
+    for image in images:
+        yield ListedFrame(image.relative_to(folder).with_suffix("").as_posix(), image)
 
 
-LAYOUTS: dict[str, Finder] = {
-    "tum": _find_tum,
-    "icl-nuim": _find_icl_nuim,
-    "scannet": _find_scannet,
-    "7-scenes": _find_seven_scenes,
-    "images": _find_images,
+LAYOUTS = {
+    "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
+    "icl-nuim": FrameLayout(_icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0),
+    "scannet": FrameLayout(_scannet_frames, "depth", _scannet_camera, 1000.0),
+    "7-scenes": FrameLayout(
+        _seven_scenes_frames,
+        "frame-*.depth.png",
+        _same_camera(*_SEVEN_SCENES_INTRINSICS),
+        1000.0,
+        no_depth=65535,
+    ),
+    "images": FrameLayout(_all_images),
 }
-"""What finds the frames of a folder, by the name of its shape."""
+"""Shapes of folders of frames by their names."""
 
 
 def _recordings(root: Path, mark: str) -> Iterator[tuple[str, Path]]:
-    """Yield name and folder of the recordings in a folder, which may be one itself.
+    """Yield the recordings in a folder, which may be one itself, with the folder of their names.
 
     Every recording has an entry in it whose name fits the pattern ``mark``. One that is there under
     several names has the one without links, or else the one that comes first.
@@ -396,7 +383,8 @@ def _recordings(root: Path, mark: str) -> Iterator[tuple[str, Path]]:
     if not found:
         raise FormatError(f"{root}: expected recordings with {mark} in them, got none.")
     for folder in found:
-        yield (folder.resolve() if folder == root else folder).name, folder
+        name = (folder.resolve() if folder == root else folder).name
+        yield f"{name}/", folder
 
 
 def _numbered_images(folder: Path) -> list[Path]:
@@ -410,19 +398,6 @@ def _image_beside(folder: Path, stem: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _posed_frame(
-    image: Path,
-    camera: Tensor,
-    depth_scale: float | None,
-    name: str,
-    color: Path | None,
-    track: Path,
-    *,
-    no_depth: int | None = None,
-    sources: tuple[Path, ...] = (),
-) -> RGBDFrame:
-    """Return a frame whose pose is in a file of its own, if that is there and it is known."""
-    pose = known_pose(read_matrix(track)) if track.is_file() else None
-    sources = (*sources, track) if track.is_file() else sources
-    scale = _MILLIMETERS if depth_scale is None else depth_scale
-    return RGBDFrame(image, camera, scale, name, color, pose, no_depth, sources)
+def _read_pose(path: Path) -> tuple[Tensor | None, tuple[Path, ...]]:
+    """Return the pose in a file, None if it is not known, and the file if it is there."""
+    return (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())

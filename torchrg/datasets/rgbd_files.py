@@ -6,7 +6,7 @@ import struct
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import DAMAGES, check_file, read_text, refusing
-from torchrg.structures import FARTHEST
+from torchrg.structures import FARTHEST, Array
 
+Value = TypeVar("Value")
 DEPTH_SUFFIXES = (".png", ".npy")
 """Suffixes of depth images."""
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
@@ -88,7 +89,7 @@ def _read_png16(source: Path) -> NDArray[np.uint16]:
     return values
 
 
-def _read_image(source: Path, kinds: str) -> NDArray[Any]:
+def _read_image(source: Path, kinds: str) -> Array:
     """Return what an image holds, shape ``(H, W, C)``."""
     from kornia_rs import io
 
@@ -179,14 +180,14 @@ def _check_times(path: Path, times: Sequence[float]) -> None:
 
 
 def read_nearest(
-    times: list[float], path: Path, read: Callable[[Path], tuple[list[float], Sequence[Any]]]
-) -> list[Any]:
+    times: list[float], path: Path, read: Callable[[Path], tuple[list[float], Sequence[Value]]]
+) -> list[Value | None]:
     """Return what a list by time has nearest to each of some times, None where that is too far.
 
     It is None everywhere if there is no such file.
     """
     others, values = read(path) if path.is_file() else ([], [])
-    found: list[Any] = []
+    found: list[Value | None] = []
     for time in times:
         place = bisect_left(others, time)
         around = range(max(place - 1, 0), min(place + 1, len(others)))

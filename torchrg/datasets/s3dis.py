@@ -1,43 +1,79 @@
-"""The Stanford rooms, S3DIS, as they are released, and a cache of them as arrays.
+r"""The Stanford rooms, S3DIS, as they are released: a text file for each annotated object.
 
-Mapped into memory, arrays are there at once; the text is read once.
+A file has ``x y z r g b`` on each line. The two releases hold six known broken bytes. In all of
+them a character lost its bit 0x20 (``\x10`` for ``0``, ``\x00`` for a space), so setting that bit
+again repairs them exactly; a space in their place, as is often done, would make two numbers of one.
+Each repair is reported, and every other line that is not six numbers is an error.
 """
 
-import hashlib
-import json
+import filecmp
+import itertools
 import os
-import secrets
-import shutil
+import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
-from torchrg.datasets.rooms import (
-    ANNOTATIONS,
-    Repair,
-    Room,
-    RoomReport,
-    Skipped,
-    class_names,
-    object_files,
-    read_room,
-)
+from torchrg._optional import require
+from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.files import DAMAGES
-from torchrg.io.npy import map_array
+from torchrg.io.files import check_file
+from torchrg.transforms.rows import SampleDict
 
+CLASS_ORDERS = {
+    "pointcept": (
+        "ceiling", "floor", "wall", "beam", "column", "window", "door",
+        "table", "chair", "sofa", "bookcase", "board", "clutter",
+    ),
+    "spt": (
+        "ceiling", "floor", "wall", "beam", "column", "window", "door",
+        "chair", "table", "bookcase", "sofa", "board", "clutter",
+    ),
+}  # fmt: skip
+"""Names of the classes by number: the order of Pointcept, MMDetection3D and PointNet, and that of
+Superpoint Transformer and KPConv."""
+_OTHER_CLASS = "clutter"
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms of each area in the release, 272 in all."""
-USER_CACHE = "~/.cache/torchrg"
-_VERSION = 1
-"""To be raised when the same files are read as other arrays."""
-_ARRAYS = ("coord", "color", "segment", "instance")
-_STORED_ORDER = "pointcept"
+ANNOTATIONS = "Annotations"
+_OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
+"""Names of the files of objects, and of their copies."""
+_COLUMNS = ("x", "y", "z", "red", "green", "blue")
+_CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
+"""Bytes that no text of numbers has."""
+_LOST_BIT = 0x20
+"""Bit that the broken bytes of the releases have lost."""
+_LARGEST = float(np.finfo(np.float32).max)
+"""Largest coordinate, in metres, that the arrays of a room hold."""
+_NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+class Room(NamedTuple):
+    """The points of a room; those of an object follow each other.
+
+    Attributes:
+        coord: Coordinates in metres, shape ``(N, 3)``, float32.
+        color: Colours, shape ``(N, 3)``, uint8.
+        segment: Class of each point, a place in :data:`CLASS_ORDERS`, shape ``(N,)``, int16.
+        instance: Object of each point, counted from zero in natural order of the file names, shape
+            ``(N,)``, int16, or int32 with more objects than that holds.
+        repairs: A line for each byte that was read as another one: file, line and column, counted
+            from one, and the line before and after. The file itself is not changed.
+        notes: A line for each entry of the folder that is no object, and for each file whose class
+            is not among the 13, ``stairs`` for example.
+    """
+
+    coord: NDArray[np.float32]
+    color: NDArray[np.uint8]
+    segment: NDArray[np.signedinteger]
+    instance: NDArray[np.signedinteger]
+    repairs: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 class S3DIS(SceneDataset):
@@ -48,15 +84,14 @@ class S3DIS(SceneDataset):
     from zero in natural order of the file names), and ``name``, as in ``Area_1/office_1``. Points
     are in the order of the objects, not in that of the room's own text file.
 
-    Nothing is ever written below ``root``, unless ``cache`` says so.
+    The text is read each time, and nothing is written; ``torchrg convert s3dis`` writes arrays,
+    which :class:`torchrg.datasets.FolderOfClouds` reads at once.
 
     Args:
         root: The folder that holds ``Area_1`` to ``Area_6``.
         areas: Numbers of the areas to use.
         class_order: What the numbers in ``segment`` mean: a key of
             :data:`torchrg.datasets.CLASS_ORDERS`.
-        cache: Folder that keeps rooms as arrays, 19 bytes a point, so that the text is read once.
-            None: it is read every time.
         transform: Called with each sample.
 
     Attributes:
@@ -80,17 +115,15 @@ class S3DIS(SceneDataset):
         areas: Sequence[int] = tuple(ROOMS_PER_AREA),
         *,
         class_order: str = "pointcept",
-        cache: str | os.PathLike[str] | None = USER_CACHE,
-        transform: Callable[[Mapping[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> None:
         self.root = Path(root)
         self.class_order = class_order
         self.classes = class_names(class_order)
-        self.cache = None if cache is None else Path(cache).expanduser()
         self.transform = transform
         self.scenes = [scene for area in areas for scene in _scenes_of_area(self.root, area)]
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a room."""
         room = self.read_room(index)
         return {
@@ -102,11 +135,8 @@ class S3DIS(SceneDataset):
         }
 
     def read_room(self, index: int) -> Room:
-        """Return the arrays of the room of a scene and the report of what was unusual about it."""
-        scene = self.scenes[index]
-        if self.cache is None:
-            return read_room(scene.path, class_order=self.class_order)
-        return _read_cached(scene, self.cache, self.class_order)
+        """Return the room of a scene, with the notes and repairs that a sample has not."""
+        return read_room(self.scenes[index].path, class_order=self.class_order)
 
 
 def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
@@ -132,93 +162,171 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
     return [SceneFiles(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]
 
 
-def _read_cached(scene: SceneFiles, cache: Path, class_order: str) -> Room:
-    """Read a room from the cache, and put it there first if it is not.
+def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
+    """Read a room from the raw release; nothing is written.
 
-    An entry counts as long as path, size and time of change of every input file are what they were
-    and torchrg reads them the same way; a damaged entry is made again. Processes may share a cache.
-    The cache is a folder that is made; old entries are not removed. Its arrays are mapped
-    copy-on-write: changing them changes no file.
+    Args:
+        path: Folder of the room, the one above ``Annotations``.
+        class_order: What the numbers in ``segment`` mean: a key of :data:`CLASS_ORDERS`.
+
+    Raises:
+        FormatError: If there is no object, or a line of one is not a point.
+        ConfigError: If the class order is unknown.
+        MissingDependencyError: If pyarrow is not installed.
     """
-    entry = cache / "s3dis" / f"{scene.name.replace('/', '-')}-{_fingerprint(scene)}"
-    room = _load(entry)
-    if room is None:
-        room = _store(entry, read_room(scene.path, class_order=_STORED_ORDER))
-    if class_order != _STORED_ORDER:
-        stored, wanted = class_names(_STORED_ORDER), class_names(class_order)
-        table = np.array([wanted.index(name) for name in stored], room.segment.dtype)
-        room = room._replace(segment=table[room.segment])
-    return room
-
-
-def _fingerprint(scene: SceneFiles) -> str:
-    """Return a name for the state of a room's files."""
-    state = [
-        (os.path.realpath(file), (status := file.stat()).st_size, status.st_mtime_ns)
-        for file in scene.files
-    ]
-    return hashlib.sha256(json.dumps([_VERSION, state]).encode()).hexdigest()[:16]
-
-
-def _load(entry: Path) -> Room | None:
-    """Return what an entry holds, None if it is not there or damaged."""
-    try:
-        report = json.loads((entry / "report.json").read_text(encoding="utf-8"))
-        coord, color, segment, instance = (map_array(entry / f"{name}.npy") for name in _ARRAYS)
-        return Room(coord, color, segment, instance, _report_of(report))
-    except (OSError, *DAMAGES):
-        return None
-
-
-def _store(entry: Path, room: Room) -> Room:
-    """Put a room into the cache in one step, and return it as it is there."""
-    beside = entry.with_name(f".{entry.name}.{secrets.token_hex(4)}")
-    try:
-        beside.mkdir(parents=True)
-        for name in _ARRAYS:
-            np.save(beside / f"{name}.npy", getattr(room, name), allow_pickle=False)
-        (beside / "report.json").write_text(json.dumps(_plain(room.report)), encoding="utf-8")
-        # On the disk before the folder has its name, which says that all is there.
-        for path in beside.iterdir():
-            with path.open("rb+") as stream:
-                os.fsync(stream.fileno())
-        if entry.exists() and _load(entry) is None:
-            shutil.rmtree(entry, ignore_errors=True)
-        try:
-            beside.rename(entry)
-        except OSError:
-            # Another process has put the same room there in the meantime.
-            if not entry.is_dir():
-                raise
-    except OSError as error:
-        raise FormatError(
-            f"{entry}: cannot be written: {error.strerror or error}; choose another folder with "
-            "cache=..., or none with cache=None."
-        ) from error
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return _load(entry) or room
-
-
-def _plain(report: RoomReport) -> dict[str, Any]:
-    """Return a report as JSON can hold it; latin-1 keeps every byte."""
-    return {
-        "repairs": [
-            [str(file), line, column, before.decode("latin-1"), after.decode("latin-1")]
-            for file, line, column, before, after in report.repairs
-        ],
-        "skipped": [[str(file), reason] for file, reason in report.skipped],
-        "as_clutter": [[str(file)] for file in report.as_clutter],
-    }
-
-
-def _report_of(plain: dict[str, Any]) -> RoomReport:
-    """Return the report that JSON holds."""
-    return RoomReport(
-        tuple(
-            Repair(Path(file), line, column, before.encode("latin-1"), after.encode("latin-1"))
-            for file, line, column, before, after in plain["repairs"]
-        ),
-        tuple(Skipped(Path(file), reason) for file, reason in plain["skipped"]),
-        tuple(Path(file) for (file,) in plain["as_clutter"]),
+    classes = class_names(class_order)
+    objects, notes = _list_room(path)
+    coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
+    numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
+    notes += [f"{file.name} taken as clutter" for name, file in objects if name not in classes]
+    counts = [len(coord) for coord in coords]
+    dtype = np.int16 if len(objects) <= np.iinfo(np.int16).max else np.int32
+    return Room(
+        np.concatenate(coords),
+        np.concatenate(colors),
+        np.repeat(np.array(numbers, np.int16), counts),
+        np.repeat(np.arange(len(objects), dtype=dtype), counts),
+        tuple(itertools.chain.from_iterable(repairs)),
+        tuple(notes),
     )
+
+
+def class_names(class_order: str) -> tuple[str, ...]:
+    """Return the names of the 13 classes in an order, a key of :data:`CLASS_ORDERS`."""
+    if class_order not in CLASS_ORDERS:
+        raise ConfigError(
+            f"S3DIS: expected class_order to be one of {', '.join(CLASS_ORDERS)}, got "
+            f"{class_order!r}."
+        )
+    return CLASS_ORDERS[class_order]
+
+
+def object_files(room: Path) -> tuple[Path, ...]:
+    """Return the files of a room's objects; none of a broken room, which fails when it is read."""
+    try:
+        return tuple(file for _, file in _list_room(room)[0])
+    except FormatError:
+        return ()
+
+
+def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
+    """Return class and file of each object of a room in natural order, and notes on the others.
+
+    These are hidden files, files that are not named ``CLASS_NUMBER.txt``, and copies named
+    ``CLASS_NUMBER (2).txt`` of a file that is there.
+    """
+    folder = path / ANNOTATIONS
+    if not folder.is_dir():
+        raise FormatError(f"{path}: expected a folder {ANNOTATIONS}, got none; fetch it again.")
+    objects, notes = [], []
+    for file in listed(folder):
+        match = _OBJECT.fullmatch(file.stem)
+        if file.name.startswith(".") or file.suffix != ".txt" or not match or file.is_dir():
+            notes.append(f"{file.name} not read: not named CLASS_NUMBER.txt")
+        elif match[3] and (original := folder / f"{match[1]}_{match[2]}.txt").is_file():
+            equal = filecmp.cmp(file, original, shallow=False)
+            but = "" if equal else " by its name, but it differs"
+            notes.append(f"{file.name} not read: a copy of {original.name}{but}")
+        else:
+            objects.append((match[1], file))
+    if not objects:
+        raise FormatError(
+            f"{folder}: expected objects as CLASS_NUMBER.txt, got none; fetch it again."
+        )
+    return objects, notes
+
+
+def read_annotation(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8], list[str]]:
+    """Read coordinates and colours of one object in the order of the file, and list the repairs.
+
+    Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
+    Colours may be written as ``106.000000`` and are rounded.
+    """
+    check_file(path)
+    original = path.read_bytes()
+    content, repairs = _repair(path, original)
+    table = _parse_fast(content)
+    if table is None or not _are_points(table):
+        table = _parse_lines(path, content, original)
+    coord = np.stack([column.astype(np.float32) for column in table[:3]], axis=1)
+    color = np.stack([np.rint(column).astype(np.uint8) for column in table[3:]], axis=1)
+    return coord, color, repairs
+
+
+def _repair(path: Path, original: bytes) -> tuple[bytes, list[str]]:
+    """Set the lost bit of control bytes, and list where."""
+    if len(original.translate(None, _CONTROL_BYTES)) == len(original):
+        return original, []
+    table = bytes(byte | _LOST_BIT if byte in _CONTROL_BYTES else byte for byte in range(256))
+    content = original.translate(table)
+    places = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
+    ends = np.flatnonzero(np.frombuffer(original, np.uint8) == ord("\n"))
+    repairs = []
+    for place, line in zip(places.tolist(), np.searchsorted(ends, places).tolist(), strict=True):
+        begin = int(ends[line - 1]) + 1 if line else 0
+        end = int(ends[line]) if line < len(ends) else len(original)
+        before, after = (text[begin:end].rstrip(b"\r") for text in (original, content))
+        column = place - begin + 1
+        repairs.append(
+            f"{path.name}: line {line + 1}, column {column}: {before!r} read as {after!r}"
+        )
+    return content, repairs
+
+
+def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
+    """Parse lines of six numbers between single spaces; None if they are not."""
+    # A lone CR would end a line here, and a minus that lost its bit is one.
+    if content.count(b"\r") != content.count(b"\r\n"):
+        return None
+    arrow = require("pyarrow", extra="s3dis", purpose="read S3DIS")
+    csv = require("pyarrow.csv", extra="s3dis", purpose="read S3DIS")
+    try:
+        table = csv.read_csv(
+            arrow.BufferReader(content),
+            csv.ReadOptions(column_names=_COLUMNS, use_threads=torch.get_num_threads() > 1),
+            csv.ParseOptions(delimiter=" ", quote_char=False),
+            csv.ConvertOptions(
+                column_types=dict.fromkeys(_COLUMNS, arrow.float64()),
+                null_values=[],
+                check_utf8=False,
+            ),
+        )
+    except arrow.ArrowInvalid:
+        return None
+    return [column.to_numpy() for column in table.columns] if table.num_rows else None
+
+
+def _are_points(table: list[NDArray[np.float64]]) -> bool:
+    """Whether columns hold coordinates that float32 holds, and colours that fit a byte."""
+    lows, highs = [-_LARGEST] * 3 + [0.0] * 3, [_LARGEST] * 3 + [255.0] * 3
+    return all(
+        bool(low <= np.rint(column.min()) and np.rint(column.max()) <= high)
+        for column, low, high in zip(table, lows, highs, strict=True)
+    )
+
+
+def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np.float64]]:
+    """Parse line by line, and name the first line that is not a point."""
+    rows: list[list[float]] = []
+    for number, line in enumerate(content.split(b"\n"), start=1):
+        text = line.removesuffix(b"\r")
+        words = text.split()
+        if not words:
+            continue
+        row = [float(word) for word in words if _NUMBER.fullmatch(word)]
+        if (
+            len(words) != 6
+            or len(row) != 6
+            or b"\r" in text
+            or not _are_points([np.array([x]) for x in row])
+        ):
+            shown = original.split(b"\n")[number - 1].removesuffix(b"\r")
+            shown = shown if len(shown) <= 80 else shown[:77] + b"..."
+            raise FormatError(
+                f"{path}: line {number}: expected x y z and colours in 0 to 255, six numbers, "
+                f"got {shown!r}; repair or delete this line in a copy."
+            )
+        rows.append(row)
+    if not rows:
+        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+    return list(np.array(rows).T)

@@ -8,7 +8,7 @@ import csv
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from reprlib import repr as shortened
@@ -18,10 +18,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrg.datasets.folder import SceneDataset, SceneFiles, check_folder, listed
+from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
 from torchrg.io.files import DAMAGES, read_text, refusing
+from torchrg.plane_table import Arrays
+from torchrg.transforms.rows import SampleDict
 
 MESH, MESH_PLUSPLUS = "_vh_clean_2.ply", "mesh_aligned_0.05.ply"
 """End of the name of a scan's mesh in ScanNet, and the whole name in ScanNet++."""
@@ -105,7 +107,7 @@ class ScanNet(SceneDataset):
         root: str | os.PathLike[str],
         split: str | None = None,
         *,
-        transform: Callable[[Mapping[str, Any]], Any] | None = None,
+        transform: Transform | None = None,
     ) -> None:
         if split is not None and split not in _SPLITS:
             raise ConfigError(
@@ -131,7 +133,7 @@ class ScanNet(SceneDataset):
         # Every scan needs them: what is wrong with them is told before the first.
         _read_mapping(self.root) if is_plus else _read_categories(self.root)
 
-    def read_sample(self, index: int) -> dict[str, Any]:
+    def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a scan."""
         name, mesh, _ = self.scenes[index]
         arrays = read_scannet_scan(mesh, self.root)
@@ -139,13 +141,13 @@ class ScanNet(SceneDataset):
             arrays.pop(key, None)
         if "segment20" in arrays:
             arrays["segment"] = arrays.pop("segment20")
-        sample: dict[str, Any] = {key: torch.from_numpy(values) for key, values in arrays.items()}
+        sample: SampleDict = {key: torch.from_numpy(values) for key, values in arrays.items()}
         for key in {"segment", "segment200", "instance"} & set(arrays):
             sample[key] = sample[key].reshape(len(arrays["coord"]), -1)[:, 0].long()
         return {**sample, "name": name}
 
 
-def read_scannet_scan(mesh: Path, root: Path) -> dict[str, NDArray[Any]]:
+def read_scannet_scan(mesh: Path, root: Path) -> Arrays:
     """Read a scan of ScanNet or ScanNet++ from the raw release; nothing is written.
 
     Args:
@@ -163,7 +165,7 @@ def read_scannet_scan(mesh: Path, root: Path) -> dict[str, NDArray[Any]]:
         FormatError: If a file is damaged, or is of another number of vertices.
     """
     cloud = read_cloud(mesh)
-    arrays: dict[str, NDArray[Any]] = {"coord": cloud.coordinates.astype(np.float32)}
+    arrays: Arrays = {"coord": cloud.coordinates.astype(np.float32)}
     if "color" in cloud.fields:
         arrays["color"] = cloud.fields["color"]
     if cloud.front is not None:
@@ -270,7 +272,7 @@ def _split(scene: SceneFiles, lists: Mapping[str, tuple[str, Path]]) -> str:
     return "train" if "groups" in _files_of(scene.path) else "test"
 
 
-def _alignment(path: Path) -> dict[str, NDArray[Any]]:
+def _alignment(path: Path) -> Arrays:
     """Return the motion in the text of a scan, if there is one."""
     for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         name, _, numbers = line.partition("=")
@@ -284,10 +286,10 @@ def _alignment(path: Path) -> dict[str, NDArray[Any]]:
     return {}
 
 
-def _labels(files: Mapping[str, Path], root: Path, count: int) -> dict[str, NDArray[Any]]:
+def _labels(files: Mapping[str, Path], root: Path, count: int) -> Arrays:
     """Return the labels of a scan of ScanNet."""
     words = _read_categories(root)
-    found: dict[str, NDArray[Any]] = {}
+    found: Arrays = {}
     if "groups" in files and "segments" in files:
         instance = np.full(count, _NONE, dtype=np.int64)
         numbers = np.zeros((count, 2), dtype=np.int64)
@@ -317,7 +319,7 @@ def _labels(files: Mapping[str, Path], root: Path, count: int) -> dict[str, NDAr
     return found
 
 
-def _labels_plus(mesh: Path, root: Path, count: int) -> dict[str, NDArray[Any]]:
+def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
     """Return the labels of a scan of ScanNet++, in which a vertex may be of several objects."""
     files, classes = _files_of(mesh), _classes_plus(root)
     renamed = _read_mapping(root)
@@ -391,7 +393,7 @@ def _read_list(path: Path, key: str) -> list[Any]:
         return values
 
 
-def _whole(path: Path, what: str, values: list[Any]) -> NDArray[np.int64]:
+def _whole(path: Path, what: str, values: Sequence[object]) -> NDArray[np.int64]:
     """Return whole numbers of 64 bits, and refuse all others; ``what`` they are is for messages."""
     message = f"{path}: expected {what} to be whole numbers, got: "
     with refusing(message, *DAMAGES, repair="; fetch it again"):

@@ -27,6 +27,14 @@ _AROUND = (*_AHEAD, *((-down, -right) for down, right in _AHEAD))
 _NUM_PASSES = 2
 """Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
 
+_ABSORB_REACH = 3.0
+"""Standard deviations of the noise: a pixel this near to the plane of the flat region beside it is
+on it, as 99.7 % of its pixels are."""
+
+_MERGE_TOLERANCE = 1.2
+"""One plane explains two flat regions that touch when neither is farther from it than this many
+times its distance from its own: that of clouds, see :class:`torchrg.config.GrowingConfig`."""
+
 _CURVED = 3.0
 """Thickness of a region in units of the noise up to which it is a plane, however it is bent."""
 
@@ -284,20 +292,18 @@ def _refine(
     beside, seen = PixelGrid(cloud.seen.shape), cloud.seen.flatten()
     for _ in range(_NUM_PASSES):
         planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
-        reach = planes.times_thickness(config.absorb_reach)
+        reach = planes.times_thickness(_ABSORB_REACH)
         labels = absorb_points(cloud.points, labels, beside, planes, reach, valid=seen)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
         pairs = zip(beside.contacts(labels), hidden, strict=True)
         contacts, counts = (torch.cat(part) for part in pairs)
-        merged = merge_coplanar(
-            labels, (contacts, counts), planes, tolerance=config.merge_tolerance
-        )
+        merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
     joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
     if not torch.equal(joined, labels):
         labels, planes = joined, fit_inverse_planes(cloud, joined, most=MOST_FITTED)
-    reach = planes.times_thickness(config.absorb_reach)
+    reach = planes.times_thickness(_ABSORB_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)

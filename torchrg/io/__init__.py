@@ -21,6 +21,7 @@ from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
 from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.io.vg import write_vg
+from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
@@ -167,7 +168,8 @@ def write_cloud(
         the cloud whose name a result takes is kept under another: ``label_input``,
         ``normals_input`` and so on; where there is such a field already, it is that which stays.
         ``.npz`` holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the
-        table of planes as :meth:`torchrg.structures.Planes.to_arrays` gives it in the input's
+        table of planes as
+        :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's
         coordinates, and ``provenance``. Equal input gives equal bytes. Superpoints are
         ``superpoints``, and ``superpoints_1`` and so on for the coarser levels; in ``.npz`` also
         ``plane_of_superpoint``. ``.vg`` holds coordinates, colours, normals and the planes as
@@ -222,7 +224,7 @@ def write_cloud(
         fields = put_results(fields, results)
     labelled = replace(cloud, fields=fields)
     if suffix == _PLANES_SUFFIX and segmentation is not None:
-        table = segmentation.planes.to_arrays(cloud.origin)
+        table = planes_to_arrays(segmentation.planes, cloud.origin)
         equations = np.column_stack([table["plane_normal"], -table["plane_offset"]])
         write_vg(target, labelled, equations)
         return

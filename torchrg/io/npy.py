@@ -37,6 +37,7 @@ from torchrg.io.files import (
     check_promise,
     refusing,
 )
+from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
 
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
@@ -161,7 +162,7 @@ def write_npz(
             arrays[name] = values
     else:
         arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in _RESULTS}
-        arrays |= segmentation.planes.to_arrays(cloud.origin)
+        arrays |= planes_to_arrays(segmentation.planes, cloud.origin)
     if superpoints is not None:
         for name, level in superpoints.by_level().items():
             if name in arrays:

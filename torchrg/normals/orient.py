@@ -18,7 +18,7 @@ from torchrg.structures import Neighbors
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
 """What normals can be turned towards."""
 
-_NUM_NEIGHBORS = 20
+NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""
 
 _NUM_LINKS = 12
@@ -162,7 +162,7 @@ def orient_normals(
         return upright
     spreading = rows[_evenly_spread(len(rows))]
     kept, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
-    near = search_knn(kept, min(_NUM_NEIGHBORS, len(kept)), canonical=True)
+    near = search_knn(kept, min(NUM_NEIGHBORS, len(kept)), canonical=True)
     signs = turn(kept, units, near)
     if len(spreading) < len(rows):
         signs = _follow(cloud, upright, rows, kept, units * signs[:, None])

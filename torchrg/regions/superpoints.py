@@ -36,6 +36,10 @@ _PIECES_EACH = 2
 """Where the number of superpoints is given, each is made of at least so many pieces in the mean, so
 that there is a choice of what to merge."""
 
+_COLOR_WEIGHT = 3.0
+"""Weight of a squared difference of colours in [0, 1] against one of unit normals: colours that are
+a third of the range apart in each channel weigh as much as a squared difference of normals of 1."""
+
 _COLOR_VARIATION = 0.1
 """Weighted squared differences of the colours of a piece from their mean, added up, above which the
 piece is cut: four points that are off by 0.09 of the range from black to white reach it."""
@@ -152,7 +156,7 @@ def _partition_places(
     neighbors = Neighbors(neighbors.indices[:, :k].cpu())
     spacing = _median_spacing(places, neighbors)
     if colors is not None:
-        colors = math.sqrt(config.color_weight) * colors
+        colors = math.sqrt(_COLOR_WEIGHT) * colors
     pieces = labels
     if config.planes == "pieces":
         pieces = _cut_planes(places, spacing, neighbors, labels, colors, config)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.structures import UNLABELED
+from torchrg.transforms.rows import Entries, SampleDict
 from torchrg.transforms.sample import SampleTransform
 
 
@@ -27,7 +28,7 @@ class DepthTransform(SampleTransform):
         *("plane", "normal", "curvature", "planes"),
     )
 
-    def read_images(self, sample: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor | None]:
+    def read_images(self, sample: Entries) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
         key = self.key(sample, "intrinsics")
         if key in sample:
@@ -47,7 +48,7 @@ class DepthTransform(SampleTransform):
             None if poses is None else self._one_each("pose", poses, (len(depth), 4, 4)),
         )
 
-    def is_batch(self, sample: Mapping[str, Any]) -> bool:
+    def is_batch(self, sample: Entries) -> bool:
         """Return whether the depth of a sample is a batch, ``(B, 1, H, W)``."""
         return self.read(sample, "depth").ndim == 4
 
@@ -75,9 +76,6 @@ class DepthToCloud(DepthTransform):
 
     and replaces ``color`` by that of the points, ``(N, 3)``, of the nearest pixel.
 
-    Args:
-        keys: Other names for the keys.
-
     Example:
         >>> depth = torch.tensor([[[2.0, 0.0], [2.0, 2.0]]])
         >>> cloud = DepthToCloud()({"depth": depth, "intrinsics": torch.eye(3)})
@@ -86,7 +84,7 @@ class DepthToCloud(DepthTransform):
     """
 
     @of_clouds
-    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+    def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with the cloud."""
         depth, intrinsics, poses = self.read_images(sample)
         images = depth_to_points(depth, intrinsics, poses)
@@ -138,7 +136,6 @@ class SegmentDepth(DepthTransform):
         config: Settings.
         planes: Whether to add the table.
         compile: Whether to run kernels compiled; see :func:`segment_depth`.
-        keys: Other names for the keys.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -161,7 +158,7 @@ class SegmentDepth(DepthTransform):
         self.planes, self.is_compiled = planes, compile
 
     @of_clouds
-    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+    def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
         segment = partial(segment_depth, config=self.config, compile=self.is_compiled)
@@ -169,7 +166,7 @@ class SegmentDepth(DepthTransform):
             segment(image, camera, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
-        batch, added = self.is_batch(sample), dict[str, Any](sample)
+        batch, added = self.is_batch(sample), SampleDict(sample)
         for name, part in (("plane", "labels"), ("normal", "normals"), ("curvature", "curvature")):
             images = [getattr(seg, part) for seg in found]
             added[self.key(sample, name)] = torch.stack(images) if batch else images[0]
@@ -225,9 +222,7 @@ class FusedFrames(NamedTuple):
         return images
 
 
-def fuse_depth(
-    samples: Sequence[Mapping[str, Any]], *, voxel_size: float | None = None
-) -> FusedFrames:
+def fuse_depth(samples: Sequence[Entries], *, voxel_size: float | None = None) -> FusedFrames:
     """Fuse depth frames with poses into one cloud.
 
     Args:

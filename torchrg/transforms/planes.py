@@ -17,14 +17,14 @@ from torchrg.config import (
     settings_of,
 )
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.neighbors import finite_rows, restore_rows
 from torchrg.normals import estimate_normals, orient_normals
-from torchrg.normals.orient import Orientation
+from torchrg.normals.orient import NUM_NEIGHBORS, Orientation
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.structures import UNLABELED
-from torchrg.transforms.rows import rows_of_clouds
-from torchrg.transforms.sample import CloudTransform, SampleTransform
+from torchrg.transforms.rows import Sample, rows_of_clouds
+from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
 
 
 class EstimateNormals(CloudTransform):
@@ -38,7 +38,6 @@ class EstimateNormals(CloudTransform):
         residual: Whether to add ``residual`` ``(N,)``, the root mean square distance of the
             neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
         chunk_size: Points handled at a time; bounds memory, changes no result.
-        keys: Other names for the keys.
         **changes: Single settings, as in ``method="pca", k=30``.
 
     Example:
@@ -53,16 +52,22 @@ class EstimateNormals(CloudTransform):
         *,
         residual: bool = True,
         chunk_size: int = CHUNK_SIZE,
+        keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(keys=keys)
+        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
         self.config = settings_of("EstimateNormals", NormalsConfig, config, changes)
         self.residual, self.chunk_size = residual, chunk_size
 
-    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return normals and curvature of a cloud."""
-        fit = estimate_normals(cloud["coord"], self.config, chunk_size=self.chunk_size)
+        rows = finite_rows(cloud["coord"])
+        points = cloud["coord"][rows]
+        neighbors = search(points, self.config.k)
+        fit = estimate_normals(
+            points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
+        ).each(lambda values: restore_rows(values, rows, len(cloud["coord"])))
         found = {"normal": fit.normals, "curvature": fit.curvature}
         return {**found, "residual": fit.residual_rms} if self.residual else found
 
@@ -77,7 +82,6 @@ class OrientNormals(CloudTransform):
     Args:
         towards: What normals are turned to; ``"up"`` is ``"+z"``.
         viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
-        keys: Other names for the keys.
 
     Raises:
         ConfigError: If ``towards`` is unknown, or does not go with ``viewpoint``.
@@ -94,9 +98,10 @@ class OrientNormals(CloudTransform):
         towards: Orientation | Literal["up"] = "interior",
         viewpoint: Sequence[float] | None = None,
         *,
+        keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(keys=keys)
+        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
         known = (*get_args(Orientation), "up")
         if towards not in known:
             raise ConfigError(
@@ -112,7 +117,7 @@ class OrientNormals(CloudTransform):
         looks = towards == "viewpoint" and viewpoint is None
         self.reads = ("coord", "normal", *["viewpoint"] * looks)
 
-    def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
+    def read(self, sample: Sample, name: str) -> Tensor:
         """Return an entry of a sample; of a viewpoint a row for each point."""
         values = super().read(sample, name)
         if name != "viewpoint":
@@ -125,12 +130,20 @@ class OrientNormals(CloudTransform):
         counts = [part.stop - part.start for part in parts]
         return of_clouds.repeat_interleave(torch.tensor(counts, device=places.device), dim=0)
 
-    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the normals of a cloud, turned."""
-        points, viewpoint = cloud["coord"], cloud.get("viewpoint")
+        points, normals, viewpoint = cloud["coord"], cloud["normal"], cloud.get("viewpoint")
         if self.viewpoint is not None:
             viewpoint = points.new_tensor(self.viewpoint)
-        turned = orient_normals(points, cloud["normal"], towards=self.towards, viewpoint=viewpoint)
+        is_all = bool((normals != 0).any(dim=1).all() & points.isfinite().all())
+        if search.known and is_all and self.towards in ("interior", "consistent"):
+            rows = finite_rows(points)
+            near = search(points[rows], NUM_NEIGHBORS)
+            turned = orient_normals(
+                points[rows], normals[rows], towards=self.towards, neighbors=near
+            )
+            return {"normal": restore_rows(turned, rows, len(points))}
+        turned = orient_normals(points, normals, towards=self.towards, viewpoint=viewpoint)
         return {"normal": turned}
 
     def extra_repr(self) -> str:
@@ -150,7 +163,6 @@ class GrowRegions(CloudTransform):
         config: Settings of the growth, a whole configuration, or the name of a preset. Default:
             that of :func:`torchrg.load_config`.
         k: Number of neighbours, the point itself included.
-        keys: Other names for the keys.
         **changes: Single settings, as in ``max_angle_deg=7``.
 
     Example:
@@ -165,16 +177,17 @@ class GrowRegions(CloudTransform):
         config: GrowingConfig | PipelineConfig | str | None = None,
         *,
         k: int = NormalsConfig.k,
+        keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(keys=keys)
+        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
         self.config = settings_of("GrowRegions", GrowingConfig, config, changes)
         self.k = k
         with_residual = self.config.plane_reach is not None
         self.reads = ("coord", "normal", "curvature", *["residual"] * with_residual)
 
-    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the plane labels of a cloud."""
         points = cloud["coord"]
         rows = finite_rows(points)
@@ -186,7 +199,7 @@ class GrowRegions(CloudTransform):
             finite,
             read["normal"],
             read["curvature"],
-            search_knn(finite, min(self.k, len(finite)), canonical=True),
+            search(finite, self.k),
             self.config,
             valid=(read["normal"] != 0).any(dim=-1),
             residual_rms=read.get("residual"),
@@ -208,7 +221,6 @@ class SegmentPlanes(CloudTransform):
     Args:
         config: Settings, or the name of a preset.
         compile: Whether to run kernels compiled; see :func:`torchrg.segment_planes`.
-        keys: Other names for the keys.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -221,16 +233,19 @@ class SegmentPlanes(CloudTransform):
         config: PipelineConfig | str = DEFAULT_PRESET,
         *,
         compile: bool | None = None,  # noqa: A002 - torch's word
+        keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(keys=keys)
+        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
         config = settings_of("SegmentPlanes", PipelineConfig, config)
         is_compiled = config.compile if compile is None else compile
         self.config = dataclasses.replace(config, compile=is_compiled)
 
-    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return plane labels, normals and curvature of a cloud."""
-        seg = segment_planes(cloud["coord"], self.config)
+        seg = segment_planes(cloud["coord"], self.config, keep_neighbors=self.keep_neighbors)
+        if seg.neighbors is not None:
+            search.remember(cloud["coord"][finite_rows(cloud["coord"])], seg.neighbors)
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
 
 
@@ -244,7 +259,6 @@ class MakeSuperpoints(CloudTransform):
         config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
         white: Largest value of a colour, 255 or 1, to read ``color`` ``(N, 3)`` too. Default:
             colours play no part.
-        keys: Other names for the keys.
         **changes: Single settings, as in ``strengths=(2.0,)``.
 
     Example:
@@ -269,11 +283,13 @@ class MakeSuperpoints(CloudTransform):
         self.white = white
         self.reads = ("coord", "normal", "plane", *["color"] * (white is not None))
 
-    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the superpoints of a cloud."""
         colors = None if self.white is None else cloud["color"].double() / self.white
+        points, plane = cloud["coord"], cloud["plane"].reshape(-1)
+        near = search.recall(points[finite_rows(points)]) if search.known else None
         found = partition_points(
-            cloud["coord"], cloud["normal"], cloud["plane"].reshape(-1), self.config, colors
+            points, cloud["normal"], plane, self.config, colors, neighbors=near
         )
         return {"superpoint": found.labels}
 
@@ -288,7 +304,6 @@ class AlignAxes(SampleTransform):
         config: How the planes are found that say where floor and walls are: settings, or the name
             of a preset.
         up: Where up is, to within 30 degrees.
-        keys: Other names for the keys.
 
     Raises:
         ConfigError: If a cloud has neither floor nor walls, when it is called.
@@ -313,7 +328,7 @@ class AlignAxes(SampleTransform):
         self.config = settings_of("AlignAxes", PipelineConfig, config)
         self.up = tuple(up)
 
-    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Sample) -> Sample:
         """Return a new sample with moved coordinates and normals."""
         coord = self.read(sample, "coord")
         parts = rows_of_clouds(sample, len(coord))

@@ -16,15 +16,14 @@ Where Pointcept is not installed, nothing happens.
 """
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
 from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints, OrientNormals
-from torchrg.transforms.rows import OUR_KEYS, with_listed
+from torchrg.transforms.rows import OUR_KEYS, Entries, Sample, SampleDict, with_listed
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
 _FEATURES = ("curvature", "residual")
@@ -40,11 +39,11 @@ class _WithColumns(SampleTransform):
 
     def changed(
         self,
-        sample: Any,  # noqa: ANN401
-        values: Mapping[str, Any],
+        sample: Sample,
+        values: Entries,
         *,
         per_point: Sequence[str] = (),
-    ) -> Any:  # noqa: ANN401
+    ) -> Sample:
         """Return a new sample of the same kind with other values by key."""
         columns = {self.key(sample, name) for name in _FEATURES}
         wide = {
@@ -62,12 +61,12 @@ class SegmentPlanes(_WithColumns, planes.SegmentPlanes):
     """:class:`torchrg.transforms.SegmentPlanes`; ``curvature`` is ``(N, 1)``."""
 
 
-def point_collate_fn(batch: Sequence[Mapping[str, Any]], mix_prob: float = 0) -> dict[str, Any]:
+def point_collate_fn(batch: Sequence[Entries], mix_prob: float = 0) -> SampleDict:
     """Join samples as Pointcept does; where two rooms become one, their planes stay apart.
 
     Of each pair the planes of the second are numbered after those of the first.
     """
-    joined: dict[str, Any] = _OWN["point_collate_fn"](batch, mix_prob=mix_prob)
+    joined: SampleDict = _OWN["point_collate_fn"](batch, mix_prob=mix_prob)
     labels = [joined[name] for name in _LABELS if name in joined]
     if not labels or "offset" not in joined:
         return joined
@@ -94,11 +93,11 @@ _TRANSFORMS = (
     OrientNormals,
 )
 """What configs can name."""
-_OWN: dict[str, Callable[..., dict[str, Any]]] = {}
+_OWN: dict[str, Callable[..., SampleDict]] = {}
 """Pointcept's own functions, behind those that take their places."""
 
 
-def index_operator(data_dict: dict[str, Any], index: Any, duplicate: bool = False) -> Any:  # noqa: ANN401
+def index_operator(data_dict: SampleDict, index: object, duplicate: bool = False) -> SampleDict:
     """Take points out as Pointcept does, and out of our entries too."""
     data_dict.update(with_listed(data_dict, [*OUR_KEYS, *_LABELS]))
     return _OWN["index_operator"](data_dict, index, duplicate)

@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
+from torchrg.structures import Array
 
+Sample = Any
+"""A sample: a dict of tensors, NumPy arrays and others, or a PyG ``Data`` or ``Batch``."""
+Entries = Mapping[str, Any]
+"""What a sample holds by key."""
+SampleDict = dict[str, Any]
+"""A sample as data sets give it."""
 LISTED = "index_valid_keys"
 """The entry that names those with a row for each point."""
 POINTCEPT_KEYS = ("coord", "color", "normal", "superpoint", "strength", "segment", "instance")
@@ -45,19 +52,19 @@ _FEW = 16
 may have as many rows."""
 
 
-def entries_of(sample: Any) -> Mapping[str, Any]:  # noqa: ANN401
+def entries_of(sample: Sample) -> Entries:
     """Return what a sample holds by key, or say that it is none."""
     if isinstance(sample, Mapping):
         return sample
     if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
-        entries: dict[str, Any] = sample.to_dict()
+        entries: Entries = sample.to_dict()
         return entries
     raise ConfigError(
         f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
     )
 
 
-def listed_keys(entries: Mapping[str, Any]) -> list[str] | None:
+def listed_keys(entries: Entries) -> list[str] | None:
     """Return the list of a sample, None if it has none; whatever kind of collection it is."""
     names = entries.get(LISTED)
     if names is None:
@@ -66,7 +73,7 @@ def listed_keys(entries: Mapping[str, Any]) -> list[str] | None:
 
 
 def point_keys(
-    caller: str, entries: Mapping[str, Any], num_points: int, *, whole: Collection[str] = ()
+    caller: str, entries: Entries, num_points: int, *, whole: Collection[str] = ()
 ) -> list[str]:
     """Return the entries with a row for each point; ``whole`` are further ones that have none.
 
@@ -83,14 +90,12 @@ def point_keys(
     return found
 
 
-def recognized_keys(
-    entries: Mapping[str, Any], num_points: int, *, whole: Collection[str] = ()
-) -> list[str]:
+def recognized_keys(entries: Entries, num_points: int, *, whole: Collection[str] = ()) -> list[str]:
     """Return what belongs on a list besides ours: nothing where somebody made the list."""
     return [] if _has_chosen_list(entries) else _sort_keys(entries, num_points, whole)[0]
 
 
-def with_listed(entries: Mapping[str, Any], keys: Iterable[str]) -> dict[str, list[str]]:
+def with_listed(entries: Entries, keys: Iterable[str]) -> dict[str, list[str]]:
     """Return the list of a sample with some entries on it, those that are there; never the old one.
 
     Where there is none, it is what Pointcept would begin, and they.
@@ -103,13 +108,13 @@ def with_listed(entries: Mapping[str, Any], keys: Iterable[str]) -> dict[str, li
     return {LISTED: list(dict.fromkeys([*begun, *present]))}
 
 
-def _has_chosen_list(entries: Mapping[str, Any]) -> bool:
+def _has_chosen_list(entries: Entries) -> bool:
     """Return whether somebody made the list; of usual names alone, nobody did."""
     return not _USUAL_KEYS.issuperset(listed_keys(entries) or ())
 
 
 def _sort_keys(
-    entries: Mapping[str, Any], num_points: int, whole: Collection[str]
+    entries: Entries, num_points: int, whole: Collection[str]
 ) -> tuple[list[str], list[str]]:
     """Return the entries with a row for each point, and those that may have one."""
     by_name = _USUAL_KEYS.union(listed_keys(entries) or ())
@@ -124,12 +129,12 @@ def _sort_keys(
     return found, ambiguous
 
 
-def is_whole(key: Any, whole: Collection[str] = ()) -> bool:  # noqa: ANN401
+def is_whole(key: object, whole: Collection[str] = ()) -> bool:
     """Return whether an entry has no row for each point by its name."""
     return key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
 
 
-def check_in_step(caller: str, entries: Mapping[str, Any], num_points: int) -> None:
+def check_in_step(caller: str, entries: Entries, num_points: int) -> None:
     """Raise if an entry that must have a row for each point has another number of rows.
 
     Which must, the list says; besides, the names that Pointcept and torchrg use, unless the entry
@@ -151,12 +156,12 @@ def check_in_step(caller: str, entries: Mapping[str, Any], num_points: int) -> N
 
 def select_points(
     caller: str,
-    sample: Any,  # noqa: ANN401
+    sample: Sample,
     rows: Tensor,
     num_points: int,
     *,
     whole: Collection[str] = (),
-) -> dict[str, Any]:
+) -> SampleDict:
     """Return the entries of a sample that change when only some rows are kept, given ascending.
 
     Raises:
@@ -169,7 +174,7 @@ def select_points(
                 f"{caller}: expected a sample without {key} to take points out of, got one; apply "
                 f"the transform {repair}."
             )
-    chosen = {
+    chosen: SampleDict = {
         key: _take(entries[key], rows)
         for key in point_keys(caller, entries, num_points, whole=whole)
     }
@@ -201,12 +206,12 @@ def follow_points(caller: str, inverse: Tensor, place: Tensor) -> Tensor:
     return moved
 
 
-def rows_of_clouds(sample: Any, num_points: int) -> list[slice]:  # noqa: ANN401
+def rows_of_clouds(sample: Sample, num_points: int) -> list[slice]:
     """Return the rows of each cloud of a sample, by its ``offset`` or ``batch`` if it has one."""
     return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
 
 
-def _cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
+def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
     """Return the row that each cloud of a sample ends before; one cloud ends at the last."""
     entries = entries_of(sample)
     if entries.get("offset") is not None:
@@ -229,7 +234,7 @@ def _cloud_ends(sample: Any, num_points: int) -> list[int]:  # noqa: ANN401
     return [num_points]
 
 
-def _is_as_long(value: Any, num_points: int) -> bool:  # noqa: ANN401
+def _is_as_long(value: object, num_points: int) -> bool:
     """Return whether a value is, or holds, as many rows as there are points.
 
     Lists count if they hold numbers, and what is nested counts: neither is left behind unseen.
@@ -245,12 +250,12 @@ def _is_as_long(value: Any, num_points: int) -> bool:  # noqa: ANN401
     return False
 
 
-def _take(values: Any, rows: Tensor) -> Any:  # noqa: ANN401
+def _take(values: Tensor | Array, rows: Tensor) -> Tensor | Array:
     """Return rows of a tensor or an array, in its own kind and dtype."""
     return values[rows.to(values.device) if isinstance(values, Tensor) else rows.numpy(force=True)]
 
 
-def _alike(values: Tensor, like: Any) -> Any:  # noqa: ANN401
+def _alike(values: Tensor, like: object) -> Tensor | Array:
     """Return whole numbers in the kind, dtype and device of others."""
     if isinstance(like, Tensor):
         return values.to(like)

@@ -18,11 +18,14 @@ from torch import Tensor, nn
 
 from torchrg._checks import as_tensor, check_shapes, of_clouds
 from torchrg.errors import ConfigError
-from torchrg.neighbors import sample_voxels
-from torchrg.structures import UNLABELED
+from torchrg.neighbors import sample_voxels, search_knn
+from torchrg.structures import UNLABELED, Neighbors
 from torchrg.transforms.rows import (
     LISTED,
     OUR_KEYS,
+    Entries,
+    Sample,
+    SampleDict,
     check_in_step,
     entries_of,
     follow_points,
@@ -34,7 +37,7 @@ from torchrg.transforms.rows import (
 
 KEYS = (
     "coord", "normal", "curvature", "residual", "plane", "inverse", "origin", "color", "superpoint",
-    "viewpoint",
+    "viewpoint", "neighbors",
 )  # fmt: skip
 """Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
@@ -81,7 +84,7 @@ class SampleTransform(nn.Module):
         return "" if self.config is None else "\n".join(_lines_of(self.config))
 
     @of_clouds
-    def forward(self, sample: Any) -> Any:  # noqa: ANN401
+    def forward(self, sample: Sample) -> Sample:
         """Return a new sample; the given one is not changed."""
         if is_separable(sample):
             return with_each(sample, self.forward)
@@ -89,16 +92,16 @@ class SampleTransform(nn.Module):
         check_in_step(type(self).__name__, entries_of(sample), num_points)
         return self.transform(sample)
 
-    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Sample) -> Sample:
         """Return a new sample, of one whose entries are in step."""
         raise NotImplementedError
 
-    def key(self, sample: Any, name: str) -> str:  # noqa: ANN401
+    def key(self, sample: Sample, name: str) -> str:
         """Return what an entry is called in a sample."""
         usual = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
         return self.renamed.get(name, usual)
 
-    def read(self, sample: Any, name: str) -> Tensor:  # noqa: ANN401
+    def read(self, sample: Sample, name: str) -> Tensor:
         """Return an entry of a sample as a tensor, or say what is wrong with it."""
         key, caller = self.key(sample, name), type(self).__name__
         entries = entries_of(sample)
@@ -115,11 +118,11 @@ class SampleTransform(nn.Module):
 
     def changed(
         self,
-        sample: Any,  # noqa: ANN401
-        values: Mapping[str, Any],
+        sample: Sample,
+        values: Entries,
         *,
         per_point: Sequence[str] = (),
-    ) -> Any:  # noqa: ANN401
+    ) -> Sample:
         """Return a new sample of the same kind with other values by key.
 
         Those in ``per_point`` have a row for each point.
@@ -143,12 +146,12 @@ class SampleTransform(nn.Module):
             changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
         return changed
 
-    def selected(self, sample: Any, rows: Tensor, num_points: int) -> dict[str, Any]:  # noqa: ANN401
+    def selected(self, sample: Sample, rows: Tensor, num_points: int) -> SampleDict:
         """Return the entries that change when only some rows are kept, given ascending."""
         whole = self._whole_keys(sample)
         return select_points(type(self).__name__, sample, rows, num_points, whole=whole)
 
-    def moved_inverse(self, sample: Any, place: Tensor) -> dict[str, Tensor]:  # noqa: ANN401
+    def moved_inverse(self, sample: Sample, place: Tensor) -> dict[str, Tensor]:
         """Return the ``inverse`` of a sample after rows moved to ``place``, if it has one."""
         key = self.key(sample, "inverse")
         if entries_of(sample).get(key) is None:
@@ -156,31 +159,95 @@ class SampleTransform(nn.Module):
         inverse = self.read(sample, "inverse")
         return {key: follow_points(type(self).__name__, inverse, place)}
 
-    def _whole_keys(self, sample: Any) -> list[str]:  # noqa: ANN401
+    def _whole_keys(self, sample: Sample) -> list[str]:
         """Return what the entries are called that have no row for each point."""
         return [self.key(sample, name) for name in ("inverse", "origin")]
 
 
+class NeighborSearch:
+    """Searches the neighbours of clouds, and remembers them for the transforms that follow.
+
+    A sample carries it where a transform was asked to by ``keep_neighbors``. It holds the points
+    that were searched: where some were moved, taken out or put in since, neighbours are searched
+    again. Of ``K`` remembered ones the next transform may use fewer, not more. No collate function
+    joins it: :func:`torchrg.datasets.collate_offset` leaves it out, torch's refuses it.
+
+    Args:
+        known: Finite points of clouds in canonical order, and their neighbours.
+    """
+
+    def __init__(self, known: Sequence[tuple[Tensor, Neighbors]] = ()) -> None:
+        self.known = known
+        self.used: list[tuple[Tensor, Neighbors]] = []
+
+    def __call__(self, points: Tensor, k: int) -> Neighbors:
+        """Return the ``k`` nearest neighbours of finite points in canonical order."""
+        k = min(k, len(points))
+        neighbors = self.recall(points, k)
+        if neighbors is None:
+            none = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
+            neighbors = search_knn(points, k, canonical=True) if k else none
+            self.remember(points, neighbors)
+        return Neighbors(neighbors.indices[:, : max(k, 1)])
+
+    def recall(self, points: Tensor, k: int = 1) -> Neighbors | None:
+        """Return what is known of finite points in canonical order; None of fewer than ``k``."""
+        for others, neighbors in self.known:
+            is_same = others.dtype == points.dtype and others.device == points.device
+            if is_same and neighbors.indices.shape[1] >= k and torch.equal(others, points):
+                self.remember(points, neighbors)
+                return neighbors
+        return None
+
+    def remember(self, points: Tensor, neighbors: Neighbors) -> None:
+        """Keep the neighbours of finite points in canonical order."""
+        self.used.append((points.detach(), neighbors))
+
+    def to_carry(self) -> "NeighborSearch":
+        """Return what the sample carries on: neighbours that were used, or else those known."""
+        return NeighborSearch(self.used or self.known)
+
+
 class CloudTransform(SampleTransform):
-    """Base of the transforms that add a row for each point, cloud by cloud."""
+    """Base of the transforms that add a row for each point, cloud by cloud.
+
+    Args:
+        keep_neighbors: Whether the sample carries the neighbours on, as ``neighbors``, so that the
+            next transform need not search them; see :class:`NeighborSearch`. They take 4 bytes for
+            each neighbour of a point.
+    """
 
     reads: tuple[str, ...] = ("coord",)
 
-    def add(self, cloud: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def __init__(
+        self, *, keep_neighbors: bool = False, keys: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(keys=keys)
+        self.keep_neighbors = keep_neighbors
+
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return new entries of one cloud, from those that are read."""
         raise NotImplementedError
 
-    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Sample) -> Sample:
         """Return a new sample with the new entries."""
         values = {name: self.read(sample, name) for name in self.reads}
+        key = self.key(sample, "neighbors")
+        carried = entries_of(sample).get(key)
+        search = NeighborSearch(carried.known if isinstance(carried, NeighborSearch) else ())
         parts = [
-            self.add({name: value[rows] for name, value in values.items()})
+            self.add({name: value[rows] for name, value in values.items()}, search)
             for rows in rows_of_clouds(sample, len(values["coord"]))
         ]
         added = {
             self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
         }
-        return self.changed(sample, added, per_point=list(added))
+        changed = self.changed(sample, added, per_point=list(added))
+        if self.keep_neighbors:
+            changed[key] = search.to_carry()
+        elif isinstance(carried, NeighborSearch):
+            del changed[key]
+        return changed
 
 
 class CenterCloud(SampleTransform):
@@ -197,7 +264,7 @@ class CenterCloud(SampleTransform):
         ([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[6.0, 5.0, 5.0]])
     """
 
-    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Sample) -> Sample:
         """Return a new sample with moved coordinates."""
         coord = self.read(sample, "coord")
         clouds = [coord[rows] for rows in rows_of_clouds(sample, len(coord))]
@@ -224,7 +291,7 @@ class KeepFinite(SampleTransform):
         {'coord': tensor([[0., 0., 0.]]), 'name': 'a'}
     """
 
-    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Sample) -> Sample:
         """Return a new sample with the finite points."""
         coord = self.read(sample, "coord")
         is_finite = coord.isfinite().all(dim=-1)
@@ -254,7 +321,6 @@ class SampleVoxels(SampleTransform):
 
     Args:
         size: Side of a voxel, in the unit of the cloud.
-        keys: Other names for the keys.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [0.04, 0, 0], [0.11, 0, 0]])
@@ -269,7 +335,7 @@ class SampleVoxels(SampleTransform):
             raise ConfigError(f"SampleVoxels: expected size > 0, got {size!r}.")
         self.size = size
 
-    def transform(self, sample: Any) -> Any:  # noqa: ANN401
+    def transform(self, sample: Sample) -> Sample:
         """Return a new sample of voxels."""
         coord = self.read(sample, "coord")
         rows, inverse, num_voxels = [], [], 0
@@ -305,7 +371,7 @@ def _is_section(part: object) -> bool:
     return dataclasses.is_dataclass(part)
 
 
-def is_separable(sample: Any) -> bool:  # noqa: ANN401
+def is_separable(sample: Sample) -> bool:
     """Return whether a sample is a PyG ``Batch`` that can be taken apart into its clouds.
 
     One whose points were taken out by hand cannot; it counts as one sample with ``batch``.
@@ -321,7 +387,7 @@ def is_separable(sample: Any) -> bool:  # noqa: ANN401
     )
 
 
-def with_each(batch: Any, change: Callable[[Any], Any]) -> Any:  # noqa: ANN401
+def with_each(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
     """Return a batch of the changed clouds of a batch; the given one is not changed.
 
     What was added to the batch after it was made stays: rows of points with their clouds, the rest
@@ -344,7 +410,7 @@ def with_each(batch: Any, change: Callable[[Any], Any]) -> Any:  # noqa: ANN401
     return changed
 
 
-def _parts(values: Tensor, batch: Any) -> list[Tensor]:  # noqa: ANN401
+def _parts(values: Tensor, batch: Sample) -> list[Tensor]:
     """Return the rows of each cloud of a batch."""
     counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
     return list(torch.split(values, counts))

@@ -1,0 +1,179 @@
+"""The plane table in files: as arrays in ``.npz``, and as JSON in folders of arrays."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Array, PlaneAdjacency, Planes
+
+Arrays = dict[str, Array]
+"""Parts of the table by their names in ``.npz``."""
+Json = dict[str, Any]
+"""Parts of the table as JSON can hold them, by name."""
+
+
+def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
+    """Return a table as ``.npz`` holds it, by name; what it does not have is left out.
+
+    Args:
+        planes: The table.
+        origin: Where the origin of its coordinates is in those of the file, shape ``(3,)``. What is
+            moved by it, places and offsets, is in float64.
+
+    Returns:
+        ``plane_normal`` and so on, of M rows; ``plane_kind`` as words; ``adjacency_pairs``,
+        ``adjacency_boundary_length`` and ``adjacency_dihedral_deg``; outlines as
+        ``outline_points``, rings one after the other, ``outline_ring_sizes``, their lengths, and
+        ``outline_ring_planes``, the planes that they belong to.
+    """
+
+    def moved(places: Tensor) -> NDArray[np.float64]:
+        return places.numpy(force=True).astype(np.float64) + origin
+
+    arrays: Arrays = {
+        f"plane_{name}": getattr(planes, name).numpy(force=True) for name in PLANE_COLUMNS
+    }
+    offset = arrays["plane_offset"].astype(np.float64)
+    arrays["plane_offset"] = offset + arrays["plane_normal"] @ origin
+    arrays |= {f"plane_{name}": moved(getattr(planes, name)) for name in ("centroid", "center")}
+    if planes.kind is not None:
+        arrays["plane_kind"] = np.array(PLANE_KINDS)[planes.kind.numpy(force=True)]
+    if planes.adjacency is not None:
+        for name, values in planes.adjacency._asdict().items():
+            arrays[f"adjacency_{name}"] = values.numpy(force=True)
+    if planes.outline is not None:
+        rings = [(plane, ring) for plane, own in enumerate(planes.outline) for ring in own]
+        arrays["outline_points"] = moved(torch.cat([planes.center[:0], *(r for _, r in rings)]))
+        arrays["outline_ring_sizes"] = np.array([len(r) for _, r in rings], dtype=np.int64)
+        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)
+    return arrays
+
+
+def planes_from_arrays(
+    arrays: Mapping[str, Array], origin: NDArray[np.float64], dtype: torch.dtype
+) -> Planes:
+    """Return the table of :func:`planes_to_arrays`; ``dtype`` is that of its numbers.
+
+    Raises:
+        LookupError: If an array is missing, or a number in it is that of no plane or kind.
+        ValueError: If an array is of another shape or type.
+    """
+
+    def read(name: str, dtype: str, shape: tuple[int, ...]) -> Array:
+        values = arrays[name]
+        if values.dtype.kind != np.dtype(dtype).kind or values.shape != shape:
+            raise ValueError(f"{name} of {values.dtype} and shape {values.shape}")
+        return values
+
+    def tensor(values: Array) -> Tensor:
+        found = torch.from_numpy(np.ascontiguousarray(values))
+        return found.to(dtype) if found.is_floating_point() else found
+
+    num_planes = len(arrays["plane_count"])
+    columns = {
+        name: read(f"plane_{name}", number, (num_planes, *shape))
+        for name, (number, shape) in PLANE_COLUMNS.items()
+    }
+    columns["offset"] = columns["offset"] - columns["normal"] @ origin
+    columns |= {name: columns[name] - origin for name in ("centroid", "center")}
+    table = Planes._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), None, None, None])
+    if "plane_kind" in arrays:
+        kinds = [PLANE_KINDS.index(word) for word in read("plane_kind", "U", (num_planes,))]
+        table = table._replace(kind=torch.tensor(kinds, dtype=torch.int64))
+    if "adjacency_pairs" in arrays:
+        num_pairs = len(arrays["adjacency_pairs"])
+        pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
+        length, angle = (
+            read(f"adjacency_{name}", "f8", (num_pairs,)) for name in PlaneAdjacency._fields[1:]
+        )
+        _check_planes(pairs, num_planes)
+        adjacency = PlaneAdjacency(tensor(pairs), tensor(length), tensor(angle))
+        table = table._replace(adjacency=adjacency)
+    if "outline_points" in arrays:
+        num_rings = len(arrays["outline_ring_sizes"])
+        sizes = read("outline_ring_sizes", "i8", (num_rings,))
+        owners = read("outline_ring_planes", "i8", (num_rings,))
+        points = read("outline_points", "f8", (int(sizes.sum()), 3)) - origin
+        _check_planes(owners, num_planes)
+        outline: list[tuple[Tensor, ...]] = [()] * num_planes
+        for owner, end, size in zip(owners, sizes.cumsum(), sizes, strict=True):
+            outline[owner] += (tensor(points[end - size : end]),)
+        table = table._replace(outline=tuple(outline))
+    return table
+
+
+def _check_planes(numbers: Array, num_planes: int) -> None:
+    """Raise IndexError if a number is that of no plane."""
+    if numbers.size and not 0 <= numbers.min() <= numbers.max() < num_planes:
+        raise IndexError(f"plane {numbers.max()} of {num_planes}")
+
+
+def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> Json:
+    """Return a plane table as JSON can hold it.
+
+    Args:
+        planes: The table.
+        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
+            Default: they are the same.
+
+    Returns:
+        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
+        :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
+        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
+
+    Example:
+        >>> from torchrg.pipeline import segment_planes
+        >>> grid = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
+        >>> plane = describe_planes(segment_planes(grid).planes, origin=[0, 0, 5])["planes"][0]
+        >>> plane["count"], plane["normal"], plane["offset"]
+        (81, [0.0, 0.0, 1.0], 6.0)
+    """
+    arrays = planes_to_arrays(
+        planes, np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
+    )
+    columns = {"id": [*range(len(planes.count))]} | _lists(arrays, "plane_")
+    if planes.outline is not None:
+        ends = arrays["outline_ring_sizes"].cumsum()[:-1]
+        rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
+        columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
+    table: Json = {"planes": _rows(columns)}
+    if planes.adjacency is not None:
+        pairs = _lists(arrays, "adjacency_")
+        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
+    return table
+
+
+def _lists(arrays: Arrays, prefix: str) -> Json:
+    """Return the arrays with a prefix as lists, by their names without it."""
+    return {n.removeprefix(prefix): v.tolist() for n, v in arrays.items() if n.startswith(prefix)}
+
+
+def _rows(columns: Json) -> list[Json]:
+    """Turn a table of columns into a list of rows."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def arrays_of_description(described: Json) -> Arrays:
+    """Return what :func:`describe_planes` described as :func:`planes_to_arrays` gives it."""
+    rows, pairs = described["planes"], described.get("adjacency")
+    arrays = {
+        f"plane_{name}": np.array([row[name] for row in rows], dtype).reshape(len(rows), *shape)
+        for name, (dtype, shape) in PLANE_COLUMNS.items()
+    }
+    if rows and "kind" in rows[0]:
+        arrays["plane_kind"] = np.array([row["kind"] for row in rows])
+    if rows and "outline" in rows[0]:
+        rings = [(row["id"], ring) for row in rows for ring in row["outline"]]
+        arrays["outline_points"] = np.array([p for _, ring in rings for p in ring]).reshape(-1, 3)
+        arrays["outline_ring_sizes"] = np.array([len(ring) for _, ring in rings], np.int64)
+        arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], np.int64)
+    if pairs is not None:
+        ends = np.array([pair["pair"] for pair in pairs], np.int64).reshape(-1, 2)
+        arrays["adjacency_pairs"] = ends
+        for name in PlaneAdjacency._fields[1:]:
+            arrays[f"adjacency_{name}"] = np.array([pair[name] for pair in pairs], np.float64)
+    return arrays
