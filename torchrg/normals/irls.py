@@ -14,8 +14,13 @@ from torchrg.errors import ConfigError
 from torchrg.linalg import second_moments
 from torchrg.linalg.eigen import principal_frame
 from torchrg.normals.consensus.noise import survey_noise
-from torchrg.normals.patches import about_first, fit_points, replace_rows
-from torchrg.normals.pca import check_patches, fit_normals_pca
+from torchrg.normals.pca import (
+    about_first,
+    check_patches,
+    fit_normals_pca,
+    fit_points,
+    replace_rows,
+)
 from torchrg.structures import Neighbors, NormalFit
 
 _HEAVY = 0.25

@@ -17,8 +17,7 @@ from torchrg._checks import in_own_precision
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root
 from torchrg.linalg.moments import Columns, along, sq_lengths
-from torchrg.normals.patches import about_first
-from torchrg.normals.pca import check_patches, fit_plane, patch_resolution
+from torchrg.normals.pca import about_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
