@@ -35,8 +35,8 @@ _BENT = 0.03
 A slightly bent face is a face, and a column is 0.4 of its extent thick."""
 
 _NUM_FITS = 2
-"""Fits of a region's plane: a plain one and a reweighted one. More change nothing, as the pixels
-that grew into a region are near its plane already."""
+"""Fits of a region's plane, a plain one and a reweighted one: its pixels are near the plane
+already."""
 
 _ALIKE = 1.75
 """Factor of the largest angle between normals of two windows that both hold both pixels. On a

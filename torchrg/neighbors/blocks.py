@@ -16,8 +16,8 @@ from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.neighbors.order import MORTON_BITS, morton_codes
 
 BLOCK_SIZE = 300_000
-"""Points of a block. Smaller ones search more points around them in vain, larger ones leave the
-cache of freed memory."""
+"""Points of a block. Smaller ones search more points around them in vain, larger ones take more
+memory."""
 _LEAST_CANDIDATES = 65536
 _CANDIDATES = 2
 """Rows searched at a time at most: as many as two blocks have, and so many that a small block is
@@ -26,15 +26,14 @@ not searched in crumbs."""
 SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
 """Points in canonical order, rows that are asked for, and k -> their neighbours, ``(n, k)``."""
 POINTS_PER_BOX = 256
-"""Points. A box of surface is then as wide as two neighbourhoods of 50: few rows are read in vain,
-and the boxes take a hundredth of the memory of the points."""
+"""Points of a box of surface about as wide as two neighbourhoods of 50: few rows are read in vain,
+and boxes take a hundredth of the memory of the points."""
 
 _ROUNDING = 1 + 1e-9
 """Factor by which distances are taken larger, so that rounding leaves no point out."""
 
 _BOXES_AT_ONCE = 64
-"""Boxes, near to one another as they follow one another: the box about them all leaves few others
-to compare with each."""
+"""Boxes that follow one another, whose common box leaves few others to compare with each."""
 
 
 class Boxes(NamedTuple):

@@ -26,8 +26,7 @@ Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 """Points, their neighbours, settings, chunk size -> fit."""
 
 _NARROW = 0.03
-"""Share of its length. A patch whose width is below this share is lost in the rounding of its
-covariance."""
+"""A patch of a width below this share of its length is lost in the rounding of its covariance."""
 
 
 def fit_normals_pca(

@@ -15,7 +15,7 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
 NUM_CONTACTS = 8
-"""So many neighbours surround a point of a surface; more reach across gaps."""
+"""Neighbours that surround a point of a surface; more reach across gaps."""
 
 LEAST_CONTACTS = 3
 """Regions that touch in fewer edges neither meet nor are merged: one may be an outlier's."""
@@ -24,11 +24,12 @@ PARALLEL_DEG = 15.0
 """At a smaller angle the line in which two planes cross may be far from where the faces end."""
 
 _REACH = 4.0
-"""Thicknesses of the planes. An edge that leads across them by no more is within their noise."""
+"""An edge that leads across the planes by at most this many of their thicknesses is within their
+noise."""
 
 _MAX_STEEPNESS = 0.25
-"""Share of the way to the 8th neighbour. An edge that leads across the planes by no more follows
-the surface. One that leads farther than this and than the noise goes to a parallel surface."""
+"""An edge follows the surface if it leads across the planes by at most this share of the way to the
+8th neighbour. One beyond this and the noise goes to a parallel surface."""
 
 
 def find_adjacency(

@@ -20,10 +20,11 @@ from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
 
 _MAX_PASSES = 10
-"""Times. Points that moved are neighbours of the next: narrow strips fill from their ends."""
+"""Passes over the borders at most. Points that moved lead to the next: narrow strips fill from
+their ends."""
 
 _ROUNDING = 0.01
-"""Thicknesses. Smaller distances decide nothing."""
+"""Distances of less than this many thicknesses decide nothing."""
 
 _ONE_SIDED = 0.5
 """A face ends at another plane if the mean distance of its points from that, with signs, is this
@@ -35,8 +36,8 @@ _FACET_TURN_DEG = 25.0
 of ten points are turned most; the sides of a thin board are turned by 90."""
 
 _FACET_TILT = 2 / 3
-"""Tolerances. Root mean square distance that this turn alone gives the points of a facet. Without
-a limit a plane across the step between two shelves, 5 cm, explains both."""
+"""Largest root mean square distance, in tolerances, that the turn alone gives the points of a
+facet. Without it a plane across the step between two shelves, 5 cm, explains both."""
 
 
 class Beside(Protocol):
@@ -182,9 +183,7 @@ def merge_coplanar(
     """
     pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
-    moments = _moments_of(planes)
-    owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
-    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+    return _merge(labels, pairs, _moments_of(planes), tolerance)
 
 
 def merge_facets(
@@ -208,12 +207,9 @@ def merge_facets(
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= LEAST_CONTACTS]
-    moments = _moments_of(planes)
-    scale, noise = torch.full_like(moments.scale, tolerance), torch.zeros_like(moments.noise)
-    moments = moments._replace(scale=scale, noise=noise)
-    moments = _Moments(*(part.cpu() for part in moments))
-    owner = _merge_pairs(moments, pairs.cpu(), 1.0, max_tilt=_FACET_TILT * tolerance)
-    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+    scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
+    moments = _moments_of(planes)._replace(scale=scale, noise=noise)
+    return _merge(labels, pairs, moments, 1.0, max_tilt=_FACET_TILT * tolerance)
 
 
 class _Moments(NamedTuple):
@@ -257,14 +253,19 @@ def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
     return _misfit(first, second)
 
 
-def _merge_pairs(
-    moments: _Moments, pairs: Tensor, tolerance: float, *, max_tilt: float | None = None
-) -> list[int]:
-    """Return for each region the smallest of those that it is merged with.
+def _merge(
+    labels: Tensor,
+    pairs: Tensor,
+    moments: _Moments,
+    tolerance: float,
+    *,
+    max_tilt: float | None = None,
+) -> Tensor:
+    """Return labels where each region has the smallest number of those that it is merged with.
 
-    With a largest tilt those are not whose own planes the joint one is turned against too far.
+    With a largest tilt, pairs stay apart if the joint plane is turned too far against either.
     """
-    groups = _Moments(*(values.clone() for values in moments))
+    pairs, groups = pairs.cpu(), _Moments(*(values.cpu().clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(touching))), [0] * len(touching)
     queue: list[tuple[float, int, int, int, int]] = []
@@ -297,7 +298,8 @@ def _merge_pairs(
             touching[c].add(a)
         beside = [(min(a, c), max(a, c)) for c in touching[a]]
         offer(torch.tensor(beside, dtype=torch.int64).view(-1, 2))
-    return [_root(owner, i) for i in range(len(owner))]
+    roots = [_root(owner, i) for i in range(len(owner))]
+    return torch.tensor([*roots, UNLABELED], device=labels.device)[labels]
 
 
 def _root(owner: list[int], i: int) -> int:

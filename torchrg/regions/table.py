@@ -29,8 +29,8 @@ _ROUNDING = 1e-12
 """Share of the coordinates by which a point inside an octagon is inside beyond rounding."""
 
 _TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
-"""From an edge to the edges across its direction in front, to the opposite one, and to those behind
-it: 0.5, 1 and 1.5 times pi, and another pi that the range of angles begins below 0."""
+"""Turns, in units of pi, from an edge to the front, opposite and back edges of its rectangle: 0.5,
+1 and 1.5, and 1 more as angles begin at -pi."""
 
 _POINTS_PER_CELL = 9.0
 """So many points in an average cell leave one of 8,000 empty by chance."""
@@ -57,10 +57,10 @@ _LEAST_WALL_SHARE = 0.5
 """A wall reaches over at least this share of the cloud's height."""
 
 _LEAST_WIDTH_SHARE = 0.2
-"""And is at least this share of it wide."""
+"""A wall is at least this wide, as a share of the cloud's height."""
 
 _TOP_SHARE = 0.1
-"""And reaches into this highest share of it; a window ended 14 % below."""
+"""A wall reaches into the top tenth of the cloud; a tall window ended 14 % below the top."""
 
 _WALL_AREA_SHARE = 0.25
 """A wall that ends below has at least this share of the largest vertical plane's area;

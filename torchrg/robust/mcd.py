@@ -47,7 +47,7 @@ _NUM_KEPT = 10
 """Random starts that are concentrated to the end, as published."""
 
 _MAX_COMPARED = 16
-"""Starts of a patch up to which equal sets are looked for. With more, comparing costs more than it
+"""Starts of a patch up to which equal sets are sought; with more, comparing costs more than it
 saves."""
 
 _DIGITS = 24

@@ -37,10 +37,10 @@ _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
 """Finite-sample factors of 2 to 12 values."""
 
 _TAU_WEIGHT_CUT = 4.5
-"""Medians of the deviations. A value that deviates by more has no weight in the centre."""
+"""A value that deviates by more than this many median deviations has no weight in the centre."""
 
 _TAU_SCALE_CUT = 3.0
-"""Medians of the deviations at which larger deviations are cut off."""
+"""Deviations are cut off at this many median deviations."""
 
 
 def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:

@@ -32,11 +32,10 @@ from torchrg.robust.scale import (
 Starts = Literal["paper", "robustbase", "planes", "more"]
 
 _LONG = 1000
-"""Values from which tau takes the place of Qn, as in robustbase, because Qn needs all
-differences."""
+"""Values from which tau takes the place of Qn, which needs all differences, as in robustbase."""
 
 _STARTS_AT_ONCE = 3
-"""Of the six starts so many are worked on together, so that what they need fits the cache."""
+"""Starts that are worked on together, so that what they need fits the cache."""
 
 _NUM_PLANES = 64
 """Planes among which the best are chosen."""
