@@ -335,8 +335,8 @@ class Planes(NamedTuple):
             return values
 
         def tensor(values: NDArray[Any]) -> Tensor:
-            found = torch.from_numpy(np.ascontiguousarray(values))
-            return found.to(dtype) if found.is_floating_point() else found
+            column = torch.from_numpy(np.ascontiguousarray(values))
+            return column.to(dtype) if column.is_floating_point() else column
 
         num_planes = len(arrays["plane_count"])
         columns = {

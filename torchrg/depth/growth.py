@@ -392,11 +392,11 @@ def move_to_creases(
         at_border = ((near >= 0) & (near != labels[rows][:, None])).any(dim=1)
         rows, around, near = rows[at_border], around[at_border], near[at_border]
         columns = [rows, around, labels[rows], near]
-        (found,) = map_rows(_regions_across, columns, *tables)
-        moved = found != labels[rows]
+        (across,) = map_rows(_regions_across, columns, *tables)
+        moved = across != labels[rows]
         if not bool(moved.any()):
             break
-        labels[rows[moved]] = found[moved]
+        labels[rows[moved]] = across[moved]
         rows = torch.unique(torch.cat([rows[moved], around[moved].flatten()]))
         rows = rows[labels[rows] >= 0]
     return labels

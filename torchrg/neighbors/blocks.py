@@ -167,8 +167,8 @@ def search_block(
     """
     first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
     reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
-    found = np.empty((block.stop - block.start, k), dtype=np.int32)
-    most = max(_CANDIDATES * len(found), _LEAST_CANDIDATES) if most is None else most
+    nearest = np.empty((block.stop - block.start, k), dtype=np.int32)
+    most = max(_CANDIDATES * len(nearest), _LEAST_CANDIDATES) if most is None else most
     waiting = [slice(first, last)]
     while waiting:
         some = waiting.pop()
@@ -182,14 +182,14 @@ def search_block(
             bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, some.start, k))
             rows = _rows_near(boxes, numbers, bound)
         asked = slice(boxes.starts[some.start], boxes.starts[some.stop])
-        into = found[asked.start - block.start : asked.stop - block.start]
+        into = nearest[asked.start - block.start : asked.stop - block.start]
         if len(rows) > most:
             into[:] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
             continue
         start = int(np.searchsorted(rows, asked.start))
         local = slice(start, start + asked.stop - asked.start)
         np.take(rows.astype(np.int32), search(points[rows], local, k), out=into, mode="clip")
-    return found
+    return nearest
 
 
 def _reach_of_boxes(
@@ -221,10 +221,10 @@ def _rows_near(
     boxes: Boxes, numbers: NDArray[np.int64], reach: NDArray[np.float64]
 ) -> NDArray[np.int64]:
     """Return the rows of all boxes within reach of some."""
-    found = np.zeros(len(boxes.low), dtype=bool)
+    is_near = np.zeros(len(boxes.low), dtype=bool)
     for _, near, within in near_boxes(boxes, numbers, reach):
-        found[near[within.any(axis=0)]] = True
-    return _rows_of(boxes, np.flatnonzero(found))
+        is_near[near[within.any(axis=0)]] = True
+    return _rows_of(boxes, np.flatnonzero(is_near))
 
 
 def _search_each(

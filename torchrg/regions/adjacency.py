@@ -181,8 +181,8 @@ class _Border:
         for some in chunks_of(len(labels), ROWS_IN_CACHE):
             places, _, keys = self._edges_of(some)
             touches[some.start + places // self._width] = True
-            found = torch.unique(keys, return_counts=True)
-            counts.update(dict(zip(*(values.tolist() for values in found), strict=True)))
+            values_of_chunk = torch.unique(keys, return_counts=True)
+            counts.update(dict(zip(*(values.tolist() for values in values_of_chunk), strict=True)))
         self._rows = places_of(touches).to(torch.int32)
         self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
         self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
@@ -235,16 +235,16 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
     NaN for pairs that do not meet on a line.
     """
     origin = points[:1].double()
-    found = array("q"), array("q")
+    cells = array("q"), array("q")
     for contacts in border.contacts():
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
         cell = torch.where(place.isfinite(), place, 0.0).floor().long()
-        for kept, values in zip(found, _each_once(contacts.pair, cell), strict=True):
+        for kept, values in zip(cells, _each_once(contacts.pair, cell), strict=True):
             kept.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _each_once(*(torch.from_numpy(np.array(kept)).to(points.device) for kept in found))
+    pair, cell = _each_once(*(torch.from_numpy(np.array(kept)).to(points.device) for kept in cells))
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
     steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))

@@ -114,11 +114,11 @@ def grow_regions(
         >>> points = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
         >>> normals, curvature = torch.eye(3)[[2] * 16], torch.zeros(16)
         >>> neighbors = Neighbors(torch.arange(16).expand(16, 16))
-        >>> found = grow_regions(
+        >>> labels = grow_regions(
         ...     points, normals, curvature, neighbors, GrowingConfig(min_size=9),
         ...     residual_rms=torch.zeros(16),
         ... )
-        >>> found.unique()
+        >>> labels.unique()
         tensor([0])
     """
     if not isinstance(config, GrowingConfig):
@@ -262,14 +262,14 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     # The last entry is what -1 finds.
     numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
     numbers[kept] = np.arange(len(kept))
-    found = numbers[old]
+    numbered = numbers[old]
     firsts = np.full(len(kept) + 1, len(old))
     for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
-        firsts[found[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
+        firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
     order = np.lexsort((firsts[:-1], -sizes))
     ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
     ranks[order] = np.arange(len(kept))
-    return torch.from_numpy(ranks[found]).to(regions.device)
+    return torch.from_numpy(ranks[numbered]).to(regions.device)
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:

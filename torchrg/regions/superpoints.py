@@ -194,9 +194,9 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
     kept = column < _MOST_EDGES
     width = max(int(counts.max()), 1) if len(edges) else 1
-    found = torch.arange(num_places)[:, None].repeat(1, min(width, _MOST_EDGES))
-    found[edges[kept, 0], column[kept]] = edges[kept, 1]
-    return found
+    listed = torch.arange(num_places)[:, None].repeat(1, min(width, _MOST_EDGES))
+    listed[edges[kept, 0], column[kept]] = edges[kept, 1]
+    return listed
 
 
 class _Regions(NamedTuple):
@@ -292,8 +292,8 @@ def _first_regions(pieces: Tensor, nearest: Tensor) -> Tensor:
         inside = (pieces[nearest[rows]] == pieces[rows, None]) & (pieces[rows, None] >= 0)
         return inside.sum(dim=1), nearest[rows][inside].to(torch.int32)
 
-    found = map_chunks(find, len(pieces), ROWS_AT_ONCE, pieces.device)
-    counts, targets = (torch.cat(parts) for parts in zip(*found, strict=True))
+    parts = map_chunks(find, len(pieces), ROWS_AT_ONCE, pieces.device)
+    counts, targets = (torch.cat(parts) for parts in zip(*parts, strict=True))
     starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     links = np.ones(len(targets), dtype=np.int8)
     shape = (len(pieces), len(pieces))
@@ -388,9 +388,9 @@ def _merge_to_count(
     """
     num_large, chosen = 0, (graph, torch.arange(len(graph.regions.size)))
     for state in _merging(graph, bound, _is_cheap, count):
-        found = int((state[0].regions.size >= min_size).sum())
-        if found >= min(num_large, count):
-            num_large, chosen = found, state
+        num_enough = int((state[0].regions.size >= min_size).sum())
+        if num_enough >= min(num_large, count):
+            num_large, chosen = num_enough, state
     graph, become = chosen
     graph, merged = _last(_merging(graph, bound, partial(_joins_small, min_size)))
     graph, again = _last(_merging(graph, bound, _is_cheap, count))

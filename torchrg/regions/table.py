@@ -119,13 +119,13 @@ def summarize_planes(
     first, second = _plane_axes(fit)
 
     def measure() -> list[_Measures]:
-        found, start = [], 0
+        parts, start = [], 0
         for some in segments.split(POINTS_AT_ONCE):
             rows = slice(start, start + len(some.counts))
             frame = (fit.center[rows], first[rows], second[rows])
-            found.append(_measure(points, some, frame, outline=outline))
+            parts.append(_measure(points, some, frame, outline=outline))
             start = rows.stop
-        return found
+        return parts
 
     def meet() -> PlaneAdjacency | None:
         if neighbors is None:
@@ -134,7 +134,7 @@ def summarize_planes(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
 
-    measures, found = run_beside(measure, meet, points.device)
+    measures, meeting = run_beside(measure, meet, points.device)
     mean, area, sides, directions, middle = (
         torch.cat(parts) for parts in list(zip(*measures, strict=True))[:5]
     )
@@ -159,9 +159,9 @@ def summarize_planes(
         planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
     if outline:
         planes = planes._replace(outline=sum((part.outline for part in measures), ()))
-    if found is not None:
-        lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
-        planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
+    if meeting is not None:
+        lengths, angles = own(meeting.boundary_length), own(meeting.dihedral_deg)
+        planes = planes._replace(adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
 
 

@@ -224,9 +224,9 @@ def _per_count(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], 
     results: Tensor | None = None
     for count in sorted(set(counts.tolist())) or [n]:
         chosen = (counts == count) & ~broken
-        found = of_sorted(ascending[chosen][:, :count].contiguous())
-        results = out.to(found.dtype) if results is None else results
-        results[chosen] = found
+        of_count = of_sorted(ascending[chosen][:, :count].contiguous())
+        results = out.to(of_count.dtype) if results is None else results
+        results[chosen] = of_count
     return (out if results is None else results).reshape(shape)
 
 
@@ -368,8 +368,8 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     last = rows.shape[1] - 1
     partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
     own = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
-    found = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
-    is_pair = (found == difference[:, None, None]) & (partners > own)
+    gaps = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
+    is_pair = (gaps == difference[:, None, None]) & (partners > own)
     pick = is_pair.flatten(1).to(torch.uint8).argmax(dim=1, keepdim=True)
     low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (own, partners))
     return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)

@@ -99,15 +99,15 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
     if len(zero) == 0:
         return scale
     deviations = sort_rows((rows[zero] - center[zero, None]).abs().contiguous())
-    found = torch.ones_like(scale[zero])
+    positive = torch.ones_like(scale[zero])
     last = deviations.shape[1] - 1
     for level in (0.9875, *(level / 100 for level in range(95, 49, -5))):
         low = int(level * last)
         high, part = min(low + 1, last), level * last - low
         quantile = deviations[:, low] * (1 - part) + deviations[:, high] * part
         quantile = quantile / NormalDist().inv_cdf((level + 1) / 2)
-        found = torch.where(quantile > 0, quantile, found)
-    return scale.index_copy(0, zero, found)
+        positive = torch.where(quantile > 0, quantile, positive)
+    return scale.index_copy(0, zero, positive)
 
 
 def _scatter_matrices(columns: list[Tensor]) -> Tensor:
