@@ -1,4 +1,4 @@
-"""What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
+"""Values that one step gives to the next: clouds, neighbours, fits, planes, segmentations."""
 
 import warnings
 from collections.abc import Callable, Mapping

@@ -77,19 +77,17 @@ def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxe
 
 def near_boxes(
     boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
-) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.bool_]]]:
-    """Yield which boxes are within the reach ``(n,)`` of the chosen ones ``(n,)``.
-
-    For some of the chosen ones at a time: which these are, the numbers of boxes near them, and who
-    is near whom, shape ``(chosen, near)``.
-    """
+) -> NDArray[np.bool_]:
+    """Return which boxes are within the reach ``(n,)`` of one of those chosen ``(n,)``."""
+    is_near = np.zeros(len(boxes.low), dtype=bool)
     about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
     all_low, all_high = boxes.low[about], boxes.high[about]
     for some in chunks_of(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[some]], boxes.high[chosen[some]]
         near = _about(all_low, all_high, low, high, reach[some])
-        gap = _gaps(all_low[near], all_high[near], low, high)
-        yield some, about[near], gap <= reach[some, None] * _ROUNDING
+        within = _gaps(all_low[near], all_high[near], low, high) <= reach[some, None] * _ROUNDING
+        is_near[about[near[within.any(axis=0)]]] = True
+    return is_near
 
 
 def _about(
@@ -210,21 +208,14 @@ def _reach_of_boxes(
     return reach
 
 
-def _rows_of(boxes: Boxes, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the rows of some boxes."""
+def _rows_near(
+    boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the rows of all boxes within reach of one of those chosen."""
+    numbers = np.flatnonzero(near_boxes(boxes, chosen, reach))
     starts, counts = boxes.starts[numbers], np.diff(boxes.starts)[numbers]
     ends = np.cumsum(counts)
     return np.repeat(starts - ends + counts, counts) + np.arange(ends[-1])
-
-
-def _rows_near(
-    boxes: Boxes, numbers: NDArray[np.int64], reach: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return the rows of all boxes within reach of some."""
-    is_near = np.zeros(len(boxes.low), dtype=bool)
-    for _, near, within in near_boxes(boxes, numbers, reach):
-        is_near[near[within.any(axis=0)]] = True
-    return _rows_of(boxes, np.flatnonzero(is_near))
 
 
 def _search_each(

@@ -16,7 +16,7 @@ from torchrg.neighbors import finite_rows, gather_patches, search_knn
 from torchrg.structures import Neighbors
 
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
-"""What normals can be turned towards."""
+"""Names of the directions and sides that normals can be turned towards."""
 
 _NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""

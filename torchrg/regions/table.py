@@ -33,7 +33,7 @@ _TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
 1 and 1.5, and 1 more as angles begin at -pi."""
 
 _POINTS_PER_CELL = 9.0
-"""So many points in an average cell leave one of 8,000 empty by chance."""
+"""Points in an average cell; one cell of 8,000 is then empty by chance."""
 
 _NUM_DOUBLINGS = 4
 """How often cells are made twice as wide, at most."""

@@ -28,7 +28,7 @@ from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
-"""What the efficiency of 95 % at the normal distribution refers to."""
+"""Estimate that the efficiency of 95 % at the normal distribution refers to."""
 
 _BREAKDOWN = 0.5
 """Share of the points that may be arbitrary."""

@@ -1,4 +1,4 @@
-"""What surface explains each neighbourhood: a plane, a paraboloid, or planes that meet."""
+"""The surface that explains each neighbourhood: a plane, a paraboloid, or planes that meet."""
 
 from typing import NamedTuple
 
