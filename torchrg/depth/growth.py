@@ -305,10 +305,10 @@ def _refine(
 
 def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
     """Return what :func:`join_strips` does for the regions of an inverse cloud ``(H * W,)``."""
-    shape, pixels = cloud.seen.shape, torch.arange(len(labels), device=labels.device)
-    rays, noise = _rays(cloud, pixels).view(*shape, 3), cloud.noise.view(shape)
-    image, normals = labels.view(shape), _normals_in_space(fit)
-    return join_strips(image, rays, noise, _planes_over_rays(fit), normals).flatten()
+    shape, (x, y, _) = cloud.seen.shape, cloud.points.unbind(dim=1)
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=-1).view(*shape, 3)
+    planes, normals = _planes_over_rays(fit), _normals_in_space(fit)
+    return join_strips(labels.view(shape), rays, cloud.noise.view(shape), planes, normals).flatten()
 
 
 def _planes_over_rays(fit: RegionPlanes) -> Tensor:
@@ -438,9 +438,3 @@ def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Return the last coordinates ``(*)`` of planes ``(*, 3)`` at rays ``(x, y, 1)``."""
     a, b, c = planes.unbind(dim=-1)
     return a * x + b * y + c
-
-
-def _rays(cloud: InverseCloud, pixels: Tensor) -> Tensor:
-    """Return the rays ``(x, y, 1)`` of some pixels ``(*)``, shape ``(*, 3)``."""
-    x, y, _ = cloud.points.unbind(dim=1)
-    return torch.stack([x[pixels], y[pixels], torch.ones_like(x[pixels])], dim=-1)
