@@ -219,8 +219,8 @@ def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if torch.compiler.is_compiling():
             uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
-            found: Result = uncompiled(*args, **kwargs)
-            return found
+            result: Result = uncompiled(*args, **kwargs)
+            return result
         if not has_values(*(given for given in (*args, *kwargs.values()) if is_tensor(given))):
             raise ShapeError(
                 f"{function.__name__}: expected points with values, got those of vmap, torch.func "

@@ -44,7 +44,7 @@ def opaque(
         name = function.__name__
         parameters = tuple(inspect.signature(function).parameters)
         kind: Any = inspect.signature(function).return_annotation
-        make = kind if kind is not Tensor else (lambda found: found)
+        make = kind if kind is not Tensor else (lambda outputs_of_call: outputs_of_call)
         _FUNCTIONS[name] = _Function(function, outputs, differentiable)
 
         @wraps(function)
@@ -58,8 +58,8 @@ def opaque(
                 if key not in tensors and value is not None:
                     _check_literal(name, key, value)
                     parts.append(f"{key}={value!r}")
-            found = _apply("|".join(parts), list(tensors.values()))
-            result: Result = make(*found)
+            outputs_of_call = _apply("|".join(parts), list(tensors.values()))
+            result: Result = make(*outputs_of_call)
             return result
 
         return call
@@ -79,8 +79,8 @@ def _check_literal(name: str, key: str, value: object) -> None:
 def _apply(call: str, tensors: list[Tensor]) -> list[Tensor]:
     """Run an opaque function, with gradients if the first tensor wants them or may want them."""
     if torch.compiler.is_compiling() and not tensors[0].requires_grad:
-        found: list[Tensor] = _forward(tensors, call)
-        return found
+        outputs: list[Tensor] = _forward(tensors, call)
+        return outputs
     return list(_Differentiable.apply(call, *tensors))  # type: ignore[no-untyped-call]
 
 
@@ -92,8 +92,8 @@ def _parse(call: str, tensors: list[Tensor]) -> tuple[_Function, dict[str, Any]]
     return _FUNCTIONS[name], arguments | {key: ast.literal_eval(text) for key, text in pairs}
 
 
-def _as_list(found: Any) -> list[Tensor]:  # noqa: ANN401
-    tensors = [found] if isinstance(found, Tensor) else found
+def _as_list(outputs: Any) -> list[Tensor]:  # noqa: ANN401
+    tensors = [outputs] if isinstance(outputs, Tensor) else outputs
     return [tensor for tensor in tensors if tensor is not None]
 
 
@@ -117,8 +117,8 @@ def _backward(tensors: list[Tensor], call: str) -> Tensor:
 
     def differentiate() -> Tensor:
         values = arguments[name].detach().clone().requires_grad_()
-        found = _as_list(function.run(**{**arguments, name: values}))
-        chosen = [found[place] for place in function.differentiable]
+        outputs = _as_list(function.run(**{**arguments, name: values}))
+        chosen = [outputs[place] for place in function.differentiable]
         (gradient,) = torch.autograd.grad(chosen, values, gradients)
         copied: Tensor = gradient.clone()
         return copied
@@ -150,8 +150,8 @@ if hasattr(_forward, "register_vmap"):  # torch 2.5
 
     @_forward.register_vmap
     def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-        found = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
-        return found, [0] * len(found)
+        outputs = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
+        return outputs, [0] * len(outputs)
 
     @_backward.register_vmap
     def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401

@@ -32,7 +32,7 @@ ROWS_IN_CACHE = 8192
 """Rows of some fifty values that a thread works on at a time, so that they stay in the cache."""
 
 CHUNK_SIZE = 16384
-"""Points that each stage handles at a time where the caller does not say."""
+"""Points that each stage handles at a time by default."""
 
 ROWS_AT_ONCE = 65536
 """Rows that one pass over a cloud takes at a time: few calls, and temporaries of bounded memory."""

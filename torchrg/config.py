@@ -135,9 +135,6 @@ class GrowingConfig:
     absorb_reach: float = 3.0
     """With absorb, a point is on the plane of a region when it is within this many times the
     thickness of the region."""
-    absorb_angle_deg: float = 45.0
-    """With absorb, a point joins only if its normal is within this angle of the normal of the
-    plane."""
     refine_borders: bool = True
     """Whether points where regions touch go to the region that explains them best. Between two
     planes within reach, the line in which they meet decides. It needs absorb, and matters most for
@@ -165,7 +162,6 @@ class GrowingConfig:
         residual = self.max_plane_residual
         _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
         _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
-        _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
 

@@ -14,19 +14,19 @@ from torch import Tensor
 from torchrg.errors import PrecisionWarning
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
-"""Step of the coordinates, in spacings of the points, from which on people are told: of single
-precision, which nobody has chosen, and of a grid that a file has been written with."""
+"""Steps of the coordinates, in spacings of the points, from which on there is a note: those of
+float32, which nobody has chosen, and those of a grid that a file was written with."""
 _SURELY_FINE = 1e-3
-"""Step, in spacings of an even surface, up to which nothing is searched. Half of the points of a
-cloud would have to lie a hundred times as close as on an even surface for it to be too coarse."""
+"""Step, in spacings of an even surface, up to which nothing is searched: half of the points would
+have to lie a hundred times as close for it to be too coarse."""
 _QUARTILES = (0.25, 0.75)
-"""Quantiles of each coordinate, between which the middle half of a cloud lies. Single points far
-off, which have coarser steps than the others, play no part."""
+"""Quantiles of each coordinate about the middle half of a cloud: single points far off play no
+part."""
 _SAMPLE = 20_000
 """About as many points tell the spacing."""
 _CELL = 32
-"""Side of the cells that these points are in, in spacings of an even surface, of which seven of
-eight points are not at the border of their cell, where the nearest point may be outside."""
+"""Side of the cells of the sample, in spacings of an even surface: seven of eight points are not at
+the border of their cell, where the nearest point may be outside."""
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
 """Factors of the hash of a cell: M. Teschner et al. Optimized spatial hashing for collision
 detection of deformable objects. VMV, 2003."""

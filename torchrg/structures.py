@@ -1,4 +1,4 @@
-"""What torchrg passes between its parts: clouds, neighbours, fits, planes, segmentations."""
+"""Values that one step gives to the next: clouds, neighbours, fits, planes, segmentations."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -18,8 +18,8 @@ from torchrg.precision import note_on_steps
 UNLABELED = -1
 """Label of a point that belongs to no region."""
 FARTHEST = 1e12
-"""Largest coordinate of a point: what programs write for a missing one, 1e20, 1e30 or the largest
-float32, is beyond, and a room in any unit is not. Squares of these are far from float32's end."""
+"""Largest coordinate of a point. Programs write 1e20, 1e30 or the largest float32 for a missing
+one."""
 
 
 Array = NDArray[Any]

@@ -12,8 +12,7 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.jet import fit_normals_jet
-from torchrg.normals.patches import fit_points
-from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.pca import fit_normals_pca, fit_points
 from torchrg.structures import Neighbors
 
 

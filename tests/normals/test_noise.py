@@ -8,8 +8,7 @@ from tests.made import make_shape
 from torchrg.config import load_config
 from torchrg.neighbors import search_knn
 from torchrg.normals.consensus.noise import regional_noise, survey_noise
-from torchrg.normals.patches import fit_points
-from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.pca import fit_normals_pca, fit_points
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Neighbors
 

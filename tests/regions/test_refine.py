@@ -71,15 +71,6 @@ def test_unlabelled_points_on_the_plane_are_absorbed_and_others_are_not():
     assert (refined[order >= 100] == 0).float().mean() > 0.99
 
 
-def test_points_with_another_direction_are_not_absorbed():
-    rng = np.random.default_rng(3)
-    normals = np.tile([0.0, 0.0, 1.0], (1500, 1))
-    normals[:200] = [1.0, 0.0, 0.0]
-    cloud, order = flat_cloud(sheet(rng), normals=normals)
-    labels = torch.where(order < 200, UNLABELED, 0)
-    assert torch.equal(refine_regions(cloud, labels, with_settings(absorb=True)), labels)
-
-
 def test_invalid_points_are_not_absorbed():
     cloud, order = flat_cloud(sheet(np.random.default_rng(4)))
     labels = torch.where(order < 200, UNLABELED, 0)
@@ -89,12 +80,11 @@ def test_invalid_points_are_not_absorbed():
     assert (refined[(order >= 100) & (order < 200)] == 0).float().mean() > 0.9
 
 
-def absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid, max_angle_deg):
+def absorbed_one_by_one(points, labels, neighbors, planes, reach, valid):
     """The rule of absorption, literally."""
     normal, center, reach = (part.tolist() for part in (planes.normal, planes.center, reach))
     nearest = neighbors.indices[:, 1:9].tolist()
     labels = labels.tolist()
-    least_cosine = np.cos(np.radians(max_angle_deg))
     while True:
         joined = {}
         for i, point in enumerate(points.tolist()):
@@ -103,8 +93,7 @@ def absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid
             options = []
             for region in {labels[j] for j in nearest[i]} - {UNLABELED}:
                 away = np.abs(np.dot(np.subtract(point, center[region]), normal[region]))
-                cosine = np.abs(np.dot(normals[i].tolist(), normal[region]))
-                if away <= reach[region] and cosine >= least_cosine:
+                if away <= reach[region]:
                     options.append((away, region))
             if options:
                 joined[i] = min(options)[1]
@@ -117,7 +106,7 @@ def absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid
 def test_absorption_follows_its_rule_literally():
     rng = np.random.default_rng(5)
     cloud = growing_clouds.prepare(growing_clouds.room(rng, 300, 0.01), 12)
-    points, normals, _, neighbors = cloud
+    points, _, _, neighbors = cloud
     labels = torch.full((len(points),), UNLABELED)
     axes = Segments(torch.arange(3))
     planes = fit_planes(axes, torch.zeros(3, 3).double(), torch.eye(3).double())
@@ -125,17 +114,8 @@ def test_absorption_follows_its_rule_literally():
     for axis in range(3):
         labels[(points[:, axis].abs() < 0.02).nonzero()[:30, 0]] = axis
     valid = torch.from_numpy(rng.random(len(points)) < 0.9)
-    found = absorb_points(
-        points,
-        labels,
-        NearestPoints(neighbors),
-        planes,
-        reach,
-        valid=valid,
-        normals=normals,
-        max_angle_deg=30.0,
-    )
-    expected = absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid, 30.0)
+    found = absorb_points(points, labels, NearestPoints(neighbors), planes, reach, valid=valid)
+    expected = absorbed_one_by_one(points, labels, neighbors, planes, reach, valid)
     assert found.tolist() == expected
     assert (found >= 0).sum() > (labels >= 0).sum()
 
@@ -422,7 +402,6 @@ def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
     [
         ("max_plane_residual", 0.0),
         ("absorb_reach", -1.0),
-        ("absorb_angle_deg", 91.0),
         ("merge_tolerance", 0.9),
         ("facet_tolerance", 0.0),
         ("max_distance", -1.0),

@@ -156,8 +156,8 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
     Example:
         >>> camera = make_intrinsics(50.0, 50.0, 3.5, 2.5)
         >>> depth = torch.linspace(1, 2, 48, dtype=torch.float64).view(1, 6, 8)
-        >>> found = find_intrinsics(depth_to_points(depth, camera[None])[0])
-        >>> bool((found - camera).abs().max() < 1e-9)
+        >>> matrix = find_intrinsics(depth_to_points(depth, camera[None])[0])
+        >>> bool((matrix - camera).abs().max() < 1e-9)
         True
     """
     check_shapes("find_intrinsics", points=(points, "H W 3"))

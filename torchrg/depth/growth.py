@@ -43,8 +43,8 @@ _BENT = 0.03
 A slightly bent face is a face, and a column is 0.4 of its extent thick."""
 
 _NUM_FITS = 2
-"""Fits of a region's plane: a plain one and a reweighted one. More change nothing, as the pixels
-that grew into a region are near its plane already."""
+"""Fits of a region's plane, a plain one and a reweighted one: its pixels are near the plane
+already."""
 
 _ALIKE = 1.75
 """Factor of the largest angle between normals of two windows that both hold both pixels. On a
@@ -311,10 +311,10 @@ def _refine(
 
 def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
     """Return what :func:`join_strips` does for the regions of an inverse cloud ``(H * W,)``."""
-    shape, pixels = cloud.seen.shape, torch.arange(len(labels), device=labels.device)
-    rays, noise = _rays(cloud, pixels).view(*shape, 3), cloud.noise.view(shape)
-    image, normals = labels.view(shape), _normals_in_space(fit)
-    return join_strips(image, rays, noise, _planes_over_rays(fit), normals).flatten()
+    shape, (x, y, _) = cloud.seen.shape, cloud.points.unbind(dim=1)
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=-1).view(*shape, 3)
+    planes, normals = _planes_over_rays(fit), _normals_in_space(fit)
+    return join_strips(labels.view(shape), rays, cloud.noise.view(shape), planes, normals).flatten()
 
 
 def _planes_over_rays(fit: RegionPlanes) -> Tensor:
@@ -398,11 +398,11 @@ def move_to_creases(
         at_border = ((near >= 0) & (near != labels[rows][:, None])).any(dim=1)
         rows, around, near = rows[at_border], around[at_border], near[at_border]
         columns = [rows, around, labels[rows], near]
-        (found,) = map_rows(_regions_across, columns, *tables)
-        moved = found != labels[rows]
+        (across,) = map_rows(_regions_across, columns, *tables)
+        moved = across != labels[rows]
         if not bool(moved.any()):
             break
-        labels[rows[moved]] = found[moved]
+        labels[rows[moved]] = across[moved]
         rows = torch.unique(torch.cat([rows[moved], around[moved].flatten()]))
         rows = rows[labels[rows] >= 0]
     return labels
@@ -444,9 +444,3 @@ def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Return the last coordinates ``(*)`` of planes ``(*, 3)`` at rays ``(x, y, 1)``."""
     a, b, c = planes.unbind(dim=-1)
     return a * x + b * y + c
-
-
-def _rays(cloud: InverseCloud, pixels: Tensor) -> Tensor:
-    """Return the rays ``(x, y, 1)`` of some pixels ``(*)``, shape ``(*, 3)``."""
-    x, y, _ = cloud.points.unbind(dim=1)
-    return torch.stack([x[pixels], y[pixels], torch.ones_like(x[pixels])], dim=-1)

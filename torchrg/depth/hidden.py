@@ -12,12 +12,11 @@ _EVERY = 4
 _LEAST_LINES = 2
 """Rows and columns, of those looked at, that must lead from one region to the other."""
 _MOST_OFFSET = 0.5
-"""Thicknesses of the larger region by which the middle of the smaller may be off its plane. Those
-of one plane were off by less than 0.3 in nearly all rooms with a Kinect's noise, others by 1 and
-more."""
+"""The middle of the smaller region may be off the plane of the larger by this many of its
+thicknesses."""
 _LEAST_NEARER = 0.5
-"""Share of what parts two regions that must be in front of their plane. The rest may lie on it, or
-have no depth, as in the shadow of what is nearer."""
+"""Least share, of the pixels between two regions, in front of their plane. The others may lie on it
+or have no depth, as in the shadow of something nearer."""
 
 
 class _Lines(NamedTuple):

@@ -115,10 +115,10 @@ def fit_pixels(
     planes = fit_windows(inverse, seen, u, v)
     noises = noise_by_size(planes, noise, dtype)
     windows, first = dict[int, _SquareWindows](), 0
-    for size, found in planes.items():
-        limit = _tolerances(found, noises[size], size, focal)
-        windows[size] = _SquareWindows(size, first, found, noises[size], limit)
-        first += found.mean.numel()
+    for size, of_size in planes.items():
+        limit = _tolerances(of_size, noises[size], size, focal)
+        windows[size] = _SquareWindows(size, first, of_size, noises[size], limit)
+        first += of_size.mean.numel()
     choice = _Choice(inverse, seen, u, v)
     for size in CELL_SIZES:
         _offer_windows(choice, windows[size], windows.get(size // 2))
@@ -407,13 +407,13 @@ def _tolerances(
     """
     half = SIDE * size / 2 / max(map(abs, focal))
     columns = [planes.u_slope, planes.v_slope, planes.origin, planes.mean]
-    found = map_rows(
+    limits = map_rows(
         _tolerances_of_planes,
         [part.flatten() for part in columns],
         planes.mean.new_tensor(noise),
         planes.mean.new_tensor([*focal, half, jitter]),
     )
-    return _Tolerances(*(part.view(planes.mean.shape) for part in found))
+    return _Tolerances(*(part.view(planes.mean.shape) for part in limits))
 
 
 @kernel("n", "n", "n", "n", "4", "4")
@@ -444,9 +444,9 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
     for row in (0, corner):
         for column in (0, corner):
             part = padded[row : row + 2 * height : 2, column : column + 2 * width : 2]
-            found = part.isfinite()
-            squares += torch.where(found, part * part, 0.0)
-            count += found
+            counted = part.isfinite()
+            squares += torch.where(counted, part * part, 0.0)
+            count += counted
     return torch.where(count > 0, squares / count, torch.inf).sqrt()
 
 

@@ -60,8 +60,8 @@ def segment_depth(
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
         >>> depth = torch.full((30, 40), 2.0)
         >>> depth[:, 20:] = 3.0
-        >>> found = segment_depth(depth, intrinsics)
-        >>> found.labels[0, ::13].tolist(), found.planes.offset.tolist()
+        >>> seg = segment_depth(depth, intrinsics)
+        >>> seg.labels[0, ::13].tolist(), seg.planes.offset.tolist()
         ([0, 0, 1, 1], [2.0, 3.0])
     """
     depth = as_tensor("segment_depth", "depth", depth)

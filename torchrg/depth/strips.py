@@ -15,9 +15,9 @@ _MOST_TURN_DEG = 35.0
 _LEAST_BESIDE = 0.5
 """Share of the length of a strip along which it meets the face without a step."""
 _MOST_NOISE = 3.0
-"""Standard deviations of the noise of a pixel that are no step."""
+"""A gap of less than this many standard deviations of the noise of a pixel is no step."""
 _LEAST_REACH = 2.0
-"""Pixels from a border within which the planes of two regions meet that have no step between them;
+"""Regions meet without a step if their planes cross within so many pixels of the border, or within
 half the width of the strip if that is more."""
 
 

@@ -139,8 +139,8 @@ def _fit_planes(sums: Sequence[Tensor], sides: tuple[int, int]) -> WindowPlanes:
     one, other = sides
     full = (one * one - 1) * (other * other - 1) / 144
     least = sums[0].new_tensor([_LEAST_SHARE * one * other, _LEAST_SPREAD * full])
-    found = map_rows(_planes_of_sums, [part.flatten() for part in sums], least)
-    return WindowPlanes(*(part.view(sums[0].shape) for part in found))
+    columns = map_rows(_planes_of_sums, [part.flatten() for part in sums], least)
+    return WindowPlanes(*(part.view(sums[0].shape) for part in columns))
 
 
 @kernel(*["n"] * 10, "2")
@@ -164,11 +164,11 @@ def _planes_of_sums(
     uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
     spread = uu * vv - uv * uv
     least_count, least_spread = least.unbind()
-    found = (count >= least_count) & (spread > least_spread)
-    spread = torch.where(found, spread, 1.0)
+    has_plane = (count >= least_count) & (spread > least_spread)
+    spread = torch.where(has_plane, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
     variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
-    deviation = torch.where(found, variance.sqrt(), torch.inf)
+    deviation = torch.where(has_plane, variance.sqrt(), torch.inf)
     return u_slope, v_slope, w - u_slope * u - v_slope * v, deviation, w
 
 
@@ -221,8 +221,8 @@ def noise_by_size(
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
     for size in sorted(windows):
-        found = windows[size].deviation.isfinite()
-        deviation, mean = windows[size].deviation[found], windows[size].mean[found]
+        has_plane = windows[size].deviation.isfinite()
+        deviation, mean = windows[size].deviation[has_plane], windows[size].mean[has_plane]
         ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
         usual = float(_low_quantile(ratios)) if len(ratios) else factor
         factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)

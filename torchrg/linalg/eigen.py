@@ -12,14 +12,14 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes, has_values
 
 _JACOBI_SWEEPS = 5
-"""Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding, in float64
-too."""
+"""Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
+dtype."""
 
 _FIRST_STEPS, _MORE_STEPS = 4, 6
 """Steps of Newton's method for a simple root, and further steps for one that is nearly double."""
 
 _CONVERGED = 1e-9
-"""Share of the trace. A root that the last step moves by less has converged."""
+"""A root has converged if the last step moves it by less than this share of the trace."""
 
 _NEARLY_EQUAL = 1e-9
 """Share of the squared largest eigenvalue below which the adjugate gives no direction."""

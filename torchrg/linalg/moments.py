@@ -222,13 +222,8 @@ def kth_smallest(values: Tensor, k: int) -> Tensor:
 
 
 Columns = tuple[Tensor, Tensor, Tensor]
-"""Coordinates x, y and z of neighbourhoods, each ``(n, K)`` and contiguous.
-
-The lanes of :mod:`torchrg.robust.lanes` lie the other way, ``(K, n)``, as robust fits sort every
-neighbourhood and sort rows anyway. Tried here, that made consensus normals 18 % slower (200,000
-points, one core): neighbours rank by rank are gathered from all over the cloud, in 1.6 times the
-time, and sums over them are no faster.
-"""
+"""Coordinates x, y and z of neighbourhoods, each ``(n, K)`` and contiguous. The lanes of
+:mod:`torchrg.robust.lanes` lie the other way, as robust fits sort every neighbourhood."""
 
 
 def split_columns(patches: Tensor) -> Columns:

@@ -16,8 +16,8 @@ from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.neighbors.order import MORTON_BITS, morton_codes
 
 BLOCK_SIZE = 300_000
-"""Points of a block. Smaller ones search more points around them in vain, larger ones leave the
-cache of freed memory."""
+"""Points of a block. Smaller ones search more points around them in vain, larger ones take more
+memory."""
 _LEAST_CANDIDATES = 65536
 _CANDIDATES = 2
 """Rows searched at a time at most: as many as two blocks have, and so many that a small block is
@@ -26,15 +26,14 @@ not searched in crumbs."""
 SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
 """Points in canonical order, rows that are asked for, and k -> their neighbours, ``(n, k)``."""
 POINTS_PER_BOX = 256
-"""Points. A box of surface is then as wide as two neighbourhoods of 50: few rows are read in vain,
-and the boxes take a hundredth of the memory of the points."""
+"""Points of a box of surface about as wide as two neighbourhoods of 50: few rows are read in vain,
+and boxes take a hundredth of the memory of the points."""
 
 _ROUNDING = 1 + 1e-9
 """Factor by which distances are taken larger, so that rounding leaves no point out."""
 
 _BOXES_AT_ONCE = 64
-"""Boxes, near to one another as they follow one another: the box about them all leaves few others
-to compare with each."""
+"""Boxes that follow one another, whose common box leaves few others to compare with each."""
 
 
 class Boxes(NamedTuple):
@@ -78,19 +77,17 @@ def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxe
 
 def near_boxes(
     boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
-) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.bool_]]]:
-    """Yield which boxes are within the reach ``(n,)`` of the chosen ones ``(n,)``.
-
-    For some of the chosen ones at a time: which these are, the numbers of boxes near them, and who
-    is near whom, shape ``(chosen, near)``.
-    """
+) -> NDArray[np.bool_]:
+    """Return which boxes are within the reach ``(n,)`` of one of those chosen ``(n,)``."""
+    is_near = np.zeros(len(boxes.low), dtype=bool)
     about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
     all_low, all_high = boxes.low[about], boxes.high[about]
     for some in chunks_of(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[some]], boxes.high[chosen[some]]
         near = _about(all_low, all_high, low, high, reach[some])
-        gap = _gaps(all_low[near], all_high[near], low, high)
-        yield some, about[near], gap <= reach[some, None] * _ROUNDING
+        within = _gaps(all_low[near], all_high[near], low, high) <= reach[some, None] * _ROUNDING
+        is_near[about[near[within.any(axis=0)]]] = True
+    return is_near
 
 
 def _about(
@@ -168,8 +165,8 @@ def search_block(
     """
     first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
     reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
-    found = np.empty((block.stop - block.start, k), dtype=np.int32)
-    most = max(_CANDIDATES * len(found), _LEAST_CANDIDATES) if most is None else most
+    nearest = np.empty((block.stop - block.start, k), dtype=np.int32)
+    most = max(_CANDIDATES * len(nearest), _LEAST_CANDIDATES) if most is None else most
     waiting = [slice(first, last)]
     while waiting:
         some = waiting.pop()
@@ -183,14 +180,14 @@ def search_block(
             bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, some.start, k))
             rows = _rows_near(boxes, numbers, bound)
         asked = slice(boxes.starts[some.start], boxes.starts[some.stop])
-        into = found[asked.start - block.start : asked.stop - block.start]
+        into = nearest[asked.start - block.start : asked.stop - block.start]
         if len(rows) > most:
             into[:] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
             continue
         start = int(np.searchsorted(rows, asked.start))
         local = slice(start, start + asked.stop - asked.start)
         np.take(rows.astype(np.int32), search(points[rows], local, k), out=into, mode="clip")
-    return found
+    return nearest
 
 
 def _reach_of_boxes(
@@ -211,21 +208,14 @@ def _reach_of_boxes(
     return reach
 
 
-def _rows_of(boxes: Boxes, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the rows of some boxes."""
+def _rows_near(
+    boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the rows of all boxes within reach of one of those chosen."""
+    numbers = np.flatnonzero(near_boxes(boxes, chosen, reach))
     starts, counts = boxes.starts[numbers], np.diff(boxes.starts)[numbers]
     ends = np.cumsum(counts)
     return np.repeat(starts - ends + counts, counts) + np.arange(ends[-1])
-
-
-def _rows_near(
-    boxes: Boxes, numbers: NDArray[np.int64], reach: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return the rows of all boxes within reach of some."""
-    found = np.zeros(len(boxes.low), dtype=bool)
-    for _, near, within in near_boxes(boxes, numbers, reach):
-        found[near[within.any(axis=0)]] = True
-    return _rows_of(boxes, np.flatnonzero(found))
 
 
 def _search_each(

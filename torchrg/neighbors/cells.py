@@ -93,9 +93,9 @@ def _search_level(
     answered = np.zeros(len(points), dtype=bool)
 
     def work(cells: NDArray[np.int64]) -> None:
-        found = _search_task(grid, cells, k)
-        answered[found[0]] = True
-        store(*found)
+        answers = _search_task(grid, cells, k)
+        answered[answers[0]] = True
+        store(*answers)
 
     map_tasks(work, _make_tasks(grid, k), torch.device("cpu"))
     return rows[~answered[rows]]

@@ -134,8 +134,8 @@ def search_nearest(
     # Those close to each other find the same parts of the tree in the cache.
     asked = canonical_order(queries).numpy()
     for chunk in chunks_of(len(asked), ROWS_AT_ONCE):
-        distances, found = _query(tree, queries[asked[chunk]], 1)
-        nearest[asked[chunk]] = np.where(distances <= max_distance, first[found], -1)[:, 0]
+        distances, places = _query(tree, queries[asked[chunk]], 1)
+        nearest[asked[chunk]] = np.where(distances <= max_distance, first[places], -1)[:, 0]
     return nearest
 
 
@@ -191,18 +191,18 @@ def _search_cloud(
     places = points[starts].astype(np.float64)
 
     def store(
-        queried: NDArray[np.integer], distances: NDArray[np.float64], found: NDArray[np.integer]
+        queried: NDArray[np.integer], distances: NDArray[np.float64], nearest: NDArray[np.integer]
     ) -> None:
         rows = queried
         if len(places) < len(points):
-            rows, distances, found = _restore_duplicates(
-                queried, distances, found, starts, counts, k
+            rows, distances, nearest = _restore_duplicates(
+                queried, distances, nearest, starts, counts, k
             )
         if outside is not None:
             too_far = distances > max_distance
-            found = np.where(too_far, rows[:, None], found)
+            nearest = np.where(too_far, rows[:, None], nearest)
         into = rows if order is None else order[rows]
-        indices[into] = (found if order is None else order[found]) + first_row
+        indices[into] = (nearest if order is None else order[nearest]) + first_row
         if outside is not None:
             outside[into] = too_far
 
@@ -228,9 +228,9 @@ def _query(
     left, width = np.arange(len(queries)), k + 1
     while len(left):
         ranks = np.arange(1, min(width, tree.n) + 1)
-        near, found = tree.query(queries[left], ranks, workers=allowed_threads())
-        sort_ties(near, found, near[:, 1:] == near[:, :-1])
-        distances[left], rows[left] = near[:, :k], found[:, :k]
+        near, rows_near = tree.query(queries[left], ranks, workers=allowed_threads())
+        sort_ties(near, rows_near, near[:, 1:] == near[:, :-1])
+        distances[left], rows[left] = near[:, :k], rows_near[:, :k]
         is_open = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
         left, width = left[is_open], 2 * width
     return distances, rows
@@ -239,17 +239,17 @@ def _query(
 def _restore_duplicates(
     queried: NDArray[np.integer],
     distances: NDArray[np.float64],
-    found: NDArray[np.integer],
+    nearest: NDArray[np.integer],
     starts: NDArray[np.int64],
     counts: NDArray[np.int64],
     k: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Replace places by all their points: their rows, and the nearest k, the point itself first."""
-    before = np.minimum(np.cumsum(counts[found], axis=1), k)
+    before = np.minimum(np.cumsum(counts[nearest], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
-    position = np.arange(len(found) * k) - np.repeat(np.cumsum(taken) - taken, taken)
-    points = (np.repeat(starts[found.ravel()], taken) + position).reshape(len(found), k)
-    far = np.repeat(distances.ravel(), taken).reshape(len(found), k)
+    position = np.arange(len(nearest) * k) - np.repeat(np.cumsum(taken) - taken, taken)
+    points = (np.repeat(starts[nearest.ravel()], taken) + position).reshape(len(nearest), k)
+    far = np.repeat(distances.ravel(), taken).reshape(len(nearest), k)
     place = np.repeat(np.arange(len(queried)), counts[queried])
     rank = np.arange(len(place)) - np.searchsorted(place, place)
     rows = starts[queried][place] + rank
@@ -280,8 +280,8 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
     """
     flat = indices.reshape(-1)
     if points.requires_grad and torch.is_grad_enabled():
-        found = points.index_select(0, flat).view(*indices.shape, 3)
-        return found - found[:, :1]
+        gathered = points.index_select(0, flat).view(*indices.shape, 3)
+        return gathered - gathered[:, :1]
     patches = points.new_empty((3, *indices.shape))
     for axis in range(3):
         column = points[:, axis].index_select(0, flat).view(indices.shape)

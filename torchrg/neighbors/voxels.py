@@ -13,10 +13,10 @@ from torchrg.errors import ConfigError
 from torchrg.structures import UNLABELED
 
 _MOST_VOXELS = 2**53
-"""Along one axis: float64 counts no further."""
+"""Most voxels along one axis: float64 counts no further."""
 
 _MOST_KEYS = 2**62
-"""Of whole numbers of 64 bits, positive ones; the square of the number of points is below it."""
+"""Most cells with numbers of their own in int64; the square of the number of points is below it."""
 
 
 class Voxels(NamedTuple):

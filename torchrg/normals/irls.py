@@ -14,8 +14,13 @@ from torchrg.errors import ConfigError
 from torchrg.linalg import second_moments
 from torchrg.linalg.eigen import principal_frame
 from torchrg.normals.consensus.noise import survey_noise
-from torchrg.normals.patches import about_first, fit_points, replace_rows
-from torchrg.normals.pca import check_patches, fit_normals_pca
+from torchrg.normals.pca import (
+    about_first,
+    check_patches,
+    fit_normals_pca,
+    fit_points,
+    replace_rows,
+)
 from torchrg.structures import Neighbors, NormalFit
 
 _HEAVY = 0.25
@@ -140,21 +145,14 @@ def fit_normals_irls(
         here it is flat.
         Gradients are those of the steps as taken, and are recomputed step by step to save memory.
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the point itself first.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything, NaN
-            included. Default: all.
-        noise: Standard deviation of the noise, shape ``(*)``, in the unit of the cloud. At least
-            1e-4 of the distance to the farthest point is assumed.
-        mu_decay: Factor above 1 by which ``mu`` shrinks in a step.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``.
+    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`, the point itself
+    first. ``noise`` is its standard deviation, shape ``(*)``, in the unit of the cloud; at
+    least 1e-4 of the distance to the farthest point is assumed. ``mu_decay``, above 1, is the
+    factor by which ``mu`` shrinks in a step.
 
     Returns:
         The fit. Curvature and residual are those of PCA on it and the points of weight above
         1/4, or on all points where these span no plane; so is ``valid``.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
 
     References:
         [1] J. Sanchez, F. Denis, D. Coeurjolly, F. Dupont, L. Trassoudaine, P. Checchin. Robust

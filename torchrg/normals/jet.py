@@ -17,8 +17,7 @@ from torchrg._checks import in_own_precision
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root
 from torchrg.linalg.moments import Columns, along, sq_lengths
-from torchrg.normals.patches import about_first
-from torchrg.normals.pca import check_patches, fit_plane, patch_resolution
+from torchrg.normals.pca import about_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
@@ -91,20 +90,13 @@ def fit_jet(
         Gradients flow through everything but the principal directions, and are finite where two
         eigenvalues are equal.
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``, the point itself first.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything, NaN
-            included. Default: all.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in the unit
-            of the cloud. Default: rounding of the patch's own coordinates.
+    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`, the point itself
+    first in each patch.
 
     Returns:
         The fit. Terms that the points do not determine are left out, the last ones first: two
         straight scan lines have no ``v^2``; fewer than six points have no quadratic terms, which
         leaves the plane of PCA. ``valid`` is that of :func:`torchrg.normals.fit_normals_pca`.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
 
     References:
         [1] F. Cazals, M. Pouget. Estimating differential quantities using polynomial fitting of

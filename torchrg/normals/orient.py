@@ -16,14 +16,14 @@ from torchrg.neighbors import finite_rows, gather_patches, search_knn
 from torchrg.structures import Neighbors
 
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
-"""What normals can be turned towards."""
+"""Names of the directions and sides that normals can be turned towards."""
 
 NUM_NEIGHBORS = 20
 """Neighbours that are searched where none are given."""
 
 _NUM_LINKS = 12
-"""Nearest neighbours over which signs spread. So many reach from one face of a thin plate to the
-other."""
+"""Nearest neighbours over which signs spread: as many as reach between the faces of a thin
+plate."""
 
 _MOST_SPREADING = 2**19
 """Points over which signs spread. Of larger clouds so many stand for all, which takes a kilobyte
@@ -53,8 +53,8 @@ _CLEARLY_OUTWARDS = 1e-3
 
 _SPACINGS_PER_CELL = 1.5
 _SPACING_QUANTILE = 0.9
-"""Quantile of the spacing of the points that gives the side of a cell. Sparse walls must have no
-holes."""
+"""Quantile of the spacing of the points that gives the side of a cell, so that sparse walls are
+closed."""
 
 _CELLS_PER_POINT = 16
 """A grid with more cells a point than this, and more than a thousand, is made coarser."""

@@ -10,8 +10,7 @@ from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
-from torchrg.normals.patches import fit_points, replace_rows
-from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.pca import fit_normals_pca, fit_points, replace_rows
 from torchrg.normals.robust import fit_normals_robust
 from torchrg.robust.scale import QN_FACTOR, qn_exceeds
 from torchrg.structures import Neighbors, NormalFit

@@ -25,23 +25,14 @@ def fit_normals_robust(
     on them. (The paper prints the cut as 3.075; that is the root, 3.0575, of the quantile 9.3484
     that its eq. (6) asks for.)
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        estimator: Of location and scatter: :func:`torchrg.robust.fit_detmcd`,
-            :func:`torchrg.robust.fit_fastmcd` [2], :func:`torchrg.robust.fit_mve` [3], or
-            :func:`torchrg.robust.fit_detmm` [4].
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in the unit
-            of the cloud. Default: rounding of the patch's own coordinates.
-        **settings: Of the estimator, such as ``support_fraction``, ``quantile``, ``num_starts``.
+    The estimator is :func:`torchrg.robust.fit_detmcd`, :func:`torchrg.robust.fit_fastmcd` [2],
+    :func:`torchrg.robust.fit_mve` [3] or :func:`torchrg.robust.fit_detmm` [4]; other keywords are
+    its settings. The other arguments and errors are those of
+    :func:`torchrg.normals.fit_normals_pca`; a setting out of range is a ``ConfigError``.
 
     Returns:
         The fit. Where the trusted share of the points lies exactly on one plane it is that plane,
         with curvature 0; where no unique plane exists ``valid`` is False.
-
-    Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a setting is out of range.
 
     References:
         [1] M. Hubert, P. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location and

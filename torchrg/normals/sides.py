@@ -13,7 +13,7 @@ from torchrg.normals.orient import Orientation, orient_normals, turn_towards
 from torchrg.structures import Cloud
 
 CloudOrientation = Orientation | Literal["auto", "up", "none"]
-"""What the normals of a cloud can be turned towards."""
+"""Names of the sides that the normals of a cloud can be turned towards."""
 
 _FEW = 0.01
 """Share of the points up to which those of unknown front, as vertices of no face, follow their

@@ -15,7 +15,7 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
 NUM_CONTACTS = 8
-"""So many neighbours surround a point of a surface; more reach across gaps."""
+"""Neighbours that surround a point of a surface; more reach across gaps."""
 
 LEAST_CONTACTS = 3
 """Regions that touch in fewer edges neither meet nor are merged: one may be an outlier's."""
@@ -24,11 +24,12 @@ PARALLEL_DEG = 15.0
 """At a smaller angle the line in which two planes cross may be far from where the faces end."""
 
 _REACH = 4.0
-"""Thicknesses of the planes. An edge that leads across them by no more is within their noise."""
+"""An edge that leads across the planes by at most this many of their thicknesses is within their
+noise."""
 
 _MAX_STEEPNESS = 0.25
-"""Share of the way to the 8th neighbour. An edge that leads across the planes by no more follows
-the surface. One that leads farther than this and than the noise goes to a parallel surface."""
+"""An edge follows the surface if it leads across the planes by at most this share of the way to the
+8th neighbour. One beyond this and the noise goes to a parallel surface."""
 
 
 def find_adjacency(
@@ -180,8 +181,8 @@ class _Border:
         for some in chunks_of(len(labels), ROWS_IN_CACHE):
             places, _, keys = self._edges_of(some)
             touches[some.start + places // self._width] = True
-            found = torch.unique(keys, return_counts=True)
-            counts.update(dict(zip(*(values.tolist() for values in found), strict=True)))
+            values_of_chunk = torch.unique(keys, return_counts=True)
+            counts.update(dict(zip(*(values.tolist() for values in values_of_chunk), strict=True)))
         self._rows = places_of(touches).to(torch.int32)
         self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
         self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
@@ -234,16 +235,16 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
     NaN for pairs that do not meet on a line.
     """
     origin = points[:1].double()
-    found = array("q"), array("q")
+    cells = array("q"), array("q")
     for contacts in border.contacts():
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
         cell = torch.where(place.isfinite(), place, 0.0).floor().long()
-        for kept, values in zip(found, _each_once(contacts.pair, cell), strict=True):
+        for kept, values in zip(cells, _each_once(contacts.pair, cell), strict=True):
             kept.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _each_once(*(torch.from_numpy(np.array(kept)).to(points.device) for kept in found))
+    pair, cell = _each_once(*(torch.from_numpy(np.array(kept)).to(points.device) for kept in cells))
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
     steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))

@@ -19,7 +19,7 @@ _MOST_TILT_DEG = 30.0
 _NEAR_DEG = 3.0
 """Planes of one direction differ by less: walls are built within a degree, scanned within two."""
 _NUM_FITS = 5
-"""Reweighted fits; a sixth moves made rooms by less than 0.001 degrees."""
+"""Reweighted fits, after which a direction stands."""
 _LEAST_SHARE = 0.02
 """Share of the area of all planes below which those of a direction are furniture, not a room."""
 

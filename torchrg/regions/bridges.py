@@ -24,37 +24,38 @@ _CORE_SHARE = 0.5
 """Share of the limits of angle and distance within which the core of a face is connected."""
 
 _SMOOTH_ANGLE = 0.3
-"""Share of the largest angle. Where normals of neighbours differ by less, a surface is smooth."""
+"""A surface is smooth where normals of neighbours differ by less than this share of the largest
+angle."""
 
 _LEAST_SMOOTH = 0.7
-"""Share of the median of a region. At points with a smaller share of such neighbours two faces may
-meet in noise, where normals turn from one to the other by and by: no core grows through them."""
+"""Cores grow only through points with at least 0.7 of the smooth neighbours that are usual (the
+median) in their region; elsewhere noise may hide an edge."""
 
 _MOST_OFF_PLANE = 0.1
 """Share of a region's points off its plane up to which the others are one face."""
 
 _EXACT_REACH = 4.0
-"""Times the least thickness. Distance from a plane within which points of exact faces are on it."""
+"""Points of exact faces lie within this many least thicknesses of the plane of their region."""
 
 _LEAST_FLAT = 0.5
-"""Share of a region's points in flat cores from which it is faces: a noisy column breaks into cores
-that are few, and curved."""
+"""A region is made of faces if at least this share of its points is in flat cores: a noisy column
+breaks into cores that are few, and curved."""
 
 _LEAST_FACE = 0.05
-"""Share of the points of another region from which a flat core is a face beside what is curved: the
-panel that a moulding runs around. Smaller ones are parts of a surface that bends."""
+"""A flat core beside curved ones is a face if it has at least this share of the points of the
+region, as the panel that a moulding runs around. Smaller ones belong to the bend."""
 
 _OPEN_SHARE = 0.1
-"""Least share of the edges between two cores that pass the criteria where a surface goes on; where
-a bridge joins them it is a few in a hundred."""
+"""A surface goes on between two cores if at least this share of the edges between them passes the
+criteria; across a bridge a few in a hundred do."""
 
 _LEAST_MISFIT = 2.0
-"""Times the thickness. Two cores lie on one plane when they are nearer to it: parts of a face that
-noise has bent are."""
+"""Two cores lie on one plane if their misfit to it is below this many thicknesses, as it is for
+parts of a face that noise has bent."""
 
 _MOST_TURNED_DEG = 30.0
-"""And when their own planes are not turned by more: of narrow strips on both sides of an edge one
-plane is also within twice the thickness."""
+"""Largest angle between the planes of cores that are joined, degrees. ``_LEAST_MISFIT`` alone would
+join narrow strips on both sides of an edge."""
 
 
 class MixedRegions(NamedTuple):

@@ -42,20 +42,20 @@ LEAST_FITTED = 10
 """Points whose plane says where others at its border belong: that of three passes through them."""
 
 _BENT = 0.5
-"""Reaches. A region thicker than this share of the reach that its points have is bent: twice as
-thick as the neighbourhoods in it. From 0.3 to 0.5 made rooms come out the same."""
+"""A region is bent if its thickness is over half the median reach of its points. Reach is four
+residuals, so this is twice the noise."""
 
 _FACET_THICKNESS = 2 / 3
-"""Facet tolerances. Least thickness of the faces of a mesh: points beside a face are on facets of
-it that are no closer to its plane than those in it."""
+"""Least thickness of the faces of a mesh, in facet tolerances: points beside a face are on facets
+no closer to its plane than those in it."""
 
 _LEAST_HEIGHT = 0.2
-"""Of the product of angle and width, both as standard deviations: an arc is 0.45 of it thick, a cap
-of a sphere 0.41. Scattered normals in a thin region are noise."""
+"""An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. What is
+thinner than 0.2 a w is a plane with noisy normals."""
 
 
 _SQ_WIDTH = 12.0
-"""Variances. Square of the width of a strip that points cover evenly."""
+"""Square of the width of a strip that points cover evenly, in units of their variance across it."""
 
 
 class RegionPlanes(NamedTuple):

@@ -3,7 +3,6 @@
 import math
 from array import array
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -115,11 +114,11 @@ def grow_regions(
         >>> points = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
         >>> normals, curvature = torch.eye(3)[[2] * 16], torch.zeros(16)
         >>> neighbors = Neighbors(torch.arange(16).expand(16, 16))
-        >>> found = grow_regions(
+        >>> labels = grow_regions(
         ...     points, normals, curvature, neighbors, GrowingConfig(min_size=9),
         ...     residual_rms=torch.zeros(16),
         ... )
-        >>> found.unique()
+        >>> labels.unique()
         tensor([0])
     """
     if not isinstance(config, GrowingConfig):
@@ -266,33 +265,14 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     # The last entry is what -1 finds.
     numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
     numbers[kept] = np.arange(len(kept))
-    found = numbers[old]
+    numbered = numbers[old]
     firsts = np.full(len(kept) + 1, len(old))
     for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
-        firsts[found[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
+        firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
     order = np.lexsort((firsts[:-1], -sizes))
     ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
     ranks[order] = np.arange(len(kept))
-    return torch.from_numpy(ranks[found]).to(regions.device)
-
-
-class GrowthOrder(NamedTuple):
-    """In which order regions begin.
-
-    Attributes:
-        rows: Points that may join a region, by ascending curvature, shape ``(n,)``.
-        num_seeds: How many of them, the first ones, are of at most the limit.
-        limit: The curvature limit, a scalar.
-    """
-
-    rows: NDArray[np.int32]
-    num_seeds: int
-    limit: Tensor
-
-    @property
-    def seeds(self) -> NDArray[np.int32]:
-        """The points of at most the curvature limit."""
-        return self.rows[: self.num_seeds]
+    return torch.from_numpy(ranks[numbered]).to(regions.device)
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
@@ -300,50 +280,49 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
 
     The root of a region is the point it began with. Of a point that is not valid it is -1.
     """
-    order = growth_order(cloud.curvature, cloud.valid, config)
+    valid, growing = cloud.valid.cpu().numpy(), cloud.curvature[cloud.valid]
+    order = cloud.curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
+    order = order[valid[order]]
+    limit = curvature_limit(growing, config.curvature_quantile)
     if is_order_free(config):
-        roots, others = reach_from_seeds(cloud, config, order, chunk_size)
+        seeds = order[: int(torch.count_nonzero(growing <= limit))]
+        roots, others = reach_from_seeds(cloud, config, seeds, limit, chunk_size)
         if config.min_size <= cloud.neighbors.indices.shape[1]:
             # Points that no seed reaches may make regions with free neighbours of their own.
             free = roots < 0
-            left = grow_first_in_first_out(others, order.rows[free[order.rows]], free)
+            left = grow_first_in_first_out(others, order[free[order]], free)
             roots = np.where(free, left, roots)
     else:
-        edges, claims = find_coded_edges(cloud, config, order.limit, chunk_size=chunk_size)
-        valid, lists = cloud.valid.cpu().numpy(), cloud.neighbors.indices.cpu().numpy()
-        roots = grow_first_in_first_out(edges, order.rows, valid, claims, lists)
+        edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
+        lists = cloud.neighbors.indices.cpu().numpy()
+        roots = grow_first_in_first_out(edges, order, valid, claims, lists)
     return torch.from_numpy(roots).to(cloud.points.device)
 
 
 def reach_from_seeds(
-    cloud: GrowingCloud, config: GrowingConfig, order: GrowthOrder, chunk_size: int
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    seeds: NDArray[np.int32],
+    limit: Tensor,
+    chunk_size: int,
 ) -> tuple[NDArray[np.int32], EdgeLists]:
-    """Return the first of the seeds that reaches each point, and the edges of all that are none.
+    """Return the first of the seeds that reaches each point, and the edges of all other points.
 
     The edges of seeds are one graph, or on a disk the graphs of blocks, each without what reaches
     one another in it, so that not all of them are in memory.
     """
     num_points = len(cloud.points)
     if not scratch.is_active():
-        chain = chain_of(order.seeds, num_points)
-        edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, more=chain)
+        chain = chain_of(seeds, num_points)
+        edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, more=chain)
         return first_to_reach(edges, num_points), others
     parts, rest = [], []
     for block in chunks_of(num_points, blocks.BLOCK_SIZE):
-        edges, others = find_edges(cloud, config, order.limit, chunk_size=chunk_size, block=block)
+        edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, block=block)
         parts.append(condense(edges, block))
         rest.append(others)
     return_freed_memory()
-    return join_condensed(parts, order.seeds), join_edges(rest)
-
-
-def growth_order(curvature: Tensor, valid: Tensor, config: GrowingConfig) -> GrowthOrder:
-    """Return the order in which regions begin at valid points ``(N,)``."""
-    rows = curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
-    growing = curvature[valid]
-    limit = curvature_limit(growing, config.curvature_quantile)
-    rows = rows[valid.cpu().numpy()[rows]]
-    return GrowthOrder(rows, int(torch.count_nonzero(growing <= limit)), limit)
+    return join_condensed(parts, seeds), join_edges(rest)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:

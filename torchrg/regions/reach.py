@@ -36,8 +36,8 @@ def condense(edges: EdgeLists, block: slice) -> Condensed:
 
     Example:
         >>> edges = EdgeLists(np.array([0, 1, 3]), np.array([11, 10, 17], dtype=np.int32))
-        >>> found = condense(edges, slice(10, 12))
-        >>> found.components.tolist(), found.sources.tolist(), found.targets.tolist()
+        >>> block = condense(edges, slice(10, 12))
+        >>> block.components.tolist(), block.sources.tolist(), block.targets.tolist()
         ([0, 0], [0], [17])
     """
     from scipy.sparse import csr_array
@@ -64,7 +64,7 @@ def condense(edges: EdgeLists, block: slice) -> Condensed:
     # All points of a component do as target: the last one serves for all.
     last = np.zeros(number, dtype=np.int32)
     last[components] = np.arange(num_points)
-    found = []
+    keys_of_chunks = []
     for rows in chunks:
         places, counts, targets = edges_of(rows)
         sources = np.repeat(components[rows], counts)
@@ -73,8 +73,8 @@ def condense(edges: EdgeLists, block: slice) -> Condensed:
         is_inner = (targets >= 0) & (targets < num_points)
         targets[is_inner] = last[components[targets[is_inner]]]
         # The source above the target, which is at most 2^31, in one number to sort.
-        found.append(sources.astype(np.int64) << 32 | targets + np.int64(block.start))
-    keys = np.unique(np.concatenate(found))
+        keys_of_chunks.append(sources.astype(np.int64) << 32 | targets + np.int64(block.start))
+    keys = np.unique(np.concatenate(keys_of_chunks))
     return Condensed(components, (keys >> 32).astype(np.int32), keys.astype(np.int32))
 
 
@@ -99,5 +99,5 @@ def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[
     roots = first_to_reach(edges, len(starts) - 1)
     seed_of = np.full(int(offsets[-1]) + 1, -1, dtype=np.int32)
     seed_of[nodes] = seeds[places]
-    found: NDArray[np.int32] = seed_of[roots][node_of]
-    return found
+    firsts: NDArray[np.int32] = seed_of[roots][node_of]
+    return firsts

@@ -21,15 +21,15 @@ from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
 
 _AGREE = 0.3
-"""Share of the largest angle. Regions too small before absorption whose normals are off by less,
-root mean square, are faces: of a small one half is border. Without this a cluttered office has 490
-regions instead of 306."""
+"""Small regions stay if the root mean square angle of their normals to their plane is below 0.3 of
+``max_angle_deg``: half of a small face is border. The others are clutter."""
 
 _MAX_PASSES = 10
-"""Times. Points that moved are neighbours of the next: narrow strips fill from their ends."""
+"""Passes over the borders at most. Points that moved lead to the next: narrow strips fill from
+their ends."""
 
 _ROUNDING = 0.01
-"""Thicknesses. Smaller distances decide nothing."""
+"""Distances of less than this many thicknesses decide nothing."""
 
 _ONE_SIDED = 0.5
 """A face ends at another plane if the mean distance of its points from that, with signs, is this
@@ -41,8 +41,8 @@ _FACET_TURN_DEG = 25.0
 of ten points are turned most; the sides of a thin board are turned by 90."""
 
 _FACET_TILT = 2 / 3
-"""Tolerances. Root mean square distance that this turn alone gives the points of a facet. Without
-a limit a plane across the step between two shelves, 5 cm, explains both."""
+"""Largest root mean square distance, in tolerances, that the turn alone gives the points of a
+facet. Without it a plane across the step between two shelves, 5 cm, explains both."""
 
 
 class Beside(Protocol):
@@ -80,8 +80,6 @@ def refine_regions(
             planes,
             planes.times_thickness(config.absorb_reach),
             valid=cloud.valid,
-            normals=cloud.normals,
-            max_angle_deg=config.absorb_angle_deg,
         )
         labels = _drop_small(labels, config.min_size)
     if config.merge_coplanar:
@@ -129,15 +127,12 @@ def absorb_points(
     reach: Tensor,
     *,
     valid: Tensor,
-    normals: Tensor | None = None,
-    max_angle_deg: float = 90.0,
 ) -> Tensor:
     """Give points without a region to regions they touch, until none can be given.
 
-    A point may join a region when a point beside it belongs to it, its distance to the region's
-    plane is within reach, and its normal, if there are normals ``(N, 3)``, is within the angle of
-    the plane's. Of several regions it joins the one whose plane is nearest. Points that joined have
-    the next beside them.
+    A point may join a region when a point beside it belongs to it and its distance to the region's
+    plane is within reach. Of several regions it joins the one whose plane is nearest. Points that
+    joined have the next beside them.
 
     ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud, or of the pixels of an image, as
     ``beside`` is. Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all.
@@ -145,7 +140,6 @@ def absorb_points(
     """
     # Narrow numbers are gathered faster, and take half of the memory.
     labels = labels.to(torch.int32)
-    limit = deg_to_sq_chord(max_angle_deg)
     rows = waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
     while len(rows):
         near = labels[beside.around(rows)]
@@ -154,9 +148,6 @@ def absorb_points(
         region = near.clamp(min=0)
         distance = planes.signed_distances(points[rows], region).abs()
         fits = (near >= 0) & (distance <= reach[region])
-        if normals is not None:
-            own = normals[rows].double()[:, :, None].unbind(dim=1)
-            fits &= sq_chords(own, planes.normal[region].unbind(dim=2)) <= limit
         choice, least = _least(torch.where(fits, distance, torch.inf), near)
         joined = least.isfinite()
         rows = rows[joined]
@@ -213,9 +204,7 @@ def merge_coplanar(
     """
     pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
-    moments = _moments_of(planes)
-    owner = _merge_pairs(_Moments(*(part.cpu() for part in moments)), pairs.cpu(), tolerance)
-    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+    return _merge(labels, pairs, _moments_of(planes), tolerance)
 
 
 def merge_facets(
@@ -239,12 +228,9 @@ def merge_facets(
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= LEAST_CONTACTS]
-    moments = _moments_of(planes)
-    scale, noise = torch.full_like(moments.scale, tolerance), torch.zeros_like(moments.noise)
-    moments = moments._replace(scale=scale, noise=noise)
-    moments = _Moments(*(part.cpu() for part in moments))
-    owner = _merge_pairs(moments, pairs.cpu(), 1.0, max_tilt=_FACET_TILT * tolerance)
-    return torch.tensor([*owner, UNLABELED], device=labels.device)[labels]
+    scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
+    moments = _moments_of(planes)._replace(scale=scale, noise=noise)
+    return _merge(labels, pairs, moments, 1.0, max_tilt=_FACET_TILT * tolerance)
 
 
 class _Moments(NamedTuple):
@@ -288,14 +274,19 @@ def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
     return _misfit(first, second)
 
 
-def _merge_pairs(
-    moments: _Moments, pairs: Tensor, tolerance: float, *, max_tilt: float | None = None
-) -> list[int]:
-    """Return for each region the smallest of those that it is merged with.
+def _merge(
+    labels: Tensor,
+    pairs: Tensor,
+    moments: _Moments,
+    tolerance: float,
+    *,
+    max_tilt: float | None = None,
+) -> Tensor:
+    """Return labels where each region has the smallest number of those that it is merged with.
 
-    With a largest tilt those are not whose own planes the joint one is turned against too far.
+    With a largest tilt, pairs stay apart if the joint plane is turned too far against either.
     """
-    groups = _Moments(*(values.clone() for values in moments))
+    pairs, groups = pairs.cpu(), _Moments(*(values.cpu().clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(touching))), [0] * len(touching)
     queue: list[tuple[float, int, int, int, int]] = []
@@ -328,7 +319,8 @@ def _merge_pairs(
             touching[c].add(a)
         beside = [(min(a, c), max(a, c)) for c in touching[a]]
         offer(torch.tensor(beside, dtype=torch.int64).view(-1, 2))
-    return [_root(owner, i) for i in range(len(owner))]
+    roots = [_root(owner, i) for i in range(len(owner))]
+    return torch.tensor([*roots, UNLABELED], device=labels.device)[labels]
 
 
 def _root(owner: list[int], i: int) -> int:
@@ -424,12 +416,12 @@ def _touching(labels: Tensor, beside: NearestPoints) -> Tensor:
     """Return the points that have one of another region among their nearest neighbours."""
     # Narrow numbers are gathered three times as fast.
     narrow = labels.to(torch.int32)
-    found = []
+    rows_of_chunks = []
     for some in chunks_of(len(labels), ROWS_AT_ONCE):
         near = Neighbors(beside.around(some)).of(narrow)
         touches = (near != narrow[some, None]) & (near >= 0)
-        found.append(some.start + places_of(touches.any(dim=1)))
-    return torch.cat(found)
+        rows_of_chunks.append(some.start + places_of(touches.any(dim=1)))
+    return torch.cat(rows_of_chunks)
 
 
 def _choose(

@@ -128,19 +128,19 @@ def _bit_sets(
     sets, shape ``(blocks * (M + 1),)``, and the sets, shape ``(rows, words)``.
     """
     stride = occurs.shape[1]
-    found = np.flatnonzero(occurs)
+    occurring = np.flatnonzero(occurs)
     sizes = np.count_nonzero(occurs, axis=1)
     rows = np.zeros(occurs.size, dtype=np.intp)
-    rows[found] = np.arange(len(found))
+    rows[occurring] = np.arange(len(occurring))
     # What is not in the block falls into the first eight columns, which are cut off.
     columns = np.full(occurs.size, -8)
-    columns[found] = np.arange(len(found)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    block, member = np.divmod(found, stride)
-    of_found = lists.take(member, axis=0)
-    of_found += (block * stride)[:, None]
+    columns[occurring] = np.arange(len(occurring)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    block, member = np.divmod(occurring, stride)
+    of_occurring = lists.take(member, axis=0)
+    of_occurring += (block * stride)[:, None]
     width = 8 + -(-int(sizes.max()) // _BITS_IN_LINE) * _BITS_IN_LINE
-    bits = np.zeros(len(found) * width, dtype=bool)
-    places = columns.take(of_found, mode="wrap")
+    bits = np.zeros(len(occurring) * width, dtype=bool)
+    places = columns.take(of_occurring, mode="wrap")
     places += np.arange(8, len(bits), width)[:, None]
     bits[places.ravel()] = True
     return rows, np.packbits(bits.reshape(-1, width)[:, 8:], axis=1).view(np.uint64)

@@ -29,11 +29,11 @@ _ROUNDING = 1e-12
 """Share of the coordinates by which a point inside an octagon is inside beyond rounding."""
 
 _TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
-"""From an edge to the edges across its direction in front, to the opposite one, and to those behind
-it: 0.5, 1 and 1.5 times pi, and another pi that the range of angles begins below 0."""
+"""Turns, in units of pi, from an edge to the front, opposite and back edges of its rectangle: 0.5,
+1 and 1.5, and 1 more as angles begin at -pi."""
 
 _POINTS_PER_CELL = 9.0
-"""So many points in an average cell leave one of 8,000 empty by chance."""
+"""Points in an average cell; one cell of 8,000 is then empty by chance."""
 
 _NUM_DOUBLINGS = 4
 """How often cells are made twice as wide, at most."""
@@ -57,10 +57,10 @@ _LEAST_WALL_SHARE = 0.5
 """A wall reaches over at least this share of the cloud's height."""
 
 _LEAST_WIDTH_SHARE = 0.2
-"""And is at least this share of it wide."""
+"""A wall is at least this wide, as a share of the cloud's height."""
 
 _TOP_SHARE = 0.1
-"""And reaches into this highest share of it; a window ended 14 % below."""
+"""A wall reaches into the top tenth of the cloud; a tall window ended 14 % below the top."""
 
 _WALL_AREA_SHARE = 0.25
 """A wall that ends below has at least this share of the largest vertical plane's area;
@@ -119,13 +119,13 @@ def summarize_planes(
     first, second = _plane_axes(fit)
 
     def measure() -> list[_Measures]:
-        found, start = [], 0
+        parts, start = [], 0
         for some in segments.split(POINTS_AT_ONCE):
             rows = slice(start, start + len(some.counts))
             frame = (fit.center[rows], first[rows], second[rows])
-            found.append(_measure(points, some, frame, outline=outline))
+            parts.append(_measure(points, some, frame, outline=outline))
             start = rows.stop
-        return found
+        return parts
 
     def meet() -> PlaneAdjacency | None:
         if neighbors is None:
@@ -134,7 +134,7 @@ def summarize_planes(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
 
-    measures, found = run_beside(measure, meet, points.device)
+    measures, meeting = run_beside(measure, meet, points.device)
     mean, area, sides, directions, middle = (
         torch.cat(parts) for parts in list(zip(*measures, strict=True))[:5]
     )
@@ -159,9 +159,9 @@ def summarize_planes(
         planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
     if outline:
         planes = planes._replace(outline=sum((part.outline for part in measures), ()))
-    if found is not None:
-        lengths, angles = own(found.boundary_length), own(found.dihedral_deg)
-        planes = planes._replace(adjacency=PlaneAdjacency(found.pairs, lengths, angles))
+    if meeting is not None:
+        lengths, angles = own(meeting.boundary_length), own(meeting.dihedral_deg)
+        planes = planes._replace(adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
 
 

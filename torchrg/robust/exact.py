@@ -13,8 +13,8 @@ from torchrg.robust.lanes import covariance_entries, dot, eigenvectors, sum_squa
 from torchrg.robust.scale import sum_points
 
 _NUM_SIMPLICES = 128
-"""Sets of P + 1 points that are looked at. If 27 of 50 points lie on a plane, all sets miss it once
-in 25,000 patches."""
+"""Sets of P + 1 points that are tried. If 27 of 50 points lie on a plane, all miss it once in
+25,000."""
 
 _MAX_CANDIDATES = 16
 """Flats of a patch whose points are counted. On exact planes nearly every simplex gives one."""
@@ -23,7 +23,7 @@ _LANES = 1024
 """Patches that are looked at together, so that what they need fits the cache."""
 
 _MIN_EDGE = 0.01
-"""Share of the extent of a patch. A shorter edge does not span another dimension."""
+"""An edge shorter than this share of the extent of its patch does not span another dimension."""
 
 
 def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:

@@ -47,7 +47,7 @@ _NUM_KEPT = 10
 """Random starts that are concentrated to the end, as published."""
 
 _MAX_COMPARED = 16
-"""Starts of a patch up to which equal sets are looked for. With more, comparing costs more than it
+"""Starts of a patch up to which equal sets are sought; with more, comparing costs more than it
 saves."""
 
 _DIGITS = 24
@@ -193,20 +193,9 @@ def fit_fastmcd(
     sets are concentrated to the end, and the smallest determinant wins [1]. Unlike DetMCD it is
     affine equivariant, and it nearly always finds the best set, at a hundred times the cost.
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        support_fraction: Share of the points that may be trusted, from 0.5 to 1.
-        quantile: Level of the chi-square distribution within which points are inliers.
-        num_starts: Random sets; all sets are taken where there are no more than five times as
-            many (up to 17 points of P = 3 with 500).
-        small_sample: Apply the factors for small samples (P = 3 only).
-        generator: Source of the random sets. Default: always the same sets. Every patch gets the
-            same ones.
-        chunk_size: Patches worked on together.
-
-    Returns:
-        The fits; ``log_det`` is that of the covariance of the h points, without factors.
+    Every patch gets the same ``num_starts`` random sets, from ``generator`` or by default always
+    the same, or all sets where there are no more than five times as many (up to 17 points of P = 3
+    with 500). The other arguments, errors and results are those of :func:`fit_detmcd`.
 
     References:
         [1] P. J. Rousseeuw, K. Van Driessen. A fast algorithm for the minimum covariance

@@ -28,7 +28,7 @@ from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
-"""What the efficiency of 95 % at the normal distribution refers to."""
+"""Estimate that the efficiency of 95 % at the normal distribution refers to."""
 
 _BREAKDOWN = 0.5
 """Share of the points that may be arbitrary."""
@@ -72,12 +72,8 @@ def fit_dets(
     half of its maximum, so that half of the points may be arbitrary. Each deterministic start is
     iterated to a local minimum, and the smallest wins [1].
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        quantile: Level of the chi-square distribution within which points are inliers.
-        starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
-        chunk_size: Patches worked on together.
+    Arguments and errors are those of :func:`torchrg.robust.fit_detmcd`; the ``"robustbase"`` starts
+    are those of R's rrcov.
 
     Returns:
         The fits. Location and covariance are the estimate itself, not reweighted, and the same as
@@ -119,25 +115,16 @@ def fit_detmm(
     r"""Fit location and scatter of each patch by the deterministic MM-estimator.
 
     The scale of the S-estimate is kept, and location and shape are iterated on with a wider
-    bisquare that is 95 % efficient for normal data [1].
+    bisquare that is 95 % efficient for normal data; see the reference of :func:`fit_dets`.
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        quantile: Level of the chi-square distribution within which points are inliers.
-        tuned_for: Whether the efficiency is that of the ``"shape"`` (cut-off 6.0963 for P = 3),
-            as normals want and R's rrcov has it, or of the ``"location"`` (5.4902).
-        starts: As in :func:`torchrg.robust.fit_detmcd`; ``"robustbase"`` are those of R's rrcov.
-        chunk_size: Patches worked on together.
+    ``tuned_for`` says whether the efficiency is that of the ``"shape"`` (cut-off 6.0963 for P = 3),
+    as normals want and R's rrcov has it, or of the ``"location"`` (5.4902). The other arguments
+    are those of :func:`fit_dets`.
 
     Returns:
         The fits. Location and covariance are the MM-estimate, ``raw_*`` the S-estimate it started
         from; distances and ``support`` belong to the MM-estimate; ``log_det`` is that of its
         covariance. More than half of the points on one plane are an exact fit.
-
-    References:
-        [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
-        multivariate location and scatter. Computational Statistics & Data Analysis 81, 2015.
 
     Example:
         >>> points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))

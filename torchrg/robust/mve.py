@@ -45,17 +45,9 @@ def fit_mve(
     Each set of P + 1 points gives an ellipsoid by its mean and covariance; it is blown up until
     it covers h points, and the smallest wins [1].
 
-    Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        support_fraction: Share of the points to cover, from 0.5 to 1.
-        quantile: Level of the chi-square distribution within which points are inliers.
-        num_starts: Random sets; all sets are taken where there are no more than five times as
-            many. Random sets nearly always miss the least volume by a little.
-        exhaustive: Take all sets: 230,300 of 50 points, a tenth of a second for each patch.
-        generator: Source of the random sets. Default: always the same sets. Every patch gets the
-            same ones.
-        chunk_size: Patches worked on together.
+    Random sets nearly always miss the least volume by a little; with ``exhaustive`` all are taken,
+    230,300 of 50 points, a tenth of a second for each patch. The other arguments are those of
+    :func:`torchrg.robust.fit_fastmcd`; ``support_fraction`` is the share of the points to cover.
 
     Returns:
         The fits; ``log_det`` is that of the ellipsoid that just covers h points, and

@@ -145,8 +145,8 @@ def fit_patchwise(
     def fit_dense(chunk: Tensor) -> RobustFit:
         return _fit_chunk(chunk, support_fraction, estimator, majority)
 
-    found = _fit_groups(dense, counted, chunk_size, fit_dense)
-    fit = RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in found))
+    fields = _fit_groups(dense, counted, chunk_size, fit_dense)
+    fit = RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in fields))
     if patches.requires_grad and torch.is_grad_enabled():
         weights = torch.where(fit.exact_fit[..., None], fit.support, weigh(fit, patches.detach()))
         return _with_gradients(fit, patches, weights.to(patches.dtype))
@@ -247,8 +247,8 @@ def _fit_chunk(
         if len(thin):
             rows, chosen = regular[thin], estimate.raw_support[:, thin]
             on_plane = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
-            found = on_plane.sum(dim=0) >= enough
-            store_exact(rows[found], on_plane[:, found])
+            is_exact = on_plane.sum(dim=0) >= enough
+            store_exact(rows[is_exact], on_plane[:, is_exact])
     exact = torch.nonzero(dimension == size - 1).squeeze(1)
     if len(exact):
         store_exact(exact, members[:, exact])

@@ -37,10 +37,10 @@ _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
 """Finite-sample factors of 2 to 12 values."""
 
 _TAU_WEIGHT_CUT = 4.5
-"""Medians of the deviations. A value that deviates by more has no weight in the centre."""
+"""A value that deviates by more than this many median deviations has no weight in the centre."""
 
 _TAU_SCALE_CUT = 3.0
-"""Medians of the deviations at which larger deviations are cut off."""
+"""Deviations are cut off at this many median deviations."""
 
 
 def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -224,9 +224,9 @@ def _per_count(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], 
     results: Tensor | None = None
     for count in sorted(set(counts.tolist())) or [n]:
         chosen = (counts == count) & ~broken
-        found = of_sorted(ascending[chosen][:, :count].contiguous())
-        results = out.to(found.dtype) if results is None else results
-        results[chosen] = found
+        of_count = of_sorted(ascending[chosen][:, :count].contiguous())
+        results = out.to(of_count.dtype) if results is None else results
+        results[chosen] = of_count
     return (out if results is None else results).reshape(shape)
 
 
@@ -368,8 +368,8 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     last = rows.shape[1] - 1
     partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
     own = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
-    found = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
-    is_pair = (found == difference[:, None, None]) & (partners > own)
+    gaps = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
+    is_pair = (gaps == difference[:, None, None]) & (partners > own)
     pick = is_pair.flatten(1).to(torch.uint8).argmax(dim=1, keepdim=True)
     low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (own, partners))
     return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)

@@ -32,11 +32,10 @@ from torchrg.robust.scale import (
 Starts = Literal["paper", "robustbase", "planes", "more"]
 
 _LONG = 1000
-"""Values from which tau takes the place of Qn, as in robustbase, because Qn needs all
-differences."""
+"""Values from which tau takes the place of Qn, which needs all differences, as in robustbase."""
 
 _STARTS_AT_ONCE = 3
-"""Of the six starts so many are worked on together, so that what they need fits the cache."""
+"""Starts that are worked on together, so that what they need fits the cache."""
 
 _NUM_PLANES = 64
 """Planes among which the best are chosen."""
@@ -100,15 +99,15 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
     if len(zero) == 0:
         return scale
     deviations = sort_rows((rows[zero] - center[zero, None]).abs().contiguous())
-    found = torch.ones_like(scale[zero])
+    positive = torch.ones_like(scale[zero])
     last = deviations.shape[1] - 1
     for level in (0.9875, *(level / 100 for level in range(95, 49, -5))):
         low = int(level * last)
         high, part = min(low + 1, last), level * last - low
         quantile = deviations[:, low] * (1 - part) + deviations[:, high] * part
         quantile = quantile / NormalDist().inv_cdf((level + 1) / 2)
-        found = torch.where(quantile > 0, quantile, found)
-    return scale.index_copy(0, zero, found)
+        positive = torch.where(quantile > 0, quantile, positive)
+    return scale.index_copy(0, zero, positive)
 
 
 def _scatter_matrices(columns: list[Tensor]) -> Tensor:

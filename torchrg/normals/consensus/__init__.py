@@ -19,8 +19,7 @@ from torchrg.normals.consensus.smoothing import (
     standard_errors,
 )
 from torchrg.normals.consensus.surfaces import fit_surfaces
-from torchrg.normals.patches import fit_points
-from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.pca import fit_normals_pca, fit_points
 from torchrg.structures import Neighbors, NormalFit
 
 

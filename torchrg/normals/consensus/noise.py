@@ -104,8 +104,10 @@ def survey_noise(
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
     quantile = constants.NOISE_QUANTILE
     noise = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(whole, neighbors, quantile)
-    found = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(layered, neighbors, quantile)
-    noise = torch.minimum(noise, found)
+    layered_noise = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(
+        layered, neighbors, quantile
+    )
+    noise = torch.minimum(noise, layered_noise)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
         count = neighbors.valid.sum(dim=1)
@@ -113,14 +115,14 @@ def survey_noise(
     for size, factor, limit, values in zip(
         constants.NOISE_COUNTS, factors, limits, small, strict=True
     ):
-        found = factor * _neighbor_quantiles(values, neighbors, quantile)
+        noise_of_size = factor * _neighbor_quantiles(values, neighbors, quantile)
         near = (
             radius
             * (size / torch.as_tensor(count, dtype=radius.dtype, device=radius.device)).sqrt()
         )
-        share = found / torch.where(radius > 0, limit * near, 1.0)
+        share = noise_of_size / torch.where(radius > 0, limit * near, 1.0)
         below = (1 - share * share).clamp_(min=0)
-        scaled = found / torch.where(below > 0, below, 1.0).sqrt_()
+        scaled = noise_of_size / torch.where(below > 0, below, 1.0).sqrt_()
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
     common = _neighbor_quantiles(noise, neighbors, constants.COMMON_QUANTILE)
     noise = torch.minimum(noise, constants.MAX_ABOVE_COMMON * common)
@@ -243,21 +245,21 @@ def _of_few(x: Tensor, y: Tensor, z: Tensor, counted: Tensor) -> tuple[Tensor]:
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
     """Return a quantile of values over the neighbours of each point."""
     indices, counted = neighbors
-    rank, found = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
+    rank, quantiles = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
 
     def work(block: slice) -> None:
         if counted is None and values.device.type == "cpu":
             near = np.take(values.numpy(), indices[block].numpy())
             near.partition(rank - 1, axis=1)
-            found.numpy()[block] = near[:, rank - 1]
+            quantiles.numpy()[block] = near[:, rank - 1]
             return
         of_neighbors = values[indices[block].long()]
         if counted is None:
-            found[block] = of_neighbors.kthvalue(rank, dim=1).values
+            quantiles[block] = of_neighbors.kthvalue(rank, dim=1).values
             return
         ranks = (quantile * counted[block].sum(dim=1, keepdim=True)).ceil().clamp(min=1)
         ascending = torch.where(counted[block], of_neighbors, torch.inf).sort(dim=1).values
-        found[block] = ascending.gather(1, ranks.long() - 1).squeeze(1)
+        quantiles[block] = ascending.gather(1, ranks.long() - 1).squeeze(1)
 
     map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
-    return found
+    return quantiles

@@ -86,11 +86,11 @@ def _smoothed(
     weights = _balanced(columns, weights) * sign
     mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
     length = (mean * mean).sum(dim=1).sqrt_()
-    found = length > 0
-    safe = torch.where(found, length, 1.0)
-    normals = torch.where(found[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
-    moved = -(weights * rests).sum(dim=1) / torch.where(found, (weights * sign).sum(dim=1), 1.0)
-    return normals, torch.where(found, moved, offsets[rows])
+    has_mean = length > 0
+    safe = torch.where(has_mean, length, 1.0)
+    normals = torch.where(has_mean[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
+    moved = -(weights * rests).sum(dim=1) / torch.where(has_mean, (weights * sign).sum(dim=1), 1.0)
+    return normals, torch.where(has_mean, moved, offsets[rows])
 
 
 def choose_planes(
@@ -153,10 +153,10 @@ def _chosen(
     score = support - constants.CHOICE_COST * own * own
     usable = (own.abs() < constants.INLIER_REACH) & ((axes * axes).sum(dim=-1) > 0)
     best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
-    found = usable.gather(1, best)
+    has_choice = usable.gather(1, best)
     normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
-    offset = torch.where(found, moved.gather(1, best), offsets[rows][:, None])
-    return torch.where(found, normal, normals[rows]), offset.squeeze(1)
+    offset = torch.where(has_choice, moved.gather(1, best), offsets[rows][:, None])
+    return torch.where(has_choice, normal, normals[rows]), offset.squeeze(1)
 
 
 def standard_errors(

@@ -1,4 +1,4 @@
-"""What surface explains each neighbourhood: a plane, a paraboloid, or planes that meet."""
+"""The surface that explains each neighbourhood: a plane, a paraboloid, or planes that meet."""
 
 from typing import NamedTuple
 
@@ -68,8 +68,8 @@ def fit_surfaces(
     bent = survey.deviations.clone()
 
     def bend(rows: Tensor) -> None:
-        found = _paraboloids(points, *neighbors, fit.normals, rows)
-        normals[rows], offsets[rows], bent[rows] = found
+        fitted = _paraboloids(points, *neighbors, fit.normals, rows)
+        normals[rows], offsets[rows], bent[rows] = fitted
 
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
     map_chosen(bend, not_flat, chunk_size)
@@ -82,12 +82,12 @@ def fit_surfaces(
     def split(rows: Tensor) -> None:
         columns, scale = _gather_counted(points, neighbors, rows), noise[rows]
         voted = vote_planes(columns, scale, fit.normals[rows], torch.ones_like(columns[0]))
-        found = fit_meeting_planes(columns, *voted, scale)
+        planes = fit_meeting_planes(columns, *voted, scale)
         by_votes.normals[rows], by_votes.offsets[rows] = voted
-        meeting.normals[rows], meeting.offsets[rows] = found.normals, found.offsets
-        explained[rows] = found.deviations <= constants.MEETING_LIMIT * scale
-        known = found.deviations.isfinite()
-        rest = torch.where(known, found.deviations, scale)
+        meeting.normals[rows], meeting.offsets[rows] = planes.normals, planes.offsets
+        explained[rows] = planes.deviations <= constants.MEETING_LIMIT * scale
+        known = planes.deviations.isfinite()
+        rest = torch.where(known, planes.deviations, scale)
         unit = torch.maximum(scale, rest)
         drop = (bent[rows] / unit).square() - (rest / unit).square()
         drop *= columns[0].shape[1] - _PARABOLOID_PARAMETERS
