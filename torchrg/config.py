@@ -117,8 +117,7 @@ class GrowingConfig:
     """A neighbour farther than this does not join, in the unit of the cloud. Where points are few,
     the k nearest neighbours reach across gaps, and this keeps them apart. None: not tested."""
     min_size: int = 50
-    """Regions of fewer points are not labelled. With absorb, points at the borders of a region
-    count as well."""
+    """Regions of fewer points are not labelled."""
     cut_bridges: bool = True
     """Whether a region of several faces that only a few points join is split, as faces 12 degrees
     apart and floors with furniture on them are. It takes consensus about a twentieth more time."""

@@ -354,29 +354,6 @@ def test_what_lies_within_the_noise_of_a_larger_face_is_part_of_it(scatter_deg):
         assert len(refined.unique()) == regions
 
 
-@pytest.mark.parametrize(("scatter_deg", "kept"), [(1.0, True), (4.0, False)])
-def test_a_face_that_is_large_enough_with_its_border_counts_if_its_normals_agree(scatter_deg, kept):
-    rng = np.random.default_rng(14)
-    points = sheet(rng, 60)
-    inner = np.abs(points[:, 0] - 0.5) < 0.3
-    assert 30 < inner.sum() < 50
-    cloud, order = flat_cloud(points, normals=scattered(rng, 60, scatter_deg))
-    labels = torch.where(torch.from_numpy(inner)[order], 0, UNLABELED)
-    refined = refine_regions(cloud, labels, with_settings(absorb=True, min_size=50))
-    assert int((refined == 0).sum()) >= 50 if kept else bool((refined == UNLABELED).all())
-
-
-def test_a_region_grows_large_enough_by_what_it_absorbs():
-    points = sheet(np.random.default_rng(15), 60)
-    border = np.abs(points[:, 0] - 0.5) > 0.3
-    normals = np.where(border[:, None], [0.5, 0, 0.75**0.5], [0.0, 0, 1.0])
-    points, normals = torch.tensor(points), torch.tensor(normals)
-    curvature, neighbors = torch.from_numpy(border).double(), search_knn(points, 16)
-    plain, absorbing = with_settings(min_size=50), with_settings(min_size=50, absorb=True)
-    assert (grow_regions(points, normals, curvature, neighbors, plain) == UNLABELED).all()
-    assert (grow_regions(points, normals, curvature, neighbors, absorbing) == 0).sum() >= 50
-
-
 @pytest.mark.parametrize("unit", [1e-4, 1e3])
 def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
     generator = np.random.default_rng(10)

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_chunks, places_of
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords, unsigned_angle_deg
-from torchrg.linalg.moments import Segments
+from torchrg.linalg import eigh3_of_few, unsigned_angle_deg
 from torchrg.regions.adjacency import (
     LEAST_CONTACTS,
     PARALLEL_DEG,
@@ -19,10 +18,6 @@ from torchrg.regions.adjacency import (
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
-
-_AGREE = 0.3
-"""Small regions stay if the root mean square angle of their normals to their plane is below 0.3 of
-``max_angle_deg``: half of a small face is border. The others are clutter."""
 
 _MAX_PASSES = 10
 """Passes over the borders at most. Points that moved lead to the next: narrow strips fill from
@@ -75,7 +70,7 @@ def refine_regions(
         planes = fits.of(labels)
         labels = absorb_points(
             cloud.points,
-            _drop_scattered(cloud, labels, planes.normal, config),
+            labels,
             beside,
             planes,
             planes.times_thickness(config.absorb_reach),
@@ -94,22 +89,6 @@ def refine_regions(
         reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
         labels = refine_borders(cloud, labels, planes, reach)
     return labels
-
-
-def _drop_scattered(
-    cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
-) -> Tensor:
-    """Return labels without regions that are too small and whose normals do not agree.
-
-    Those that agree may be large enough with the points at their borders. Numbers have gaps then.
-    """
-    small = torch.bincount(labels + 1, minlength=1)[1:] < config.min_size
-    small = torch.cat([small, small.new_zeros(1)])
-    segments = Segments(torch.where(small[labels], labels, UNLABELED))
-    own, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)
-    agrees = segments.mean(sq_chords(own, theirs)) <= deg_to_sq_chord(_AGREE * config.max_angle_deg)
-    scattered = segments.rows[~segments.spread(agrees)]
-    return labels.index_fill(0, scattered, UNLABELED)
 
 
 def _drop_small(labels: Tensor, min_size: int) -> Tensor:
