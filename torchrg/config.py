@@ -117,7 +117,8 @@ class GrowingConfig:
     """A neighbour farther than this does not join, in the unit of the cloud. Where points are few,
     the k nearest neighbours reach across gaps, and this keeps them apart. None: not tested."""
     min_size: int = 50
-    """Regions of fewer points are not labelled."""
+    """Regions of fewer points are not labelled. With absorb, points at the borders of a region
+    count as well."""
     cut_bridges: bool = True
     """Whether a region of several faces that only a few points join is split, as faces 12 degrees
     apart and floors with furniture on them are. It takes consensus about a twentieth more time."""
@@ -134,6 +135,9 @@ class GrowingConfig:
     absorb_reach: float = 3.0
     """With absorb, a point is on the plane of a region when it is within this many times the
     thickness of the region."""
+    absorb_angle_deg: float = 45.0
+    """With absorb, a point joins only if its normal is within this angle of the normal of the
+    plane."""
     refine_borders: bool = True
     """Whether points where regions touch go to the region that explains them best. Between two
     planes within reach, the line in which they meet decides. It needs absorb, and matters most for
@@ -161,6 +165,7 @@ class GrowingConfig:
         residual = self.max_plane_residual
         _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
         _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
+        _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
 

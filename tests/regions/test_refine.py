@@ -71,6 +71,15 @@ def test_unlabelled_points_on_the_plane_are_absorbed_and_others_are_not():
     assert (refined[order >= 100] == 0).float().mean() > 0.99
 
 
+def test_points_with_another_direction_are_not_absorbed():
+    rng = np.random.default_rng(3)
+    normals = np.tile([0.0, 0.0, 1.0], (1500, 1))
+    normals[:200] = [1.0, 0.0, 0.0]
+    cloud, order = flat_cloud(sheet(rng), normals=normals)
+    labels = torch.where(order < 200, UNLABELED, 0)
+    assert torch.equal(refine_regions(cloud, labels, with_settings(absorb=True)), labels)
+
+
 def test_invalid_points_are_not_absorbed():
     cloud, order = flat_cloud(sheet(np.random.default_rng(4)))
     labels = torch.where(order < 200, UNLABELED, 0)
@@ -80,11 +89,12 @@ def test_invalid_points_are_not_absorbed():
     assert (refined[(order >= 100) & (order < 200)] == 0).float().mean() > 0.9
 
 
-def absorbed_one_by_one(points, labels, neighbors, planes, reach, valid):
+def absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid, max_angle_deg):
     """The rule of absorption, literally."""
     normal, center, reach = (part.tolist() for part in (planes.normal, planes.center, reach))
     nearest = neighbors.indices[:, 1:9].tolist()
     labels = labels.tolist()
+    least_cosine = np.cos(np.radians(max_angle_deg))
     while True:
         joined = {}
         for i, point in enumerate(points.tolist()):
@@ -93,7 +103,8 @@ def absorbed_one_by_one(points, labels, neighbors, planes, reach, valid):
             options = []
             for region in {labels[j] for j in nearest[i]} - {UNLABELED}:
                 away = np.abs(np.dot(np.subtract(point, center[region]), normal[region]))
-                if away <= reach[region]:
+                cosine = np.abs(np.dot(normals[i].tolist(), normal[region]))
+                if away <= reach[region] and cosine >= least_cosine:
                     options.append((away, region))
             if options:
                 joined[i] = min(options)[1]
@@ -106,7 +117,7 @@ def absorbed_one_by_one(points, labels, neighbors, planes, reach, valid):
 def test_absorption_follows_its_rule_literally():
     rng = np.random.default_rng(5)
     cloud = growing_clouds.prepare(growing_clouds.room(rng, 300, 0.01), 12)
-    points, _, _, neighbors = cloud
+    points, normals, _, neighbors = cloud
     labels = torch.full((len(points),), UNLABELED)
     axes = Segments(torch.arange(3))
     planes = fit_planes(axes, torch.zeros(3, 3).double(), torch.eye(3).double())
@@ -114,8 +125,17 @@ def test_absorption_follows_its_rule_literally():
     for axis in range(3):
         labels[(points[:, axis].abs() < 0.02).nonzero()[:30, 0]] = axis
     valid = torch.from_numpy(rng.random(len(points)) < 0.9)
-    found = absorb_points(points, labels, NearestPoints(neighbors), planes, reach, valid=valid)
-    expected = absorbed_one_by_one(points, labels, neighbors, planes, reach, valid)
+    found = absorb_points(
+        points,
+        labels,
+        NearestPoints(neighbors),
+        planes,
+        reach,
+        valid=valid,
+        normals=normals,
+        max_angle_deg=30.0,
+    )
+    expected = absorbed_one_by_one(points, normals, labels, neighbors, planes, reach, valid, 30.0)
     assert found.tolist() == expected
     assert (found >= 0).sum() > (labels >= 0).sum()
 
@@ -354,6 +374,29 @@ def test_what_lies_within_the_noise_of_a_larger_face_is_part_of_it(scatter_deg):
         assert len(refined.unique()) == regions
 
 
+@pytest.mark.parametrize(("scatter_deg", "kept"), [(1.0, True), (4.0, False)])
+def test_a_face_that_is_large_enough_with_its_border_counts_if_its_normals_agree(scatter_deg, kept):
+    rng = np.random.default_rng(14)
+    points = sheet(rng, 60)
+    inner = np.abs(points[:, 0] - 0.5) < 0.3
+    assert 30 < inner.sum() < 50
+    cloud, order = flat_cloud(points, normals=scattered(rng, 60, scatter_deg))
+    labels = torch.where(torch.from_numpy(inner)[order], 0, UNLABELED)
+    refined = refine_regions(cloud, labels, with_settings(absorb=True, min_size=50))
+    assert int((refined == 0).sum()) >= 50 if kept else bool((refined == UNLABELED).all())
+
+
+def test_a_region_grows_large_enough_by_what_it_absorbs():
+    points = sheet(np.random.default_rng(15), 60)
+    border = np.abs(points[:, 0] - 0.5) > 0.3
+    normals = np.where(border[:, None], [0.5, 0, 0.75**0.5], [0.0, 0, 1.0])
+    points, normals = torch.tensor(points), torch.tensor(normals)
+    curvature, neighbors = torch.from_numpy(border).double(), search_knn(points, 16)
+    plain, absorbing = with_settings(min_size=50), with_settings(min_size=50, absorb=True)
+    assert (grow_regions(points, normals, curvature, neighbors, plain) == UNLABELED).all()
+    assert (grow_regions(points, normals, curvature, neighbors, absorbing) == 0).sum() >= 50
+
+
 @pytest.mark.parametrize("unit", [1e-4, 1e3])
 def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
     generator = np.random.default_rng(10)
@@ -379,6 +422,7 @@ def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
     [
         ("max_plane_residual", 0.0),
         ("absorb_reach", -1.0),
+        ("absorb_angle_deg", 91.0),
         ("merge_tolerance", 0.9),
         ("facet_tolerance", 0.0),
         ("max_distance", -1.0),

@@ -144,6 +144,9 @@ def label_regions(
     ``roots`` ``(N,)`` are what :func:`grow` gives. This needs the whole cloud, too.
     """
     least = config.min_size
+    if config.absorb:
+        # A region may be large enough only with the points that it absorbs.
+        least = min(least, max(least // 2, LEAST_FITTED))
     # Facets make a face together, however small they are.
     fitted = least if config.facet_tolerance is None else min(least, LEAST_FITTED)
     labels, fits = number_by_size(roots, fitted), RegionFits(cloud, config)

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_chunks, places_of
 from torchrg.config import GrowingConfig
-from torchrg.linalg import eigh3_of_few, unsigned_angle_deg
+from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords, unsigned_angle_deg
+from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import (
     LEAST_CONTACTS,
     PARALLEL_DEG,
@@ -18,6 +19,11 @@ from torchrg.regions.adjacency import (
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
+
+_AGREE = 0.3
+"""Share of the largest angle. Regions too small before absorption whose normals are off by less,
+root mean square, are faces: of a small one half is border. Without this a cluttered office has 490
+regions instead of 306."""
 
 _MAX_PASSES = 10
 """Passes over the borders at most. Points that moved lead to the next: narrow strips fill from
@@ -70,11 +76,13 @@ def refine_regions(
         planes = fits.of(labels)
         labels = absorb_points(
             cloud.points,
-            labels,
+            _drop_scattered(cloud, labels, planes.normal, config),
             beside,
             planes,
             planes.times_thickness(config.absorb_reach),
             valid=cloud.valid,
+            normals=cloud.normals,
+            max_angle_deg=config.absorb_angle_deg,
         )
         labels = _drop_small(labels, config.min_size)
     if config.merge_coplanar:
@@ -89,6 +97,22 @@ def refine_regions(
         reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
         labels = refine_borders(cloud, labels, planes, reach)
     return labels
+
+
+def _drop_scattered(
+    cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
+) -> Tensor:
+    """Return labels without regions that are too small and whose normals do not agree.
+
+    Those that agree may be large enough with the points at their borders. Numbers have gaps then.
+    """
+    small = torch.bincount(labels + 1, minlength=1)[1:] < config.min_size
+    small = torch.cat([small, small.new_zeros(1)])
+    segments = Segments(torch.where(small[labels], labels, UNLABELED))
+    own, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)
+    agrees = segments.mean(sq_chords(own, theirs)) <= deg_to_sq_chord(_AGREE * config.max_angle_deg)
+    scattered = segments.rows[~segments.spread(agrees)]
+    return labels.index_fill(0, scattered, UNLABELED)
 
 
 def _drop_small(labels: Tensor, min_size: int) -> Tensor:
@@ -106,12 +130,15 @@ def absorb_points(
     reach: Tensor,
     *,
     valid: Tensor,
+    normals: Tensor | None = None,
+    max_angle_deg: float = 90.0,
 ) -> Tensor:
     """Give points without a region to regions they touch, until none can be given.
 
-    A point may join a region when a point beside it belongs to it and its distance to the region's
-    plane is within reach. Of several regions it joins the one whose plane is nearest. Points that
-    joined have the next beside them.
+    A point may join a region when a point beside it belongs to it, its distance to the region's
+    plane is within reach, and its normal, if there are normals ``(N, 3)``, is within the angle of
+    the plane's. Of several regions it joins the one whose plane is nearest. Points that joined have
+    the next beside them.
 
     ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud, or of the pixels of an image, as
     ``beside`` is. Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all.
@@ -119,6 +146,7 @@ def absorb_points(
     """
     # Narrow numbers are gathered faster, and take half of the memory.
     labels = labels.to(torch.int32)
+    limit = deg_to_sq_chord(max_angle_deg)
     rows = waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
     while len(rows):
         near = labels[beside.around(rows)]
@@ -127,6 +155,9 @@ def absorb_points(
         region = near.clamp(min=0)
         distance = planes.signed_distances(points[rows], region).abs()
         fits = (near >= 0) & (distance <= reach[region])
+        if normals is not None:
+            own = normals[rows].double()[:, :, None].unbind(dim=1)
+            fits &= sq_chords(own, planes.normal[region].unbind(dim=2)) <= limit
         choice, least = _least(torch.where(fits, distance, torch.inf), near)
         joined = least.isfinite()
         rows = rows[joined]
