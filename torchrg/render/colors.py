@@ -49,22 +49,22 @@ UNLABELED_GRAY = 176
 """Red, green and blue of points that belong to no plane."""
 
 _CALM = (
-    "eca3b8 eea59d e2ac88 cbb580 aebe87 8ec49b 70c7b6 61c6d2 70c1e6 94baee bbb0e7 dba7d3 "
-    "feced2 ffd0c0 f8d4ab e0dcaa c4e3b6 a9e7cc 97e8e6 98e6fc b9defe d1d8fe edd0fd fecce5"
+    "f0a7bc f1aa9c deb487 bebf86 98c79a 74cbba 66c9db 81c3ef b0b8f0 daaddc "
+    "fdd3d4 ffd4bf f0dbab cfe4b4 aeeacd 99ebeb abe5fe cadeff e6d6ff ffcfea"
 )
-"""Colours of large planes: 12 hues of chroma 30 and 26 in CIE Lab, lightness 74.5 and 87."""
+"""Colours of large planes: 10 hues of chroma 30 and 26 in CIE Lab, lightness 76 and 88."""
 _VIVID = (
-    "c74a79 c7514c b16325 8e750a 60821e 0b8947 0d8676 0c848f 0581a5 077bc7 766bc7 ae56a6 "
-    "f16e82 e67b56 c78d38 9c9d35 65a951 07ad80 06aaa8 15a7c4 11a2e3 6f95f5 ba82dd e471b3 "
-    "ffa0bd fda49b fea769 d9b954 a6c762 66d088 11d2ba 09cfe0 35cafe 8ebffd bfb1ff f99bee"
+    "b6396a b53f41 a4511c 856303 606f00 297727 077758 077472 107284 0c7098 026abb 7159b2 a04592 "
+    "e26077 d96c4f bf7d30 9a8d25 6d9838 269f5d 029d8a 079aa5 0297bd 1392db 7385e4 b372cb d663a3 "
+    "fe8eb2 fe928c f99960 d7aa4b abb850 76c26d 16c897 14c4c1 13c1df 13bdfe 84b1fe bea1ff f08fdf"
 )
-"""Colours of small planes, which are easier to see: 12 hues of chroma up to 54, lightness 50, 63
-and 76."""
+"""Colours of small planes, which are easier to see: 13 hues of chroma up to 54, lightness 44, 58
+and 72."""
 _LARGE = 0.03
 """Share of all points from which on a plane is large."""
-_ALIKE = 58.0
+_ALIKE = 120.0
 """Squared distance in CIE Lab of two colours that look about the same."""
-_WITHOUT_CONE = 0.25
+_WITHOUT_CONE = 0.5
 """Weight of what the colour-blind see. With less, planes side by side look alike to them; with
 more, to all others."""
 _AXES_WITHOUT_CONE = ((0.0, 1.0), (1.07, 0.56))
@@ -77,11 +77,11 @@ _ELSEWHERE = 0.005
 _GRAY_WEIGHT = 0.05
 """Weight of the gray of points in no plane, which are nearly everywhere."""
 PALETTE = torch.tensor([list(bytes.fromhex(row)) for row in f"{_CALM} {_VIVID}".split()]).byte()
-"""Colours of planes, the calm ones first, shape ``(60, 3)``, uint8."""
+"""Colours of planes, the calm ones first, shape ``(59, 3)``, uint8."""
 
 
 def _likeness() -> Tensor:
-    """Return how alike each colour of the palette looks to each, and to gray, ``(60, 61)``.
+    """Return how alike each colour of the palette looks to each, and to gray, ``(59, 60)``.
 
     That is to eyes with three kinds of cones, and with a weight to those of the worst dichromacy.
     """

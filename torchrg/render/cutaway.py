@@ -44,6 +44,8 @@ _LEAST_BELOW = 0.4
 """
 _BELOW_CEILING = 0.15
 """Share of the cloud's height below a ceiling that goes with it: lamps and beams hang there."""
+_MOST_PIXELS = 500
+"""Side of the picture that tells how much a view shows."""
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
 """Angles from the normal of the largest wall, in degrees, that are tried. None looks straight at a
 wall, so that two walls of a corner are always seen."""
@@ -89,47 +91,14 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         nothing = torch.zeros(0, dtype=torch.uint8, device=centers.device)
         return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
     if labels is None:
-        segmentation = segment_planes(centers, load_config("classic"))
-        labels = segmentation.labels[surface.voxel_of]
+        labels = segment_planes(centers, load_config("classic")).labels[surface.voxel_of]
     known, of_points = number_labels(labels.clamp(min=UNLABELED))
     of_voxels = of_points[surface.first]
-    numbers = number_labels(of_voxels)[1]
-    planes = summarize_planes(centers, surface.normals, numbers)
-    kind = classify_planes(planes, up)
-    is_kind = {name: kind == place for place, name in enumerate(PLANE_KINDS)}
+    planes = summarize_planes(centers, surface.normals, number_labels(of_voxels)[1])
     altitude = centers @ up
     low, high = altitude.quantile(altitude.new_tensor([0.02, 0.98])).tolist()
-    walls = is_kind["wall"] | _broad(planes, is_kind["vertical"] | is_kind["wall"])
-    ceilings = _broad(planes, kind != PLANE_KINDS.index("other")) & is_kind["horizontal"]
-    ceilings &= planes.center @ up - low > _LEAST_BELOW * (high - low)
-    ceilings |= is_kind["ceiling"]
-    heading = _heading(planes.normal[walls], planes.area[walls], up)
-    rows = (walls | ceilings).nonzero().squeeze(1)
-    rows = rows[planes.area[rows].argsort(descending=True, stable=True)][:_MOST_WALLS]
-    local = centers[:, None] - planes.center[rows]
-    across = torch.einsum("vmi,mji->vmj", local, planes.axes[rows]).abs()
-    thickness = _THICKNESS * surface.size + 2 * planes.rms[rows]
-    below = _BELOW_CEILING * (high - low)
-    depth = torch.where(ceilings[rows], thickness.clamp(min=below), thickness)
-    beside = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
-    heights = (local * planes.normal[rows]).sum(dim=2)
-    directions: list[Tensor] = []
-    covered = torch.zeros(len(centers), MOST_SIDES, dtype=torch.bool, device=centers.device)
-    for place, row in enumerate(rows.tolist()):
-        for sign in (1, -1):
-            outward, height = sign * planes.normal[row], sign * heights[:, place]
-            beyond = (beside[:, place] & (height > thickness[place])).float().mean()
-            inside = (height < -thickness[place]).float().mean()
-            if beyond > _MOST_BEYOND or inside < _LEAST_INSIDE:
-                continue
-            if ceilings[row] and outward @ up < 0:
-                continue
-            alike = [n for n, each in enumerate(directions) if each @ outward > _ALIKE]
-            if not alike and len(directions) < MOST_SIDES:
-                alike = [len(directions)]
-                directions.append(outward)
-            for side in alike[:1]:
-                covered[:, side] |= beside[:, place] & (height > -depth[place])
+    walls, ceilings = _closing(planes, up, low, high)
+    directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
     powers = 1 << torch.arange(MOST_SIDES, device=centers.device)
     by_place = (covered * powers).sum(dim=1)
     own = of_points >= 0
@@ -139,17 +108,57 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
     voxels = torch.where(of_voxels < 0, by_place, of_planes[of_voxels])
     points = torch.where(of_points < 0, by_place[surface.voxel_of], of_planes[of_points])
-    return Sides(
-        torch.stack([centers.new_zeros(3), *directions])[1:],
-        voxels.to(torch.uint8),
-        points.to(torch.uint8),
-        heading,
-    )
+    heading = _heading(planes.normal[walls], planes.area[walls], up)
+    return Sides(directions, voxels.to(torch.uint8), points.to(torch.uint8), heading)
 
 
-def _broad(planes: Planes, among: Tensor) -> Tensor:
-    """Return which of the planes ``(M,)`` have a share of the area of the largest among them."""
-    return among & (planes.area >= _LEAST_AREA * torch.where(among, planes.area, 0.0).amax())
+def _closing(planes: Planes, up: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """Return which planes may be outer walls, and which ceilings, shape ``(M,)`` each.
+
+    They have that kind, or are about as large as those that have it; the cloud reaches from the
+    height ``low`` to ``high``.
+    """
+    kind = classify_planes(planes, up)
+    is_kind = {name: kind == place for place, name in enumerate(PLANE_KINDS)}
+    upright = is_kind["wall"] | is_kind["vertical"]
+    level = is_kind["ceiling"] | is_kind["horizontal"] | is_kind["floor"]
+    broad = [
+        among & (planes.area >= _LEAST_AREA * functional.pad(planes.area[among], (0, 1)).amax())
+        for among in (upright, level)
+    ]
+    is_high = planes.center @ up - low > _LEAST_BELOW * (high - low)
+    return broad[0] | is_kind["wall"], (broad[1] & is_high) | is_kind["ceiling"]
+
+
+def _outer(
+    surface: Surface, planes: Planes, walls: Tensor, ceilings: Tensor, up: Tensor, height: float
+) -> tuple[Tensor, Tensor]:
+    """Return the directions of outer sides, and which voxels are in each ``(V, MOST_SIDES)``."""
+    rows = (walls | ceilings).nonzero().squeeze(1)
+    rows = rows[planes.area[rows].argsort(descending=True, stable=True)][:_MOST_WALLS]
+    local = surface.centers[:, None] - planes.center[rows]
+    across = torch.einsum("vmi,mji->vmj", local, planes.axes[rows]).abs()
+    thickness = _THICKNESS * surface.size + 2 * planes.rms[rows]
+    depth = torch.where(ceilings[rows], thickness.clamp(min=_BELOW_CEILING * height), thickness)
+    beside = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
+    heights = (local * planes.normal[rows]).sum(dim=2)
+    directions: list[Tensor] = []
+    covered = torch.zeros(len(local), MOST_SIDES, dtype=torch.bool, device=local.device)
+    for place, row in enumerate(rows.tolist()):
+        for sign in (1, -1):
+            outward, above = sign * planes.normal[row], sign * heights[:, place]
+            beyond = (beside[:, place] & (above > thickness[place])).float().mean()
+            inside = (above < -thickness[place]).float().mean()
+            is_outer = bool((beyond <= _MOST_BEYOND) & (inside >= _LEAST_INSIDE))
+            if not is_outer or (ceilings[row] and outward @ up < 0):
+                continue
+            alike = [n for n, each in enumerate(directions) if each @ outward > _ALIKE]
+            if not alike and len(directions) < MOST_SIDES:
+                alike = [len(directions)]
+                directions.append(outward)
+            for side in alike[:1]:
+                covered[:, side] |= beside[:, place] & (above > -depth[place])
+    return torch.stack([up.new_zeros(3), *directions])[1:], covered
 
 
 def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
@@ -230,8 +239,10 @@ def _count_seen(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
     if len(centers) == 0 or surface.size == 0:
         return 0
     right = torch.linalg.cross(viewpoint.up, viewpoint.toward)
-    places = centers @ torch.stack([right, viewpoint.up], dim=1) / (1.5 * surface.size)
-    column, row = (places - places.amin(dim=0)).long().unbind(dim=1)
+    places = centers @ torch.stack([right, viewpoint.up], dim=1)
+    places -= places.amin(dim=0)
+    pitch = max(1.5 * surface.size, float(places.amax()) / _MOST_PIXELS)
+    column, row = (places / pitch).long().unbind(dim=1)
     pixels, height = column * (int(row.amax()) + 1) + row, centers @ viewpoint.toward
     front = height.new_full((int(pixels.amax()) + 1,), -torch.inf)
     front.scatter_reduce_(0, pixels, height, "amax")

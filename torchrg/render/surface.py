@@ -34,7 +34,7 @@ class Surface(NamedTuple):
         first: The first point of each voxel, shape ``(V,)``.
         centers: Means of the points, shape ``(V, 3)``, float32, about ``origin``.
         normals: Unit normals of arbitrary sign, shape ``(V, 3)``; zero where there is no plane.
-        size: Edge of a voxel.
+        size: Edge of a voxel, or the usual spacing if that is larger.
     """
 
     rows: Tensor
@@ -87,7 +87,7 @@ def sample_surface(points: Tensor) -> Surface:
         held.cumsum(0) - held,
         centers,
         normals,
-        step * 2**level,
+        max(step * 2**level, float(spacing.median()) if len(spacing) else 0.0),
     )
 
 
