@@ -1,7 +1,7 @@
 """What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
 
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from torchrg.linalg.moments import Segments
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
-from torchrg.regions.outline import trace_outline
-from torchrg.regions.table import Rectangles, classify_planes, covered_areas
+from torchrg.regions.table import classify_planes, summarize_planes
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import Surface, sample_surface
@@ -130,7 +128,7 @@ def radii_of(surface: Surface) -> Tensor:
     return (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round().to(torch.uint8)
 
 
-def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, Any]]:
+def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, object]]:
     """Return what a page says about each plane, by the number that its points have there.
 
     It is the table of the result: the columns of :func:`torchrg.result.describe_planes` but for
@@ -171,17 +169,11 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
         return outlines
     rows = rows[:_OUTLINE_POINTS]
     numbers, labels = number_labels(result.labels[rows])
-    segments = Segments(labels)
-    axes, center = planes.axes[numbers].double(), planes.center[numbers].double()
-    centered = torch.stack(segments.take_about(result.cloud.points[rows], center), dim=1)
-    u, v = ((centered * segments.spread(axis)).sum(dim=1) for axis in axes.unbind(dim=1))
-    along = torch.eye(2, dtype=torch.float64).expand(len(numbers), 2, 2)
-    boxes = Rectangles(planes.extent[numbers].double(), along, torch.zeros_like(center[:, :2]))
-    width = covered_areas(segments, u, v, boxes)[1]
-    parts = torch.split(torch.stack([u, v], dim=1), segments.counts.tolist())
-    for place, (own, part) in enumerate(zip(numbers.tolist(), parts, strict=True)):
-        rings = (torch.from_numpy(r) for r in trace_outline(part.numpy(), float(width[place])))
-        outlines[own] = tuple(center[place] + ring @ axes[place] for ring in rings)
+    points = result.cloud.points[rows]
+    normals = result.fields.get("normals", torch.zeros_like(result.cloud.points))[rows]
+    table = summarize_planes(points, normals.to(points.dtype).nan_to_num(), labels, outline=True)
+    for number, rings in zip(numbers.tolist(), table.outline or (), strict=True):
+        outlines[number] = rings
     return outlines
 
 
@@ -192,6 +184,7 @@ def _rectangles(planes: Planes) -> Tensor:
     return planes.center.double()[:, None] + signs @ half
 
 
-def rounded(values: Tensor) -> Any:  # noqa: ANN401
+def rounded(values: Tensor) -> object:
     """Return numbers of a page as JSON needs them: a step is a hundred-thousandth of the cloud."""
-    return np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
+    numbers: object = np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
+    return numbers

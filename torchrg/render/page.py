@@ -17,7 +17,7 @@ import os
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
 from torchrg.io.stream import Extent
 from torchrg.neighbors.order import restore_rows
-from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
+from torchrg.render.channels import MODES, channels_of, encode_directions
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
     PAGE_EXTENT,
@@ -45,6 +45,9 @@ from torchrg.render.content import (
 from torchrg.render.cutaway import LEAST_FACING, View, choose_viewpoint
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 MAX_POINTS = 1_000_000
 """Most points of a page by default: as many as a laptop turns fluently."""
@@ -232,7 +235,7 @@ def _describe_cloud(
             plane["sides"] = side
     low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
     steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
-    arrays: dict[str, NDArray[Any]] = {"positions": steps.numpy().astype(np.uint16)}
+    arrays: dict[str, NDArray[np.generic]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
     radii = radii_of(shown.surface)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
@@ -254,7 +257,10 @@ def _describe_cloud(
         "step": PAGE_EXTENT / _STEPS,
         "spacing": float(shown.surface.spacing.median()) if len(shown.rows) else 0.0,
         "surfaces": rounded(shown.sides.directions),
-        "channels": {channel.mode: _describe_channel(channel) for channel in channels},
+        "channels": {
+            channel.mode: {"legend": channel.legend, "direct": channel.colors is None}
+            for channel in channels
+        },
         "planes": planes,
         "arrays": manifest,
     }
@@ -280,11 +286,6 @@ def _palettes(
     return palettes
 
 
-def _describe_channel(channel: Channel) -> dict[str, Any]:
-    """Return what a page says about a meaning of colours."""
-    return {"legend": channel.legend, "direct": channel.colors is None}
-
-
 def _direction_of_view(shown: Shown, view: View, frame: Frame, azimuth_deg: float | None) -> Tensor:
     """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
     if view == "sensor":
@@ -295,7 +296,7 @@ def _direction_of_view(shown: Shown, view: View, frame: Frame, azimuth_deg: floa
     return choose_viewpoint(shown.surface, shown.sides, view, up, azimuth_deg=azimuth_deg).toward
 
 
-def _pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]:
+def _pack(arrays: Mapping[str, NDArray[np.generic]]) -> tuple[list[dict[str, object]], str]:
     """Return name, type and shape of arrays, and all of them as one text.
 
     Each column is split into its bytes, the low ones first. Of positions, which lie along a curve,
@@ -336,7 +337,7 @@ def _encode(content: bytes) -> str:
     return base64.b64encode(squeezer.compress(content) + squeezer.flush()).decode("ascii")
 
 
-def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library: str) -> str:
+def _fill_template(description: Mapping[str, object], blobs: Iterable[str], library: str) -> str:
     """Return the text of a page."""
     from markupsafe import Markup
 
@@ -351,7 +352,7 @@ def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library
     return text
 
 
-def template_of(name: str) -> Any:  # noqa: ANN401
+def template_of(name: str) -> "Template":
     """Return one of the templates beside this file; what is put into it is escaped.
 
     Raises:
@@ -361,7 +362,8 @@ def template_of(name: str) -> Any:  # noqa: ANN401
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
     )
-    return environment.from_string((_ASSETS / name).read_text(encoding="utf-8"))
+    template: Template = environment.from_string((_ASSETS / name).read_text(encoding="utf-8"))
+    return template
 
 
 def _json_for_html(value: object) -> str:

@@ -3,7 +3,7 @@
 import functools
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import torch
@@ -287,7 +287,7 @@ def render_points(
     return draw_picture(camera, surface, kept, paint, slant, supersampling=supersampling)
 
 
-def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[Any]) -> None:
+def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:
     """Write a picture, or an image of labels, as a PNG file.
 
     Args:
