@@ -92,6 +92,14 @@ def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run):
     assert not torch.equal(regrow(run, "hallway", method, 0.01, quantile), kept)
 
 
+def test_part_alone_makes_a_report_of_itself(small, tmp_path, monkeypatch):
+    call_script(monkeypatch, "--out", tmp_path, "--quick", "method")
+    report = json.loads((tmp_path / "quick" / "report.json").read_text())
+    assert list(report["parts"]) == ["method"]
+    assert "Figure 5" in (tmp_path / "quick" / "report.html").read_text()
+
+
+@pytest.mark.slow
 def test_one_call_makes_the_whole_report(small, tmp_path, monkeypatch):
     call_script(monkeypatch, "--out", tmp_path, "--quick")
     folder = tmp_path / "quick"
