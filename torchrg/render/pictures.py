@@ -83,7 +83,7 @@ def draw_picture(
 
     def discs_of(some: Tensor) -> Discs:
         rows = surface.rows[some]
-        slant = surface.normals[surface.voxel_of[some]] if normals is None else normals[rows]
+        slant = surface.normals_at(some) if normals is None else normals[rows]
         place, least = surface.points[some], supersampling / 2
         return _discs(project, place, colors[rows], slant.float(), lengths[some], least=least)
 

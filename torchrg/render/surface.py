@@ -34,6 +34,7 @@ class Surface(NamedTuple):
         first: The first point of each voxel, shape ``(V,)``.
         centers: Means of the points, shape ``(V, 3)``, float32, about ``origin``.
         normals: Unit normals of arbitrary sign, shape ``(V, 3)``; zero where there is no plane.
+        near: The nearest voxels of each, itself first, shape ``(V, K)``.
         size: Edge of a voxel, or the usual spacing if that is larger.
     """
 
@@ -45,7 +46,24 @@ class Surface(NamedTuple):
     first: Tensor
     centers: Tensor
     normals: Tensor
+    near: Tensor
     size: float
+
+    def normals_at(self, places: Tensor) -> Tensor:
+        """Return unit normals of some of the n points, ``(*, 3)``; zero where there is no plane.
+
+        In a voxel at an edge a point has that of the plane around that passes nearest to it.
+        """
+        voxel = self.voxel_of[places]
+        normals = self.normals[voxel]
+        at_edge = (normals == 0).all(dim=1).nonzero().squeeze(1)
+        near = self.near[voxel[at_edge]]
+        around = self.normals[near]
+        away = self.points[places[at_edge], None] - self.centers[near]
+        heights = (away * around).sum(dim=2).abs()
+        heights.masked_fill_((around == 0).all(dim=2), torch.inf)
+        best = heights.argmin(dim=1)
+        return normals.index_copy(0, at_edge, around[torch.arange(len(best)), best])
 
 
 def sample_surface(points: Tensor) -> Surface:
@@ -77,7 +95,7 @@ def sample_surface(points: Tensor) -> Surface:
     )
     sums = steps.new_zeros(len(held), 3).index_add_(0, voxel_of, steps[order])
     centers = ((sums / held.double()[:, None] + 0.5) * step).float()
-    spacing, normals = _measure(centers, counts)
+    spacing, normals, near = _measure(centers, counts)
     return Surface(
         rows[order],
         local[order],
@@ -87,6 +105,7 @@ def sample_surface(points: Tensor) -> Surface:
         held.cumsum(0) - held,
         centers,
         normals,
+        near,
         max(step * 2**level, float(spacing.median()) if len(spacing) else 0.0),
     )
 
@@ -100,19 +119,20 @@ def _level_of_voxels(codes: Tensor) -> int:
     return level
 
 
-def _measure(centers: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distance between points ``(V,)`` and the normal ``(V, 3)`` around each voxel.
+def _measure(centers: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the distance between points ``(V,)``, the normal and the nearest of each voxel.
 
     Voxels with eigenvalues ``a <= b <= c`` of their covariance cover about ``12 sqrt(b c)`` of a
     plane, ``sqrt(12 c)`` of a line.
     """
     if len(centers) < 2:
-        return centers.new_zeros(len(centers)), torch.zeros_like(centers)
-    near = search_knn(centers, min(_NEIGHBORS, len(centers))).indices
+        nothing = torch.zeros_like(centers)
+        return nothing[:, 0], nothing, nothing[:, :1].long()
+    near = search_knn(centers, min(_NEIGHBORS, len(centers))).indices.long()
     values, vectors = eigh3(covariance(gather_patches(centers, near))[1])
-    num_points = counts[near.long()].sum(dim=1)
+    num_points = counts[near].sum(dim=1)
     smallest, middle, largest = values.clamp(min=0).unbind(dim=1)
     area, length = 12 * (middle * largest).sqrt(), (12 * largest).sqrt()
     flat = (smallest < _FLAT * middle)[:, None]
     spacing = torch.maximum((area / num_points).sqrt(), length / num_points)
-    return spacing, torch.where(flat, vectors[..., 0], 0.0)
+    return spacing, torch.where(flat, vectors[..., 0], 0.0), near
