@@ -28,6 +28,8 @@ MOST_SIDES = 7
 """Outer sides of a cloud: bits of a byte, the last of which hides planes on a page."""
 _MOST_WALLS = 60
 """So many of the largest walls and ceilings may be outer ones, which bounds the memory."""
+_ANGLE_DEG = 4.0
+"""Angle of growth on voxels, which have little noise: with more, ceilings grow into walls."""
 _ALIKE = 0.9
 """Least cosine between the directions of walls that are cut away together."""
 _MOST_BEYOND = 0.03
@@ -91,7 +93,8 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         nothing = torch.zeros(0, dtype=torch.uint8, device=centers.device)
         return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
     if labels is None:
-        labels = segment_planes(centers, load_config("classic")).labels[surface.voxel_of]
+        config = load_config("classic").at_angle(_ANGLE_DEG)
+        labels = segment_planes(centers, config).labels[surface.voxel_of]
     known, of_points = number_labels(labels.clamp(min=UNLABELED))
     of_voxels = of_points[surface.first]
     planes = summarize_planes(centers, surface.normals, number_labels(of_voxels)[1])
