@@ -42,7 +42,12 @@ def draw_rooms(path: Path) -> Result:
     grey = torch.full((NUM_POINTS, 3), _GREY, dtype=torch.uint8)
     pictures = [
         render_cloud(
-            room.points, colors, normals=seg.normals, azimuth_deg=AZIMUTH_DEG, width=WIDTH
+            room.points,
+            colors,
+            normals=seg.normals,
+            labels=seg.labels,
+            azimuth_deg=AZIMUTH_DEG,
+            width=WIDTH,
         ).numpy()
         for colors in (
             grey,

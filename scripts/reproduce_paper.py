@@ -3,10 +3,10 @@
     python scripts/reproduce_paper.py --out DIR                 # everything
     python scripts/reproduce_paper.py --out DIR --quick         # the same, small, in minutes
     python scripts/reproduce_paper.py --out DIR normals times   # some parts
-    python scripts/reproduce_paper.py --out DIR --again times   # Table 3 measured once more
 
 Open DIR/report.html. Each result is kept in a file of its own under DIR; what the same commit made
-is not computed again, so a run that was interrupted goes on where it stopped. At full size the tree
+is not computed again, so a run that was interrupted goes on where it stopped; delete DIR/cells to
+measure once more. At full size the tree
 must be clean: a report is of one commit. Quick results are apart, in DIR/quick. Clouds of the paper
 that are not given are replaced by made ones with known truth.
 """
@@ -52,7 +52,7 @@ def main() -> None:
             f"{commit}; commit the changes, or take --quick."
         )
     path = arguments.out / "quick" if arguments.quick else arguments.out
-    folder = Folder(path, arguments.again)
+    folder = Folder(path)
     run = Run(folder, arguments.quick, {key: getattr(arguments, key) for key in TITLES})
     for name in arguments.parts or PARTS:
         begin = time.perf_counter()
@@ -80,9 +80,6 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the report")
     parser.add_argument("--quick", action="store_true", help="small clouds, a few minutes")
-    parser.add_argument(
-        "--again", action="store_true", help="compute results that are there once more"
-    )
     parser.add_argument("--threads", type=int, help="threads of torch; default: as torch decides")
     parser.add_argument(
         "--readme", action="store_true", help="put the main numbers into the README"

@@ -3,7 +3,7 @@
 import functools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,9 @@ class Folder:
 
     Args:
         path: The folder; it is made when the first result comes.
-        again: Whether results that are there are computed once more, each once a call.
     """
 
     path: Path
-    again: bool = False
-    _renewed: set[str] = field(default_factory=set)
 
     def cell(self, name: str, work: Callable[[], Record], *, needs: Path | None = None) -> Record:
         """Return the record of that name, computed now if this commit has not made it yet.
@@ -40,13 +37,11 @@ class Folder:
             needs: A file that ``work`` writes beside it, without which the record is of no use.
         """
         path = self.path / "cells" / f"{name}.json"
-        is_due = self.again and name not in self._renewed
-        if path.exists() and (needs is None or needs.exists()) and not is_due:
+        if path.exists() and (needs is None or needs.exists()):
             record: Record = json.loads(path.read_text())
             if record["made_with"]["commit"] == made_with()["commit"]:
                 return record
         record = {**work(), "made_with": made_with()}
-        self._renewed.add(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         self.write(Path("cells") / path.name, json.dumps(record, indent=1))
         return record

@@ -1,23 +1,11 @@
 """Table 1, and tables and claims about the errors of normals."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from statistics import fmean
 
 from reproduction.cells import Record
 from reproduction.paper_numbers import NORMAL_SECONDS
 from reproduction.sections import Block, claim, mark_best, table
-
-COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "MSAE": ("msae", lambda x: f"{x:.1f}"),
-    "mean": ("mean", lambda x: f"{x:.2f}"),
-    "median": ("median", lambda x: f"{x:.2f}"),
-    "< 5": ("under_5_deg", lambda x: f"{100 * x:.1f} %"),
-    "< 10": ("under_10_deg", lambda x: f"{100 * x:.1f} %"),
-    "< 20": ("under_20_deg", lambda x: f"{100 * x:.1f} %"),
-    "MSAE at edges": ("sharp_msae", lambda x: f"{x:.1f}"),
-    "elsewhere": ("regular_msae", lambda x: f"{x:.1f}"),
-}
-"""Columns of a table of errors: field of the score, and how it is printed. Degrees."""
 
 PLAIN, ROBUST = ("pca", "jet"), ("irls", "detmm")
 """What the paper compares with its own: "fast but inaccurate", and the others."""
@@ -79,19 +67,6 @@ def time_table(records: list[Record]) -> Block:
     head = ["estimator", *(f"{noise:g} %" for noise in noises)]
     points = records[0]["num_points"]
     return table(f"**Table 1**, seconds on the cuboid of {points:,} points", head, rows, note)
-
-
-def error_table(records: list[Record], shape: str) -> Block:
-    """Return all indices of one shape."""
-    rows = []
-    for noise in values(records, "noise_percent"):
-        for variant in values(records, "variant"):
-            row = [f"{noise:g} %", variant]
-            for field, show in COLUMNS.values():
-                mean = mean_score(records, field, noise_percent=noise, variant=variant)
-                row.append("" if mean is None else show(mean))
-            rows.append(row)
-    return table(shape.replace("_", " "), ["noise", "estimator", *COLUMNS], rows)
 
 
 def normal_claims(records: list[Record], *, with_times: bool) -> list[Block]:

@@ -11,11 +11,9 @@ import torch
 from reproduction.cells import Record
 from reproduction.normal_figures import draw_errors, draw_sharp_points
 from reproduction.normal_tables import (
-    error_table,
     normal_claims,
     summary_table,
     time_table,
-    values,
     where,
 )
 from reproduction.runs import Run
@@ -123,7 +121,6 @@ def _blocks(run: Run, records: list[Record]) -> list[Block]:
     draw_errors(run.folder.place("figures/figure4.png"), records, PAPERS)
     shapes = [shape for shape in (*PAPERS, *_OTHERS) if shape in SHAPES][:_NUM_DRAWN]
     draw_sharp_points(run.folder.place("figures/figure3.png"), _sharp_clouds(shapes))
-    drawn = [record for record in records if record["shape"] in PAPERS]
     return [
         text(
             "Shapes with known normals; Gaussian noise, its standard deviation in percent of the "
@@ -142,7 +139,6 @@ def _blocks(run: Run, records: list[Record]) -> list[Block]:
         figure("figures/figure4.png", "**Figure 4**: MSAE against noise. Logarithmic scale."),
         time_table(where(records, shape="cuboid")),
         summary_table(records),
-        *(error_table(where(drawn, shape=shape), shape) for shape in values(drawn, "shape")),
     ]
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from importlib.util import find_spec
 from pathlib import Path
 
 import matplotlib as mpl
@@ -13,10 +12,8 @@ from torch import Tensor
 
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
-from torchrg.render import color_planes, make_page, render_cloud, write_page
+from torchrg.render import color_planes, render_cloud
 from torchrg.render.channels import OUTCOMES, outcomes_of
-from torchrg.result import Result
-from torchrg.structures import Cloud
 
 SETTINGS = {
     "font.family": "serif",
@@ -110,32 +107,6 @@ def draw_side_by_side(
     return _tile(folder, name, cloud, paints)
 
 
-def write_pair(folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]) -> str:
-    """Write a page of the last segmentation beside the true faces, or beside the first one.
-
-    Returns:
-        The name of the file; empty where pydeck, which pages need, is not installed.
-    """
-    if find_spec("pydeck") is None:
-        return ""
-    first, *_, last = [*labelings, *labelings]
-    pair = {last: labelings[last]}
-    if cloud.labels is not None:
-        pair["true faces"] = cloud.labels
-    elif first != last:
-        pair[first] = labelings[first]
-    normals = {} if cloud.normals is None else {"normals": cloud.normals.numpy()}
-    results = [
-        Result(Cloud(cloud.points.numpy(), {"labels": labels.numpy(), **normals}, source=title))
-        for title, labels in pair.items()
-    ]
-    truth = None if cloud.labels is None else results[-1].cloud
-    file = f"figures/{name}.html"
-    page = make_page(results[0], beside=results[1] if len(results) > 1 else None, truth=truth)
-    write_page(folder.place(file), page)
-    return file
-
-
 def draw_outcomes(
     folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]
 ) -> str:
@@ -158,7 +129,9 @@ def _tile(
 ) -> str:
     """Render a cloud in several colourings, and write them as one picture."""
     pictures = {
-        title: render_cloud(cloud.points, paint, normals=cloud.normals, width=_WIDTH)
+        title: render_cloud(
+            cloud.points, paint, normals=cloud.normals, labels=cloud.labels, width=_WIDTH
+        )
         for title, paint in paints.items()
     }
     height, width = next(iter(pictures.values())).shape[:2]

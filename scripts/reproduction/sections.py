@@ -23,9 +23,9 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], note: 
     }
 
 
-def figure(file: str, caption: str, page: str = "") -> Block:
-    """Return a picture, a file beside the report, and the page that it leads to, if any."""
-    return {"kind": "figure", "file": file, "caption": caption, "page": page}
+def figure(file: str, caption: str) -> Block:
+    """Return a picture, a file beside the report."""
+    return {"kind": "figure", "file": file, "caption": caption}
 
 
 def claim(

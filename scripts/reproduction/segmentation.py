@@ -9,7 +9,7 @@ from reproduction.clouds import HARD, OTHERS, TITLES
 from reproduction.faces import LARGE
 from reproduction.methods import DRAWN, METHODS, PAPERS
 from reproduction.paper_numbers import INDEX_NAMES, INDICES, POINTS
-from reproduction.pictures import draw_outcomes, draw_side_by_side, write_pair
+from reproduction.pictures import draw_outcomes, draw_side_by_side
 from reproduction.runs import Run
 from reproduction.sections import Block, figure, mark_best, section, table, text
 from reproduction.segmentations import (
@@ -161,8 +161,7 @@ def draw_figures(run: Run, key: str, number: str) -> list[Block]:
     labelings = {method: read_segmented(run, key, method).labels for method in DRAWN}
     name = f"{number.lower().replace(' ', '')}_{key}"
     file = draw_side_by_side(run.folder, name, cloud, labelings)
-    page = write_pair(run.folder, name, cloud, labelings)
-    blocks = [figure(file, f"**{number}**, {cloud.origin}. Points of no region are gray.", page)]
+    blocks = [figure(file, f"**{number}**, {cloud.origin}. Points of no region are gray.")]
     if cloud.labels is None:
         return blocks
     shares = []

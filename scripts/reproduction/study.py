@@ -1,6 +1,5 @@
 """The study of section II.B: what the limits of angle and curvature do."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib import pyplot as plt
@@ -10,7 +9,7 @@ from torch import Tensor
 from reproduction.cells import Record
 from reproduction.pictures import draw_side_by_side, settings
 from reproduction.runs import Run
-from reproduction.sections import Block, claim, figure, section, table, text
+from reproduction.sections import Block, claim, figure, section, text
 from reproduction.segmentations import count_regions, regrow
 from torchrg.metrics import adjusted_rand_index, contingency_table, score_labels
 
@@ -46,7 +45,6 @@ def reproduce(run: Run) -> Record:
             "figures/study.png", "Section II.B: lines at the 95th, dots at the 98th percentile."
         ),
         figure(picture, "The paper's method at several angles, 95th percentile."),
-        _table(records),
     ]
     return section(
         "Section II.B: the limits of angle and curvature", blocks, records, _claims(records)
@@ -105,34 +103,6 @@ def _claims(records: list[Record]) -> list[Block]:
         claim("II.B", "At 2 degrees fewer points are labelled than at 5.", joined),
         claim("II.B", "At 8 degrees the largest region is larger than at 5.", largest),
     ]
-
-
-def _table(records: list[Record]) -> Block:
-    """Return all numbers."""
-    has_truth = "f1" in records[0]["quantiles"][0]
-    head = [
-        "method",
-        "angle",
-        "regions",
-        "labelled",
-        "largest",
-        *(["F1", "mean best IoU"] * has_truth),
-    ]
-    rows = []
-    for record in records:
-        pairs = record["quantiles"]
-        row = [record["method"], f"{record['angle']:g}"]
-        row += [_both(pairs, "regions", "d"), _both(pairs, "share_labeled", ".3f")]
-        row.append(_both(pairs, "largest", ".3f"))
-        if has_truth:
-            row += [_both(pairs, "f1", ".1f"), _both(pairs, "mean_best_iou", ".3f")]
-        rows.append([*row, f"{record['ari']:.4f}"])
-    note = "At the 95th / 98th percentile. ARI: how alike the two segmentations are."
-    return table("", [*head, "ARI of the two"], rows, note)
-
-
-def _both(found: Sequence[Record], name: str, form: str) -> str:
-    return " / ".join(format(values[name], form) for values in found)
 
 
 def _draw(path: Path, records: list[Record]) -> None:

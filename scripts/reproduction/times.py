@@ -11,8 +11,6 @@ from reproduction.segmentations import segment
 GOAL = 40
 """How many times faster than the paper's 9.84 minutes its method should be."""
 
-STAGES = ("neighbors", "normals", "regions", "planes")
-
 
 def reproduce(run: Run) -> Record:
     """Make Table 3."""
@@ -25,7 +23,6 @@ def reproduce(run: Run) -> Record:
             f"{describe_surroundings(records)}."
         ),
         ratio_table(run, records),
-        stage_table(records),
     ]
     claims = time_claims(records) if not run.quick else []
     return section("Table 3: times", blocks, records, claims)
@@ -53,22 +50,6 @@ def ratio_table(run: Run, records: list[Record]) -> Block:
         rows.append([cloud.title, f"{len(cloud.points):,}", *cells])
     note = "Seconds, then the paper's minutes and how many times faster. * made cloud, or a piece."
     return table("**Table 3**", ["cloud", "points", *METHODS], rows, note)
-
-
-def stage_table(records: list[Record]) -> Block:
-    """Return the seconds of each stage."""
-    rows = [
-        [
-            record["title"],
-            record["method"],
-            *(f"{record['seconds'][stage]:.1f}" for stage in STAGES),
-            f"{100 * record['sharp_fraction']:.1f} %",
-            f"{1e6 * record['total'] / record['points']:.1f}",
-        ]
-        for record in records
-    ]
-    head = ["cloud", "method", *STAGES, "sharp points", "µs a point"]
-    return table("Seconds of each stage", head, rows)
 
 
 def time_claims(records: list[Record]) -> list[Block]:

@@ -17,7 +17,7 @@ from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.channels import decode_directions, encode_directions
 from torchrg.render.content import NUM_STRATA
-from torchrg.render.page import make_page, write_page
+from torchrg.render.page import make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -304,11 +304,6 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments, mess
     assert message in error
     assert error.count("\n") == 1
     assert not list(tmp_path.glob("page.*"))
-
-
-def test_equal_input_gives_equal_bytes(tmp_path):
-    write_page(tmp_path / "room.html", make_page(Result(room())))
-    assert (tmp_path / "room.html").read_text() == page_of_room().html
 
 
 def test_walls_of_an_open_scan_are_cut_away_from_outside_alone():

@@ -1,16 +1,43 @@
-"""Colours: planes that touch against brute force."""
+"""Colours: planes that touch against brute force, and to eyes that lack a cone."""
 
 import pytest
 import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.colors import DICHROMACIES, palette_of_planes, rgb_to_lab, without_cone
+from torchrg.render.colors import palette_of_planes, rgb_to_lab
 from torchrg.scenes import make_room
 
 CLEARLY = 20.0  # in Lab; 2.3 is just noticeable
+DICHROMACIES = {
+    "protanopia": (
+        (0.152286, 1.052583, -0.204868),
+        (0.114503, 0.786281, 0.099216),
+        (-0.003882, -0.048116, 1.051998),
+    ),
+    "deuteranopia": (
+        (0.367322, 0.860646, -0.227968),
+        (0.280085, 0.672501, 0.047413),
+        (-0.011820, 0.042940, 0.968881),
+    ),
+    "tritanopia": (
+        (1.255528, -0.076749, -0.178779),
+        (-0.078411, 0.930809, 0.147602),
+        (0.004733, 0.691367, 0.303900),
+    ),
+}
+"""How linear RGB looks to eyes that lack one kind of cone: rows of the matrices of Machado et al.,
+A physiologically-based model for simulation of color vision deficiency, 2009, severity 1."""
+
+
+def without_cone(colors, matrix):
+    """Return sRGB colours ``(C, 3)`` as eyes of a dichromacy see them."""
+    linear = rgb_to_linear_rgb(colors.T[None, :, :, None])[0, :, :, 0].T
+    seen = (linear @ linear.new_tensor(matrix).T).clamp(0, 1)
+    return linear_rgb_to_rgb(seen.T[None, :, :, None])[0, :, :, 0].T
 
 
 def lab_of(colors):
@@ -24,7 +51,7 @@ def test_lab_has_the_published_value_of_red():
 
 
 def test_planes_that_touch_look_clearly_different():
-    room = make_room(60_000, seed=3)
+    room = make_room(20_000, seed=3)
     colors = color_planes(room.labels, room.points)
     table = torch.zeros(int(room.labels.max()) + 1, 3, dtype=torch.uint8)
     table[room.labels[room.labels >= 0]] = colors[room.labels >= 0]
@@ -36,8 +63,8 @@ def test_planes_that_touch_look_clearly_different():
 
 
 def test_colors_do_not_depend_on_the_order_of_the_points():
-    room = make_room(20_000, seed=1)
-    order = torch.randperm(20_000, generator=torch.Generator().manual_seed(0))
+    room = make_room(5000, seed=1)
+    order = torch.randperm(5000, generator=torch.Generator().manual_seed(0))
     colors = color_planes(room.labels, room.points)
     assert torch.equal(color_planes(room.labels[order], room.points[order]), colors[order])
 
@@ -167,10 +194,3 @@ def least_difference(dichromacy):
 @pytest.mark.parametrize("dichromacy", [None, *DICHROMACIES])
 def test_planes_that_touch_differ_for_all_eyes(dichromacy):
     assert least_difference(dichromacy) > CLEARLY
-
-
-def test_reds_and_greens_are_one_without_a_cone():
-    """A pair of colours of Ishihara's plates, which deuteranopes confuse."""
-    red, green = torch.tensor([0.80, 0.42, 0.30]), torch.tensor([0.55, 0.55, 0.25])
-    seen = [without_cone(color, DICHROMACIES["deuteranopia"]) for color in (red, green)]
-    assert lab_distance(*seen) < 0.35 * lab_distance(red, green)

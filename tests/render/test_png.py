@@ -60,13 +60,6 @@ def test_labels_keep_sixteen_bits(rng, tmp_path, integers):
     np.testing.assert_array_equal(read_png(tmp_path / "labels.png")[..., 0], labels)
 
 
-def test_matplotlib_reads_the_same(rng, tmp_path):
-    reader = pytest.importorskip("matplotlib.image")
-    picture = torch.randint(0, 256, (13, 17, 3), generator=rng, dtype=torch.uint8)
-    write_png(tmp_path / "picture.png", picture.numpy())
-    np.testing.assert_allclose(reader.imread(tmp_path / "picture.png"), picture / 255, atol=1e-6)
-
-
 def test_views_into_larger_tensors_are_written_right(rng, tmp_path):
     picture = torch.randint(0, 256, (3, 20, 26), generator=rng, dtype=torch.uint8)
     part = picture.permute(1, 2, 0)[::2, ::2]

@@ -75,8 +75,7 @@ def draw_by_loops(discs):
     return depth, paint
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.1])
-@pytest.mark.parametrize("change", [0.02, 0.15])
+@pytest.mark.parametrize(("tilt", "change"), [(0.0, 0.02), (0.1, 0.15)])
 def test_pixels_have_the_color_of_the_nearest_middle_that_is_not_hidden(rng, tilt, change):
     discs = random_discs(rng, tilt=tilt, change=change)
     depth, paint = depth_and_colors(drawn(discs))

@@ -16,18 +16,13 @@ from benchmarks import (
     accuracy,
     breakdown,
     convert,
-    disk,
     harness,
-    kernels,
-    loader,
-    page,
     peers,
     robust,
     steady,
     superpoints,
 )
 
-from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 
 
@@ -131,29 +126,6 @@ def test_breakdown_is_that_of_contaminated_neighborhoods():
     assert text.splitlines()[2] == "| outliers | PCA | planes |"
 
 
-def test_kernels_are_timed_beside_what_memory_allows():
-    results, text = run(kernels.Case(work=("classic",), num_points=2000, only=("written",)))
-    (found,) = results["classic"]["written"]
-    assert {"_frames", "_pass", "in no kernel"} <= found["ms"].keys()
-    assert all(milliseconds >= 0 for milliseconds in found["ms"].values())
-    assert 0 < found["limit"]["_pass"] < found["ms"]["_pass"]
-    assert text.splitlines()[0] == "| work | kernel | written, ms | calls | limit, ms |"
-
-
-def test_crops_are_loaded_by_any_worker():
-    results, text = run(loader.Case(crops=2, num_points=300, workers=(0,)))
-    ((cloud, by),) = results.items()
-    assert cloud == "2 crops of 300 points, classic"
-    assert by["0 workers"][0]["planes"] >= 2
-    assert list(loader.Case().contenders())[-1] == "2 workers, spawn"
-    assert text.endswith("| 1 |")
-
-
-def test_pages_are_written():
-    results, _ = run(page.Case(sizes=(2000,), only=("written",)))
-    assert results["2,000 points"]["written"][0]["MB"] > 0.01
-
-
 def test_robust_estimators_are_timed_on_shares_of_the_neighborhoods():
     names = ("Qn, a row of 50", "DetS", "MVE, 500 starts")
     results, _ = run(robust.Case(patches=100, rounds=1, only=names))
@@ -176,17 +148,6 @@ def test_superpoints_are_scored_at_the_numbers_of_others(tmp_path):
     assert by["cut pursuit"][0]["seconds"] == list(superpoints.PEER_STRENGTHS)
     assert len(by["torchrg"][0]["levels"]) == len(superpoints.STRENGTHS)
     assert "(cut pursuit 0." in text
-
-
-def test_the_disk_gives_what_memory_gives(tmp_path):
-    path = disk.Case(points=1500, work=tmp_path).clouds()["1,500 points"]()
-    memory, found = (disk.prepare(path, "classic", place)() for place in ("memory", "disk"))
-    assert found["digest"] == memory["digest"]
-    assert found["planes"] == memory["planes"] > 0
-    assert found["peak_gb"] == max(found["peaks"].values())
-    seg = segment_planes(torch.from_numpy(np.load(path)), "classic")
-    assert disk.digest(seg) == found["digest"]
-    assert disk.digest(seg._replace(labels=seg.labels + 1)) != found["digest"]
 
 
 @pytest.fixture
@@ -239,25 +200,9 @@ def test_processes_take_turns(capsys):
     assert all(float(cell) > 0 for cell in cells[1:])
 
 
-@pytest.mark.slow
-def test_runs_of_other_processes_are_measured(tmp_path, capsys):
-    sizes = ["--sizes", "1500", "--rounds", "1", "--only", "torchrg-classic"]
-    assert bench.main(["peers", *sizes, "torchrg-classic-command"]) == 0
-    assert capsys.readouterr().out.count("| torchrg-classic-command |") == 2
-    assert bench.main(["disk", "--points", "1500", "--work", str(tmp_path)]) == 0
-    assert "| classic disk |" in capsys.readouterr().out
-
-
 def test_frames_and_rooms_are_prepared():
     assert steady.prepare("classic", 1500)() is None
     assert set(steady.Case().clouds()) >= {"depth", "depth-large", "consensus, 200,000 points"}
-
-
-@pytest.mark.slow
-def test_a_made_data_set_is_converted(capsys):
-    rooms = ["--rooms", "2", "--smallest", "600", "--largest", "900", "--preset", "classic"]
-    assert bench.main(["convert", *rooms, "--only", "1", "2"]) == 0
-    assert "all runs wrote the same bytes" in capsys.readouterr().out
 
 
 def test_runs_that_wrote_other_bytes_are_an_error():

@@ -114,6 +114,7 @@ def _write_picture(arguments: Arguments, result: Result, up: Direction | None) -
         cloud.points,
         _colors(result, arguments.color, up or (0.0, 0.0, 1.0)),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
+        labels=result.fields.get("labels"),
         view=arguments.view,
         up=up or (0.0, 0.0, 1.0),
         azimuth_deg=arguments.azimuth_deg,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -67,7 +67,7 @@ class Channel(NamedTuple):
     """
 
     mode: str
-    values: NDArray[Any]
+    values: NDArray[np.integer]
     colors: NDArray[np.uint8] | None
     legend: Legend
 
@@ -134,31 +134,26 @@ def _of_normals(normals: Tensor) -> Channel:
     return Channel("normal", values, colors, legend)
 
 
+def _on_scale(mode: str, shares: Tensor, shown: Mapping[float, str]) -> Channel:
+    """Return the colours of shares of a scale, and of those whose meaning is shown."""
+    steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
+    colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
+    legend = [(colors[round(_LEVELS * share)].tolist(), text) for share, text in shown.items()]
+    values = (shares.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
+    return Channel(mode, values, colors, legend)
+
+
 def _of_curvature(curvature: Tensor) -> Channel:
     """Return the colours of curvature; they go with its root, as the numbers do."""
-    share = (curvature / _CURVATURE_END).clamp(0, 1).sqrt().nan_to_num()
-    steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
-    colors = color_curvature(_CURVATURE_END * steps * steps, max_curvature=_CURVATURE_END).numpy()
-    shown = (0.0, 0.01, 0.03, _CURVATURE_END)
-    legend = [
-        (colors[round(_LEVELS * math.sqrt(value / _CURVATURE_END))].tolist(), f"{value:g}")
-        for value in shown
-    ]
-    legend[-1] = (legend[-1][0], f"{_CURVATURE_END:g} and more")
-    return Channel("curvature", (share * _LEVELS).round().numpy().astype(np.uint8), colors, legend)
+    shown = {math.sqrt(value / _CURVATURE_END): f"{value:g}" for value in (0.0, 0.01, 0.03)}
+    shown[1.0] = f"{_CURVATURE_END:g} and more"
+    return _on_scale("curvature", (curvature / _CURVATURE_END).clamp(min=0).sqrt(), shown)
 
 
 def _of_angles(angles_deg: Tensor) -> Channel:
     """Return the colours of angles between normals and their truth."""
-    share = (angles_deg / _WORST_ANGLE_DEG).clamp(0, 1).nan_to_num()
-    steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
-    colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
-    legend = [
-        (colors[round(_LEVELS * angle / _WORST_ANGLE_DEG)].tolist(), f"{angle:g} degrees")
-        for angle in (0, 5, 20, _WORST_ANGLE_DEG)
-    ]
-    values = (share * _LEVELS).round().numpy().astype(np.uint8)
-    return Channel("normal-error", values, colors, legend)
+    shown = {angle / _WORST_ANGLE_DEG: f"{angle:g} degrees" for angle in (0, 5, 20, 45)}
+    return _on_scale("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
 def outcomes_of(

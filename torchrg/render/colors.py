@@ -1,8 +1,5 @@
 """Colours for planes, normals, curvature and sharp points, chosen by how different they look."""
 
-import math
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -51,93 +48,49 @@ def _to_bytes(colors: Tensor) -> Tensor:
 UNLABELED_GRAY = 176
 """Red, green and blue of points that belong to no plane."""
 
-_CALM = ((74.5, 86.0), (24.0, 32.0), 24)
-"""Lightnesses, chromas and number of hues, in CIE Lab, of the colours for large planes."""
-_VIVID = ((56.0, 65.0, 74.5), (44.0, 56.0), 36)
-"""The same of the colours for small planes, which are easier to see."""
+_CALM = (
+    "f0a7bc f1aa9c deb487 bebf86 98c79a 74cbba 66c9db 81c3ef b0b8f0 daaddc "
+    "fdd3d4 ffd4bf f0dbab cfe4b4 aeeacd 99ebeb abe5fe cadeff e6d6ff ffcfea"
+)
+"""Colours of large planes: 10 hues of chroma 30 and 26 in CIE Lab, lightness 76 and 88."""
+_VIVID = (
+    "b6396a b53f41 a4511c 856303 606f00 297727 077758 077472 107284 0c7098 026abb 7159b2 a04592 "
+    "e26077 d96c4f bf7d30 9a8d25 6d9838 269f5d 029d8a 079aa5 0297bd 1392db 7385e4 b372cb d663a3 "
+    "fe8eb2 fe928c f99960 d7aa4b abb850 76c26d 16c897 14c4c1 13c1df 13bdfe 84b1fe bea1ff f08fdf"
+)
+"""Colours of small planes, which are easier to see: 13 hues of chroma up to 54, lightness 44, 58
+and 72."""
 _LARGE = 0.03
 """Share of all points from which on a plane is large."""
-_ALIKE = 58.0
+_ALIKE = 120.0
 """Squared distance in CIE Lab of two colours that look about the same."""
-_WITHOUT_CONE = 0.25
+_WITHOUT_CONE = 0.5
 """Weight of what the colour-blind see. With less, planes side by side look alike to them; with
 more, to all others."""
+_AXES_WITHOUT_CONE = ((0.0, 1.0), (1.07, 0.56))
+"""What is left of the axes a and b of CIE Lab to eyes without one kind of cones: blue against
+yellow without the long or the middle ones, red against cyan without the short ones. Fitted to the
+palette seen by the model of Machado et al., A physiologically-based model for simulation of color
+vision deficiency, 2009."""
 _ELSEWHERE = 0.005
 """Least weight of a plane that is not beside the one that gets a colour; a neighbour has 1."""
 _GRAY_WEIGHT = 0.05
 """Weight of the gray of points in no plane, which are nearly everywhere."""
+PALETTE = torch.tensor([list(bytes.fromhex(row)) for row in f"{_CALM} {_VIVID}".split()]).byte()
+"""Colours of planes, the calm ones first, shape ``(59, 3)``, uint8."""
 
 
-def make_palette() -> tuple[Tensor, int]:
-    """Return sRGB colours of even hues, shape ``(C, 3)``, uint8, and how many of them are calm.
-
-    Example:
-        >>> colors, num_calm = make_palette()
-        >>> len(colors) > 150, 0 < num_calm < len(colors)
-        (True, True)
-    """
-    groups = []
-    for lightness, chroma, num_hues in (_CALM, _VIVID):
-        hues = torch.arange(num_hues, dtype=torch.float64) * (2 * math.pi / num_hues)
-        light, strength, hue = torch.meshgrid(
-            torch.tensor(lightness, dtype=torch.float64),
-            torch.tensor(chroma, dtype=torch.float64),
-            hues,
-            indexing="ij",
-        )
-        lab = torch.stack([light, strength * hue.cos(), strength * hue.sin()], dim=-1)
-        colors = _lab_to_rgb(lab.view(-1, 3))
-        groups.append(colors[((colors >= 0) & (colors <= 1)).all(dim=-1)])
-    return _to_bytes(torch.cat(groups)), len(groups[0])
-
-
-DICHROMACIES = {
-    "protanopia": (
-        (0.152286, 1.052583, -0.204868),
-        (0.114503, 0.786281, 0.099216),
-        (-0.003882, -0.048116, 1.051998),
-    ),
-    "deuteranopia": (
-        (0.367322, 0.860646, -0.227968),
-        (0.280085, 0.672501, 0.047413),
-        (-0.011820, 0.042940, 0.968881),
-    ),
-    "tritanopia": (
-        (1.255528, -0.076749, -0.178779),
-        (-0.078411, 0.930809, 0.147602),
-        (0.004733, 0.691367, 0.303900),
-    ),
-}
-"""How linear RGB looks to eyes that lack one kind of cone: rows of the matrices of Machado et al.,
-A physiologically-based model for simulation of color vision deficiency, 2009, severity 1."""
-
-
-def without_cone(colors: Tensor, matrix: tuple[tuple[float, ...], ...]) -> Tensor:
-    """Return sRGB colours in [0, 1], shape ``(*, 3)``, as eyes of a dichromacy see them.
-
-    Example:
-        >>> white = torch.ones(3)
-        >>> bool((without_cone(white, DICHROMACIES["protanopia"]) - white).abs().max() < 1e-4)
-        True
-    """
-    from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-
-    linear = rgb_to_linear_rgb(_as_image(colors))[0, :, :, 0].T
-    seen = linear @ linear.new_tensor(matrix).T
-    changed: Tensor = linear_rgb_to_rgb(_as_image(seen.clamp(0, 1)))[0, :, :, 0].T
-    return changed.reshape(colors.shape)
-
-
-def _likeness(colors: Tensor) -> Tensor:
-    """Return how alike all pairs of colours look ``(C, C)``.
+def _likeness() -> Tensor:
+    """Return how alike each colour of the palette looks to each, and to gray, ``(59, 60)``.
 
     That is to eyes with three kinds of cones, and with a weight to those of the worst dichromacy.
     """
-    seen = [colors, *(without_cone(colors, matrix) for matrix in DICHROMACIES.values())]
-    labs = torch.stack([rgb_to_lab(each) for each in seen])
-    likeness = 1 / ((labs[:, :, None] - labs[:, None]).square().sum(dim=-1) + _ALIKE)
-    usual, worst = likeness[0], likeness.amax(dim=0)
-    return usual + _WITHOUT_CONE * worst
+    gray = PALETTE.new_full((1, 3), UNLABELED_GRAY)
+    labs = rgb_to_lab(torch.cat([PALETTE, gray]).double() / 255)
+    light, a, b = (labs[: len(PALETTE), None] - labs).unbind(dim=2)
+    worst = torch.stack([(a * x + b * y).square() for x, y in _AXES_WITHOUT_CONE]).amin(dim=0)
+    usual, worst = light**2 + a**2 + b**2, light**2 + worst
+    return 1 / (usual + _ALIKE) + _WITHOUT_CONE / (worst + _ALIKE)
 
 
 def choose_colors(
@@ -150,38 +103,36 @@ def choose_colors(
     """Choose a row of the palette for each plane, the largest first, far from those before.
 
     Each chosen colour repels with the inverse square of its distance in Lab: that of a neighbour,
-    in ``pairs`` ``(E, 2)``, with its weight, any other with a little. What the colour-blind see
-    counts as well. Where ``fixed`` is not negative it is the choice.
+    in ``pairs`` ``(E, 2)``, with its weight, any other with a little. Where ``fixed`` is not
+    negative it is the choice.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
         >>> len(choices.unique())
         2
     """
-    palette, num_calm = make_palette()
-    gray = palette.new_full((1, 3), UNLABELED_GRAY)
-    shown = torch.cat([palette, gray]).double() / 255
-    repulsion = _likeness(shown).numpy()[:, :-1]
-    share = (sizes / sizes.sum()).numpy()
-    strength = np.clip(8 * share, _ELSEWHERE, 1)
-    choices = torch.full_like(sizes, -1).numpy() if fixed is None else fixed.numpy().copy()
+    repulsion = _likeness().T
+    share = sizes / sizes.sum()
+    strength = (8 * share).clamp(_ELSEWHERE, 1).double()
+    choices = torch.full_like(sizes, -1) if fixed is None else fixed.clone()
     done = choices >= 0
     field = strength[done] @ repulsion[choices[done]] + _GRAY_WEIGHT * repulsion[-1]
     ends = torch.cat([pairs, pairs.flip(1)])
     order = ends[:, 0].argsort(stable=True)
+    others, pull = ends[order, 1], weights.double().repeat(2)[order]
     starts = torch.searchsorted(ends[order, 0], torch.arange(len(sizes) + 1)).tolist()
-    others, pull = ends[order, 1].numpy(), weights.repeat(2)[order].numpy()
+    num_calm = len(_CALM.split())
     for plane in sizes.sort(descending=True, stable=True).indices.tolist():
         if done[plane]:
             continue
         near = slice(starts[plane], starts[plane + 1])
         placed = choices[others[near]]
         cost = field + (pull[near] * (placed >= 0)) @ repulsion[placed]
-        calm = share[plane] > _LARGE
+        calm = bool(share[plane] > _LARGE)
         pick = cost[:num_calm].argmin() if calm else num_calm + cost[num_calm:].argmin()
         choices[plane] = pick
         field += strength[plane] * repulsion[pick]
-    return torch.from_numpy(choices)
+    return choices
 
 
 _HORIZONTAL_LIGHTNESS, _UPRIGHT_LIGHTNESS = 84.0, 60.5
@@ -276,7 +227,7 @@ def color_curvature(
     return _to_bytes(_lab_to_rgb(lab))
 
 
-def color_sharp(sharp: Tensor | NDArray[Any]) -> Tensor:
+def color_sharp(sharp: Tensor | NDArray[np.generic]) -> Tensor:
     """Colour sharp feature points red and all others light gray.
 
     Args:
@@ -305,10 +256,10 @@ _NEIGHBORHOODS = ((256, 1.0), (48, 0.2))
 
 
 def color_planes(
-    labels: Tensor | NDArray[Any],
+    labels: Tensor | NDArray[np.generic],
     points: Tensor | NDArray[np.floating] | None = None,
     *,
-    reference: Tensor | NDArray[Any] | None = None,
+    reference: Tensor | NDArray[np.generic] | None = None,
 ) -> Tensor:
     """Colour the points of each plane.
 
@@ -370,7 +321,7 @@ def palette_of_planes(
         fixed[table.regions[pairs]] = chosen[table.faces[pairs]]
     rows, choices = _choose(labels, points, fixed)
     gray = torch.full((1, 3), UNLABELED_GRAY, dtype=torch.uint8, device=labels.device)
-    return rows, torch.cat([make_palette()[0].to(labels.device)[choices], gray])
+    return rows, torch.cat([PALETTE.to(labels.device)[choices], gray])
 
 
 def _choose(

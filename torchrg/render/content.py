@@ -1,8 +1,7 @@
 """What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
 
-import math
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,14 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from torchrg.linalg.moments import Segments
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
-from torchrg.regions.outline import trace_outline
-from torchrg.regions.table import MAX_TILT_DEG, Rectangles, classify_planes, covered_areas
+from torchrg.regions.table import classify_planes, summarize_planes
 from torchrg.render.channels import MODES
-from torchrg.render.cutaway import find_outer_surfaces
-from torchrg.render.grid import build_grid, local_spacing, surface_cells
+from torchrg.render.cutaway import Sides, find_sides
+from torchrg.render.surface import Surface, sample_surface
 from torchrg.result import Result, describe_planes
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
@@ -30,26 +27,12 @@ _OUTLINE_POINTS = 200_000
 """Points through which outlines are traced: enough for a picture."""
 _NOT_SHOWN = ("id", "centroid", "axes", "center", "outline")
 """Columns of the plane table that a page draws or does not need."""
-_MAX_SURFACES = 7
-"""Outer surfaces that a page can cut away: bits of a byte, the last of which hides planes."""
 _USUAL_RADIUS = 128
 """Byte of a point with the usual radius, in the middle of what a byte holds."""
 _STEPS_OF_OCTAVE = 16
 """Steps of the byte in which the radius of a point doubles: one step is 4 percent."""
 _LARGEST_SPACING = 3.0
 """Largest ratio of a point's radius to the usual one, and of the usual one to it."""
-_UPRIGHT = math.sin(math.radians(MAX_TILT_DEG))
-"""Largest cosine between the normal of a wall and the upward direction."""
-_BEYOND = 0.02
-"""A point is beyond a wall from this share of the cloud's longest side on."""
-_MOST_BEYOND = 0.03
-"""Largest share of the points beyond an outer wall: scanners see some through doors and windows."""
-_ALIKE = 0.9
-"""Least cosine between the directions of walls that are cut away together."""
-_MOST_WALLS = 200
-"""So many of the largest planes may be outer walls, which bounds the time."""
-_WALL_POINTS = 20_000
-"""Points of the cloud that tell whether there is anything beyond a wall."""
 
 
 class Frame(NamedTuple):
@@ -80,12 +63,16 @@ class Shown(NamedTuple):
         points: In the axes of the page, shape ``(n, 3)``, float32.
         fields: Fields of those points; normals are in the axes of the page, and labels numbered
             without gaps.
+        surface: The surface through those points, in the axes of the page.
+        sides: Its outer sides.
     """
 
     rows: Tensor
     levels: list[int]
     points: Tensor
     fields: dict[str, Tensor]
+    surface: Surface
+    sides: Sides
 
 
 def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
@@ -125,47 +112,23 @@ def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
     if "superpoints" in fields:
         parts = result.fields["superpoints"].long()
         fields["superpoints"] = number_labels(parts.clamp(min=-1))[1][rows]
-    return Shown(rows, levels, frame.place(cloud.points[rows], cloud.origin), fields)
+    points = frame.place(cloud.points[rows], cloud.origin)
+    surface = sample_surface(points)
+    labels = fields["labels"][surface.rows] if "labels" in fields else None
+    sides = find_sides(surface, labels, torch.tensor([0.0, 0.0, 1.0]))
+    return Shown(rows, levels, points, fields, surface, sides)
 
 
-class Surfaces(NamedTuple):
-    """What closes a cloud, and how dense it is.
-
-    Attributes:
-        directions: From the inside toward the outside of each outer surface, shape ``(S, 3)``.
-        covered: Bits of the surfaces that each point is in, shape ``(n,)``, uint8.
-        spacing: The usual distance of a point from its neighbours.
-        radii: That of each point, as a step of a sixteenth of an octave from 128, the usual one.
-    """
-
-    directions: Tensor
-    covered: Tensor
-    spacing: float
-    radii: Tensor
+def radii_of(surface: Surface) -> Tensor:
+    """Return the radius of each point as a byte, 16 steps to an octave, 128 the usual one."""
+    usual = float(surface.spacing.median()) if len(surface.spacing) else 0.0
+    if usual == 0:
+        return torch.full((len(surface.rows),), _USUAL_RADIUS, dtype=torch.uint8)
+    octaves = (surface.spacing / usual).clamp(1 / _LARGEST_SPACING, _LARGEST_SPACING).log2()
+    return (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round().to(torch.uint8)
 
 
-def outer_surfaces(points: Tensor) -> Surfaces:
-    """Find walls and ceiling, and how far points are from their neighbours."""
-    covered = torch.zeros(len(points), dtype=torch.uint8)
-    radii = torch.full((len(points),), _USUAL_RADIUS, dtype=torch.uint8)
-    grid = build_grid(points)
-    if len(grid.levels) == 0:
-        return Surfaces(points.new_zeros(0, 3), covered, 0.0, radii)
-    up = torch.tensor([0.0, 0.0, 1.0])
-    found = find_outer_surfaces(surface_cells(grid), up)[:_MAX_SURFACES]
-    for place, surface in enumerate(found):
-        covered[grid.rows] |= surface.covers(grid.points).to(torch.uint8) << place
-    spacing = local_spacing(grid)
-    usual = float(spacing.median())
-    if usual > 0:
-        octaves = (spacing / usual).clamp(min=1 / _LARGEST_SPACING, max=_LARGEST_SPACING).log2()
-        steps = (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round()
-        radii[grid.rows] = steps.to(torch.uint8)
-    directions = torch.stack([points.new_zeros(3), *(each.direction for each in found)])[1:]
-    return Surfaces(directions, covered, usual, radii)
-
-
-def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, Any]]:
+def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, object]]:
     """Return what a page says about each plane, by the number that its points have there.
 
     It is the table of the result: the columns of :func:`torchrg.result.describe_planes` but for
@@ -206,59 +169,12 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
         return outlines
     rows = rows[:_OUTLINE_POINTS]
     numbers, labels = number_labels(result.labels[rows])
-    segments = Segments(labels)
-    axes, center = planes.axes[numbers].double(), planes.center[numbers].double()
-    centered = torch.stack(segments.take_about(result.cloud.points[rows], center), dim=1)
-    u, v = ((centered * segments.spread(axis)).sum(dim=1) for axis in axes.unbind(dim=1))
-    along = torch.eye(2, dtype=torch.float64).expand(len(numbers), 2, 2)
-    boxes = Rectangles(planes.extent[numbers].double(), along, torch.zeros_like(center[:, :2]))
-    width = covered_areas(segments, u, v, boxes)[1]
-    parts = torch.split(torch.stack([u, v], dim=1), segments.counts.tolist())
-    for place, (own, part) in enumerate(zip(numbers.tolist(), parts, strict=True)):
-        rings = (torch.from_numpy(r) for r in trace_outline(part.numpy(), float(width[place])))
-        outlines[own] = tuple(center[place] + ring @ axes[place] for ring in rings)
+    points = result.cloud.points[rows]
+    normals = result.fields.get("normals", torch.zeros_like(result.cloud.points))[rows]
+    table = summarize_planes(points, normals.to(points.dtype).nan_to_num(), labels, outline=True)
+    for number, rings in zip(numbers.tolist(), table.outline or (), strict=True):
+        outlines[number] = rings
     return outlines
-
-
-def sides_of_planes(
-    shown: Shown, planes: list[dict[str, Any]], frame: Frame, surfaces: Surfaces
-) -> tuple[Tensor, Tensor]:
-    """Return the directions of outer surfaces ``(S, 3)``, and the bits of each plane ``(M,)``.
-
-    A plane is in the outer surfaces that hold most of its points. Large upright ones are, too, in
-    that of the direction in which there is next to nothing beyond them: walls of scans that are too
-    open for a closed outer surface. There is a bit for each main direction.
-    """
-    labels = shown.fields["labels"]
-    inside = labels >= 0
-    own, bits = labels[inside], surfaces.covered[inside]
-    counts = torch.bincount(own, minlength=len(planes))
-    sides = torch.zeros(len(planes), dtype=torch.uint8)
-    for place in range(len(surfaces.directions)):
-        covered = torch.bincount(own[(bits >> place & 1).bool()], minlength=len(planes))
-        sides |= (2 * covered > counts).to(torch.uint8) << place
-    directions = list(surfaces.directions)
-    normals = torch.tensor([plane["normal"] for plane in planes]).double()
-    offsets = torch.tensor([plane["offset"] for plane in planes]).double()
-    offsets = (offsets - normals @ frame.origin) / frame.scale
-    normals = (normals @ frame.rotation.T).float()
-    large = counts.argsort(descending=True, stable=True)[:_MOST_WALLS]
-    walls = large[normals[large, 2].abs() < _UPRIGHT]
-    heights = shown.points[:_WALL_POINTS] @ normals[walls].T - offsets[walls].float()
-    margin = _BEYOND * PAGE_EXTENT
-    beyond = torch.stack([heights > margin, heights < -margin]).float().mean(dim=1)
-    for sign, shares in zip((1, -1), beyond.tolist(), strict=True):
-        for wall, share in zip(walls.tolist(), shares, strict=True):
-            if share > _MOST_BEYOND:
-                continue
-            outward = sign * normals[wall]
-            alike = [place for place, each in enumerate(directions) if each @ outward > _ALIKE]
-            if not alike and len(directions) < _MAX_SURFACES:
-                alike = [len(directions)]
-                directions.append(outward)
-            for place in alike[:1]:
-                sides[wall] |= 1 << place
-    return torch.stack([shown.points.new_zeros(3), *directions])[1:], sides
 
 
 def _rectangles(planes: Planes) -> Tensor:
@@ -268,6 +184,7 @@ def _rectangles(planes: Planes) -> Tensor:
     return planes.center.double()[:, None] + signs @ half
 
 
-def rounded(values: Tensor) -> Any:  # noqa: ANN401
+def rounded(values: Tensor) -> object:
     """Return numbers of a page as JSON needs them: a step is a hundred-thousandth of the cloud."""
-    return np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
+    numbers: object = np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
+    return numbers

@@ -1,4 +1,8 @@
-"""From where to look at a cloud, and which surfaces to leave out so that one sees into a room."""
+"""From where to look at a cloud, and which walls and ceilings to leave out to see into its rooms.
+
+Walls and ceilings are those of the plane table. Where a cloud has no labels, its voxels are
+segmented. The shader and the picking of ``page.js`` cut by the bits that each point has here.
+"""
 
 import math
 from typing import Literal, NamedTuple
@@ -7,216 +11,167 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg.config import load_config
 from torchrg.errors import ConfigError
-from torchrg.render.grid import Cells
-
-
-class SideView:
-    """The plane across a direction, cut into pixels over the extent of a cloud.
-
-    Args:
-        points: Shape ``(N, 3)``, at least one.
-        direction: Unit vector toward the viewer, shape ``(3,)``.
-        pitch: Edge of a pixel, in the unit of the cloud.
-
-    Example:
-        >>> points = torch.tensor([[0.0, 0, 0], [0, 0, 3], [5, 0, 1]])
-        >>> view = SideView(points, torch.tensor([0.0, 0, 1]), 1.0)
-        >>> view.largest(view.pixels(points), points[:, 2])[view.pixels(points)]
-        tensor([3., 3., 1.])
-    """
-
-    def __init__(self, points: Tensor, direction: Tensor, pitch: float) -> None:
-        other = torch.zeros_like(direction)
-        other[direction.abs().argmin()] = 1
-        side = functional.normalize(torch.linalg.cross(direction, other), dim=0)
-        self._basis = torch.stack([side, torch.linalg.cross(direction, side)], dim=-1)
-        self._pitch = pitch if pitch > 0 else 1.0
-        across = points @ self._basis
-        self._low = across.amin(dim=0)
-        last = ((across.amax(dim=0) - self._low) / self._pitch).long().tolist()
-        self._shape: tuple[int, int] = (last[0] + 1, last[1] + 1)
-
-    def pixels(self, points: Tensor) -> Tensor:
-        """Return the pixel of each point, shape ``(N,)``; of points outside the nearest one."""
-        place = ((points @ self._basis - self._low) / self._pitch).long()
-        columns, rows = self._shape
-        return place[:, 0].clamp(0, columns - 1) * rows + place[:, 1].clamp(0, rows - 1)
-
-    def largest(self, pixels: Tensor, values: Tensor) -> Tensor:
-        """Return the largest value in each pixel, -inf where there is none."""
-        image = values.new_full((self._shape[0] * self._shape[1],), -torch.inf)
-        return image.scatter_reduce(0, pixels, values, "amax")
-
-    def count(self, pixels: Tensor, values: Tensor) -> Tensor:
-        """Return the sum of the values in each pixel."""
-        image = torch.zeros(self._shape[0] * self._shape[1], device=values.device)
-        return image.index_add_(0, pixels, values.float())
-
-    def share_at_height(
-        self, pixels: Tensor, heights: Tensor, counted: Tensor, *, size: int, step: float
-    ) -> Tensor:
-        """Return the share of pixels around each point that hold a counted point about as high.
-
-        Around is a square of ``size`` pixels, odd; about as high is what lies in the same layer of
-        thickness ``step``, or in the next ones.
-        """
-        layers = ((heights - heights.amin()) / step).long()
-        stack = torch.zeros(int(layers.amax()) + 3, self._shape[0] * self._shape[1])
-        stack = stack.to(heights.device)
-        for shift in range(3):
-            stack[layers[counted] + shift, pixels[counted]] = 1
-        around = self.mean_around(stack, size).view(stack.shape)
-        return around[layers + 1, pixels]
-
-    def largest_around(self, image: Tensor, size: int) -> Tensor:
-        """Return the largest value in the square of ``size`` pixels, odd, about each pixel."""
-        square = image.view(1, 1, *self._shape)
-        return functional.max_pool2d(square, size, 1, size // 2).flatten()
-
-    def mean_around(self, image: Tensor, size: int) -> Tensor:
-        """Return the mean over the square of ``size`` pixels, odd, about each pixel ``(*, P)``."""
-        square = image.view(-1, 1, *self._shape)
-        rows = functional.avg_pool2d(square, (size, 1), 1, (size // 2, 0))
-        return functional.avg_pool2d(rows, (1, size), 1, (0, size // 2)).view(image.shape)
-
-
-_SPREAD = math.cos(math.radians(12))
-"""Least cosine between the normal of a cell and the direction of its group. 12 degrees keep the
-cells of a noisy wall in one group."""
-_MIN_GROUP = 0.01
-"""Least share of all cells that makes a group of parallel cells. Smaller groups are furniture."""
-_FACING = math.cos(math.radians(30))
-"""Least cosine between the normal of an outer cell and the side that it closes. 30 degrees keep a
-wall that is slightly bent in one piece."""
-_MIN_CEILING_DEPTH = 0.4
-"""Least share of the cloud's height that lies below a ceiling. Below a table top there is less."""
-_MIN_WALL_DEPTH = 0.2
-"""Least share of the cloud's extent that lies between a wall and what is opposite to it. It is less
-than for a ceiling, because rooms have narrow parts."""
-_MIN_CEILING_COVER = 0.15
-"""Least share of what is seen from above that a ceiling covers. With less of it one looks into the
-rooms anyway."""
-_MIN_WALL_COVER = 0.35
-"""Least share of what is seen from a side that the walls there cover. With less of them one looks
-into the rooms anyway."""
-_AROUND = 9
-"""Side of the square of pixels in which outer cells vote. A pixel is one and a half cells wide, so
-that the square is wider than most windows and recesses."""
-_MIN_WIDTH = 0.27
-"""Least share of that square at about the same height for a vote to count. It is a strip of two and
-a half of its nine pixels; what is narrower, as a ledge, closes no side."""
-_BEHIND = 5
-"""Side, in pixels, of the square in which the farthest point behind a cell is looked for."""
-
-
-class OuterSurface(NamedTuple):
-    """What closes a cloud toward one side: walls, or the ceiling.
-
-    Attributes:
-        direction: Unit vector from the inside to the outside, shape ``(3,)``.
-        view: The cloud as seen from there.
-        highest: Along the direction, in and next to each pixel of the view; -inf: no surface.
-        lowest: The same for the lowest; inf: no surface.
-        thickness: What is as near as this belongs to the surface.
-        section: What is above belongs to it, too.
-    """
-
-    direction: Tensor
-    view: SideView
-    highest: Tensor
-    lowest: Tensor
-    thickness: float
-    section: float
-
-    def covers(self, points: Tensor) -> Tensor:
-        """Return which points belong to the surface, shape ``(N,)``, bool."""
-        height, pixels = points @ self.direction, self.view.pixels(points)
-        near = height <= self.highest[pixels] + self.thickness
-        near &= height >= self.lowest[pixels] - self.thickness
-        return near | (height >= self.section - self.thickness)
-
-
-def find_outer_surface(cells: Cells, direction: Tensor, *, is_ceiling: bool) -> OuterSurface | None:
-    """Find the walls or the ceiling that close a cloud toward one side.
-
-    A cell is outer if its plane faces that side, nothing is in front of it, and there is something
-    far behind it: the floor below a ceiling, or the opposite wall behind a wall. The cells around
-    it at about its height vote, so that windows and recesses are no exceptions. All that is above a
-    ceiling goes with it, as in a section of a building. The result is None if what is found covers
-    so little of the side that it does not close it.
-
-    The shader and the picking of ``page.js`` cut by the same rule, from the bits that
-    :func:`torchrg.render.content.sides_of_planes` gives each plane.
-    """
-    thickness, view = 1.25 * cells.size, SideView(cells.centers, direction, 1.5 * cells.size)
-    height, pixels = cells.centers @ direction, view.pixels(cells.centers)
-    top = view.largest(pixels, height)
-    low, high = height.quantile(height.new_tensor([0.02, 0.98])).tolist()
-    share = _MIN_CEILING_DEPTH if is_ceiling else _MIN_WALL_DEPTH
-    depth_below = top + view.largest_around(view.largest(pixels, -height), _BEHIND)
-    first = ((cells.normals @ direction).abs() > _FACING) & (height >= top[pixels] - thickness)
-    outer = first & (depth_below >= share * (high - low))[pixels]
-    if not bool(first.any()):
-        return None
-    pixels, height, outer = pixels[first], height[first], outer[first]
-    votes, voters = (
-        view.share_at_height(pixels, height, of, size=_AROUND, step=thickness)
-        for of in (outer, torch.ones_like(outer))
-    )
-    elected = (voters > _MIN_WIDTH) & (2 * votes > voters)
-    pixels, height = pixels[elected], height[elected]
-    min_cover = _MIN_CEILING_COVER if is_ceiling else _MIN_WALL_COVER
-    if len(torch.unique(pixels)) < max(1, min_cover * int(top.isfinite().sum())):
-        return None
-    highest, lowest = (
-        sign * view.largest_around(view.largest(pixels, sign * height), 3) for sign in (1, -1)
-    )
-    section = float(height.median()) if is_ceiling else math.inf
-    return OuterSurface(direction, view, highest, lowest, thickness, section)
-
-
-def main_directions(cells: Cells, *, max_directions: int = 10) -> Tensor:
-    """Return the normals ``(D, 3)`` of the largest groups of parallel cells, the largest first."""
-    normals = cells.normals[(cells.normals != 0).any(dim=-1)]
-    bins = _hemisphere(200).to(normals)
-    near = (normals @ bins.T).abs() > _SPREAD
-    free = torch.ones_like(normals[:, 0], dtype=torch.bool)
-    counts = near.sum(dim=0)
-    found = [normals.new_zeros((0, 3))]
-    while len(found) <= max_directions and int(counts.amax()) > _MIN_GROUP * len(normals):
-        axis = bins[counts.argmax()]
-        for _ in range(3):
-            along = normals @ axis
-            axis = functional.normalize(
-                (along.sign() * (free & (along.abs() > _SPREAD))) @ normals, dim=0
-            )
-        group = free & ((normals @ axis).abs() > _SPREAD)
-        if not bool(group.any()):
-            break
-        found.append(axis[None])
-        counts = counts - near[group].sum(dim=0)
-        free &= ~group
-    return torch.cat(found)
-
-
-def _hemisphere(count: int) -> Tensor:
-    """Return directions spread evenly over half of the sphere, shape ``(count, 3)``."""
-    step = torch.arange(count, dtype=torch.float64) + 0.5
-    height = step / count
-    turn = step * (math.pi * (3 - math.sqrt(5)))
-    radius = (1 - height * height).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=-1)
-
+from torchrg.metrics.contingency import number_labels
+from torchrg.pipeline import segment_planes
+from torchrg.regions.table import classify_planes, summarize_planes
+from torchrg.render.surface import Surface
+from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
 
 View = Literal["cutaway", "above", "outside", "sensor"]
 
-_AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
-"""Angles from the normal of the largest walls, in degrees, that are tried. None looks straight at a
-wall, so that two walls of a corner are always seen."""
 LEAST_FACING = {"cutaway": 0.1, "above": 0.7}
-"""Least cosine between the direction of an outer surface and that toward the viewer for it to be
-cut away, by the view. From above only what lies nearly flat is in the way."""
+"""Least cosine between the direction of an outer side and that toward the viewer for it to be cut
+away, by the view. From above only what lies nearly flat is in the way."""
+MOST_SIDES = 7
+"""Outer sides of a cloud: bits of a byte, the last of which hides planes on a page."""
+_MOST_WALLS = 60
+"""So many of the largest walls and ceilings may be outer ones, which bounds the memory."""
+_ANGLE_DEG = 4.0
+"""Angle of growth on voxels, which have little noise: with more, ceilings grow into walls."""
+_ALIKE = 0.9
+"""Least cosine between the directions of walls that are cut away together."""
+_MOST_BEYOND = 0.03
+"""Largest share of the cloud beyond an outer wall: scanners see through doors and windows."""
+_LEAST_INSIDE = 0.05
+"""Least share of the cloud on the inner side of an outer wall."""
+_THICKNESS = 1.5
+"""Voxels nearer to a wall than this many of their edges, and twice its own noise, are in it."""
+_LEAST_AREA = 0.3
+"""Share of the area of the largest wall or horizontal plane from which on another one closes a side
+as well, whatever it is called."""
+_LEAST_BELOW = 0.4
+"""Least share of the cloud's height below a horizontal plane that closes it: more than a table has.
+"""
+_BELOW_CEILING = 0.15
+"""Share of the cloud's height below a ceiling that goes with it: lamps and beams hang there."""
+_MOST_PIXELS = 500
+"""Side of the picture that tells how much a view shows."""
+_AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
+"""Angles from the normal of the largest wall, in degrees, that are tried. None looks straight at a
+wall, so that two walls of a corner are always seen."""
+
+
+class Sides(NamedTuple):
+    """The outer sides of a cloud: walls, by the direction that they face, and ceilings.
+
+    Attributes:
+        directions: Unit vectors from the inside to the outside, shape ``(S, 3)``.
+        of_voxels: Bits of the sides that each voxel is in, shape ``(V,)``, uint8.
+        of_points: The same of each point, shape ``(n,)``: where it has a label, of its plane, so
+            that what stands against a wall, and the floor along it, is not part of the wall.
+        heading: Horizontal normal of the largest wall, shape ``(3,)``.
+    """
+
+    directions: Tensor
+    of_voxels: Tensor
+    of_points: Tensor
+    heading: Tensor
+
+    def bits_toward(self, toward: Tensor, view: View) -> int:
+        """Return the bits of the sides that a view from a direction leaves out."""
+        facing = self.directions @ toward > LEAST_FACING.get(view, math.inf)
+        return sum(1 << place for place, cut in enumerate(facing.tolist()) if cut)
+
+
+def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
+    """Find the walls and ceilings that close a cloud.
+
+    A wall is outer if next to nothing lies beyond the rectangle around it. What is in the rectangle
+    and not on the inner side of the wall belongs to it, as windows and handles do; and so do planes
+    that are mostly there.
+
+    Args:
+        surface: The cloud, of at least one finite point.
+        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: those of the
+            voxels' own segmentation.
+        up: Upward unit vector, shape ``(3,)``.
+    """
+    centers = surface.centers
+    if len(centers) == 0:
+        nothing = torch.zeros(0, dtype=torch.uint8, device=centers.device)
+        return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
+    if labels is None:
+        config = load_config("classic").at_angle(_ANGLE_DEG)
+        labels = segment_planes(centers, config).labels[surface.voxel_of]
+    known, of_points = number_labels(labels.clamp(min=UNLABELED))
+    of_voxels = of_points[surface.first]
+    planes = summarize_planes(centers, surface.normals, number_labels(of_voxels)[1])
+    altitude = centers @ up
+    low, high = altitude.quantile(altitude.new_tensor([0.02, 0.98])).tolist()
+    walls, ceilings = _closing(planes, up, low, high)
+    directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
+    powers = 1 << torch.arange(MOST_SIDES, device=centers.device)
+    by_place = (covered * powers).sum(dim=1)
+    own = of_points >= 0
+    inside = torch.zeros(len(known) + 1, MOST_SIDES, device=centers.device)
+    inside.index_add_(0, of_points[own], covered[surface.voxel_of[own]].float())
+    counts = torch.bincount(of_points[own], minlength=len(inside))
+    of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
+    voxels = torch.where(of_voxels < 0, by_place, of_planes[of_voxels])
+    points = torch.where(of_points < 0, by_place[surface.voxel_of], of_planes[of_points])
+    heading = _heading(planes.normal[walls], planes.area[walls], up)
+    return Sides(directions, voxels.to(torch.uint8), points.to(torch.uint8), heading)
+
+
+def _closing(planes: Planes, up: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """Return which planes may be outer walls, and which ceilings, shape ``(M,)`` each.
+
+    They have that kind, or are about as large as those that have it; the cloud reaches from the
+    height ``low`` to ``high``.
+    """
+    kind = classify_planes(planes, up)
+    is_kind = {name: kind == place for place, name in enumerate(PLANE_KINDS)}
+    upright = is_kind["wall"] | is_kind["vertical"]
+    level = is_kind["ceiling"] | is_kind["horizontal"] | is_kind["floor"]
+    broad = [
+        among & (planes.area >= _LEAST_AREA * functional.pad(planes.area[among], (0, 1)).amax())
+        for among in (upright, level)
+    ]
+    is_high = planes.center @ up - low > _LEAST_BELOW * (high - low)
+    return broad[0] | is_kind["wall"], (broad[1] & is_high) | is_kind["ceiling"]
+
+
+def _outer(
+    surface: Surface, planes: Planes, walls: Tensor, ceilings: Tensor, up: Tensor, height: float
+) -> tuple[Tensor, Tensor]:
+    """Return the directions of outer sides, and which voxels are in each ``(V, MOST_SIDES)``."""
+    rows = (walls | ceilings).nonzero().squeeze(1)
+    rows = rows[planes.area[rows].argsort(descending=True, stable=True)][:_MOST_WALLS]
+    local = surface.centers[:, None] - planes.center[rows]
+    across = torch.einsum("vmi,mji->vmj", local, planes.axes[rows]).abs()
+    thickness = _THICKNESS * surface.size + 2 * planes.rms[rows]
+    depth = torch.where(ceilings[rows], thickness.clamp(min=_BELOW_CEILING * height), thickness)
+    beside = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
+    heights = (local * planes.normal[rows]).sum(dim=2)
+    directions: list[Tensor] = []
+    covered = torch.zeros(len(local), MOST_SIDES, dtype=torch.bool, device=local.device)
+    for place, row in enumerate(rows.tolist()):
+        for sign in (1, -1):
+            outward, above = sign * planes.normal[row], sign * heights[:, place]
+            beyond = (beside[:, place] & (above > thickness[place])).float().mean()
+            inside = (above < -thickness[place]).float().mean()
+            is_outer = bool((beyond <= _MOST_BEYOND) & (inside >= _LEAST_INSIDE))
+            if not is_outer or (ceilings[row] and outward @ up < 0):
+                continue
+            alike = [n for n, each in enumerate(directions) if each @ outward > _ALIKE]
+            if not alike and len(directions) < MOST_SIDES:
+                alike = [len(directions)]
+                directions.append(outward)
+            for side in alike[:1]:
+                covered[:, side] |= beside[:, place] & (above > -depth[place])
+    return torch.stack([up.new_zeros(3), *directions])[1:], covered
+
+
+def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
+    """Return the horizontal normal of the largest wall, or any direction if there are none."""
+    if len(normals):
+        axis = normals[areas.argmax()]
+    else:
+        axis = torch.zeros_like(up)
+        axis[up.abs().argmin()] = 1
+    return functional.normalize(axis - (axis @ up) * up, dim=0)
 
 
 class Viewpoint(NamedTuple):
@@ -225,23 +180,17 @@ class Viewpoint(NamedTuple):
     Attributes:
         toward: From the cloud to the viewer, shape ``(3,)``.
         up: Up in the picture, shape ``(3,)``.
-        cut: What is left out.
+        cut: Bits of the sides that are left out.
     """
 
     toward: Tensor
     up: Tensor
-    cut: tuple[OuterSurface, ...]
-
-    def keeps(self, points: Tensor) -> Tensor:
-        """Return which points are not left out, shape ``(N,)``, bool."""
-        kept = torch.ones_like(points[:, 0], dtype=torch.bool)
-        for surface in self.cut:
-            kept &= ~surface.covers(points)
-        return kept
+    cut: int
 
 
 def choose_viewpoint(
-    cells: Cells,
+    surface: Surface,
+    sides: Sides,
     view: View,
     up: Tensor,
     *,
@@ -250,55 +199,32 @@ def choose_viewpoint(
 ) -> Viewpoint:
     """Choose the direction from which most surface is seen.
 
-    The azimuth is the angle about ``up`` from the normal of the largest walls: by default the best
+    The azimuth is the angle about ``up`` from the normal of the largest wall: by default the best
     of eight, equal ones decided by the angle, and from above the one that lays the cloud across the
     picture. The elevation is the angle over the horizon: by default 35, from above 90.
     """
     for name, angle in (("azimuth_deg", azimuth_deg), ("elevation_deg", elevation_deg)):
         if angle is not None and not math.isfinite(angle):
             raise ConfigError(f"choose_viewpoint: expected {name} to be finite, got {angle}.")
-    directions = main_directions(cells)
-    heading = _heading(directions, up)
     if elevation_deg is None:
         elevation_deg = 90.0 if view == "above" else 35.0
     azimuths = _AZIMUTHS_DEG if azimuth_deg is None else (azimuth_deg,)
     if azimuth_deg is None and view == "above":
-        azimuths = (-90.0,) if _is_longer(cells.centers, heading, up) else (0.0,)
-    surfaces = find_outer_surfaces(cells, up) if view in LEAST_FACING else ()
+        along, across = (
+            surface.centers @ side
+            for side in (sides.heading, torch.linalg.cross(up, sides.heading))
+        )
+        azimuths = (
+            (-90.0,) if along.amax() - along.amin() > across.amax() - across.amin() else (0.0,)
+        )
     viewpoints = []
     for azimuth in azimuths:
-        toward = _turned(heading, up, azimuth, elevation_deg)
-        cut = tuple(s for s in surfaces if float(s.direction @ toward) > LEAST_FACING[view])
-        picture_up = _turned(heading, up, azimuth + 180, 90 - elevation_deg)
-        viewpoints.append(Viewpoint(toward, picture_up, cut))
+        toward = _turned(sides.heading, up, azimuth, elevation_deg)
+        picture_up = _turned(sides.heading, up, azimuth + 180, 90 - elevation_deg)
+        viewpoints.append(Viewpoint(toward, picture_up, sides.bits_toward(toward, view)))
     if len(viewpoints) == 1:
         return viewpoints[0]
-    return max(viewpoints, key=lambda viewpoint: _count_seen(cells, viewpoint))
-
-
-def find_outer_surfaces(cells: Cells, up: Tensor) -> tuple[OuterSurface, ...]:
-    """Find the walls and the ceiling that close a cloud, as far as it is closed."""
-    directions = main_directions(cells)
-    sides = torch.stack([directions, -directions], dim=1).flatten(0, 1)
-    found = (find_outer_surface(cells, side, is_ceiling=float(side @ up) > 0.9) for side in sides)
-    return tuple(surface for surface in found if surface is not None)
-
-
-def _heading(directions: Tensor, up: Tensor) -> Tensor:
-    """Return the horizontal normal of the largest walls, or any direction if there are none."""
-    walls = directions[(directions @ up).abs() < 0.3]
-    if len(walls):
-        axis = walls[0]
-    else:
-        axis = torch.zeros_like(up)
-        axis[up.abs().argmin()] = 1
-    return functional.normalize(axis - (axis @ up) * up, dim=0)
-
-
-def _is_longer(centers: Tensor, heading: Tensor, up: Tensor) -> bool:
-    """Return whether a cloud is longer along its heading than across it."""
-    along, across = centers @ heading, centers @ torch.linalg.cross(up, heading)
-    return float(along.amax() - along.amin()) > float(across.amax() - across.amin())
+    return max(viewpoints, key=lambda viewpoint: _count_seen(surface, sides, viewpoint))
 
 
 def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: float) -> Tensor:
@@ -310,12 +236,17 @@ def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: floa
     return turned
 
 
-def _count_seen(cells: Cells, viewpoint: Viewpoint) -> int:
-    """Return how many of the kept cells nothing hides from far away."""
-    centers = cells.centers[viewpoint.keeps(cells.centers)]
-    if len(centers) == 0:
+def _count_seen(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
+    """Return how many of the voxels that stay nothing hides from far away."""
+    centers = surface.centers[(sides.of_voxels & viewpoint.cut) == 0]
+    if len(centers) == 0 or surface.size == 0:
         return 0
-    picture = SideView(centers, viewpoint.toward, 1.5 * cells.size)
-    pixels, height = picture.pixels(centers), centers @ viewpoint.toward
-    front = picture.largest(pixels, height)
-    return int((height >= front[pixels] - 2 * cells.size).sum())
+    right = torch.linalg.cross(viewpoint.up, viewpoint.toward)
+    places = centers @ torch.stack([right, viewpoint.up], dim=1)
+    places -= places.amin(dim=0)
+    pitch = max(1.5 * surface.size, float(places.amax()) / _MOST_PIXELS)
+    column, row = (places / pitch).long().unbind(dim=1)
+    pixels, height = column * (int(row.amax()) + 1) + row, centers @ viewpoint.toward
+    front = height.new_full((int(pixels.amax()) + 1,), -torch.inf)
+    front.scatter_reduce_(0, pixels, height, "amax")
+    return int((height >= front[pixels] - 2 * surface.size).sum())

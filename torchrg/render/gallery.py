@@ -42,6 +42,7 @@ def draw_planes(path: str | os.PathLike[str], result: Result) -> None:
         points,
         color_planes(fields.get("superpoints", result.labels), points),
         normals=None if normals is None else normals.to(points.dtype),
+        labels=fields.get("labels"),
     )
     write_png(path, picture)
 

@@ -17,7 +17,7 @@ import os
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -28,7 +28,8 @@ from torch.nn import functional
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
-from torchrg.render.channels import MODES, Channel, channels_of, encode_directions
+from torchrg.neighbors.order import restore_rows
+from torchrg.render.channels import MODES, channels_of, encode_directions
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
     PAGE_EXTENT,
@@ -36,19 +37,16 @@ from torchrg.render.content import (
     Shown,
     choose_points,
     frame_of,
-    outer_surfaces,
     planes_of_page,
+    radii_of,
     rounded,
-    sides_of_planes,
 )
-from torchrg.render.cutaway import (
-    LEAST_FACING,
-    View,
-    choose_viewpoint,
-)
-from torchrg.render.grid import build_grid, surface_cells
+from torchrg.render.cutaway import LEAST_FACING, View, choose_viewpoint
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 MAX_POINTS = 1_000_000
 """Most points of a page by default: as many as a laptop turns fluently."""
@@ -146,7 +144,7 @@ def make_page(
         "title": title or " and ".join(scene["name"] for scene in scenes),
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
-        "toward": rounded(_direction_of_view(shown[0].points, view, frame, azimuth_deg)),
+        "toward": rounded(_direction_of_view(shown[0], view, frame, azimuth_deg)),
         "cut": view in LEAST_FACING,
         "leastFacing": LEAST_FACING["above" if view == "above" else "cutaway"],
         "frame": {
@@ -225,21 +223,21 @@ def _describe_cloud(
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     palettes = _palettes(result, shown, reference)
     channels = list(channels_of(shown.fields, true_fields, palettes))
-    surfaces = outer_surfaces(shown.points)
     planes = planes_of_page(result, shown, frame)
-    directions, covered = surfaces.directions, surfaces.covered
+    covered = restore_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
     if planes:
         labels = shown.fields["labels"]
-        directions, sides = sides_of_planes(shown, planes, frame, surfaces)
-        # What stands against a wall, and the floor along it, is not part of the wall.
-        covered = torch.where(labels < 0, covered, sides[labels])
+        sides = covered.new_zeros(len(planes)).index_put_(
+            (labels[labels >= 0],), covered[labels >= 0]
+        )
         for plane, side in zip(planes, sides.tolist(), strict=True):
             plane["sides"] = side
     low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
     steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
-    arrays: dict[str, NDArray[Any]] = {"positions": steps.numpy().astype(np.uint16)}
+    arrays: dict[str, NDArray[np.generic]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
-    arrays["radii"] = surfaces.radii.numpy()
+    radii = radii_of(shown.surface)
+    arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
@@ -255,9 +253,12 @@ def _describe_cloud(
         "levels": shown.levels,
         "low": low.tolist(),
         "step": PAGE_EXTENT / _STEPS,
-        "spacing": surfaces.spacing,
-        "surfaces": [rounded(direction) for direction in directions],
-        "channels": {channel.mode: _describe_channel(channel) for channel in channels},
+        "spacing": float(shown.surface.spacing.median()) if len(shown.rows) else 0.0,
+        "surfaces": rounded(shown.sides.directions),
+        "channels": {
+            channel.mode: {"legend": channel.legend, "direct": channel.colors is None}
+            for channel in channels
+        },
         "planes": planes,
         "arrays": manifest,
     }
@@ -283,25 +284,17 @@ def _palettes(
     return palettes
 
 
-def _describe_channel(channel: Channel) -> dict[str, Any]:
-    """Return what a page says about a meaning of colours."""
-    return {"legend": channel.legend, "direct": channel.colors is None}
-
-
-def _direction_of_view(
-    points: Tensor, view: View, frame: Frame, azimuth_deg: float | None
-) -> Tensor:
+def _direction_of_view(shown: Shown, view: View, frame: Frame, azimuth_deg: float | None) -> Tensor:
     """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
     if view == "sensor":
         return frame.rotation[:, 2].float().neg()
-    grid = build_grid(points)
-    if len(grid.levels) == 0:
+    if len(shown.rows) == 0:
         return functional.normalize(torch.tensor([-1.0, -1.0, 1.0]), dim=0)
     up = torch.tensor([0.0, 0.0, 1.0])
-    return choose_viewpoint(surface_cells(grid), view, up, azimuth_deg=azimuth_deg).toward
+    return choose_viewpoint(shown.surface, shown.sides, view, up, azimuth_deg=azimuth_deg).toward
 
 
-def _pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]:
+def _pack(arrays: Mapping[str, NDArray[np.generic]]) -> tuple[list[dict[str, object]], str]:
     """Return name, type and shape of arrays, and all of them as one text.
 
     Each column is split into its bytes, the low ones first. Of positions, which lie along a curve,
@@ -342,7 +335,7 @@ def _encode(content: bytes) -> str:
     return base64.b64encode(squeezer.compress(content) + squeezer.flush()).decode("ascii")
 
 
-def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library: str) -> str:
+def _fill_template(description: Mapping[str, object], blobs: Iterable[str], library: str) -> str:
     """Return the text of a page."""
     from markupsafe import Markup
 
@@ -357,7 +350,7 @@ def _fill_template(description: Mapping[str, Any], blobs: Iterable[str], library
     return text
 
 
-def template_of(name: str) -> Any:  # noqa: ANN401
+def template_of(name: str) -> "Template":
     """Return one of the templates beside this file; what is put into it is escaped.
 
     Raises:
@@ -367,7 +360,8 @@ def template_of(name: str) -> Any:  # noqa: ANN401
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
     )
-    return environment.from_string((_ASSETS / name).read_text(encoding="utf-8"))
+    template: Template = environment.from_string((_ASSETS / name).read_text(encoding="utf-8"))
+    return template
 
 
 def _json_for_html(value: object) -> str:

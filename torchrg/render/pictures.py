@@ -3,7 +3,7 @@
 import functools
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import torch
@@ -14,10 +14,9 @@ from torch.nn import functional
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, refusing
-from torchrg.metrics.contingency import INTEGERS
+from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
-from torchrg.render.cutaway import View, choose_viewpoint
-from torchrg.render.grid import CloudGrid, build_grid, local_spacing, surface_cells
+from torchrg.render.cutaway import View, choose_viewpoint, find_sides
 from torchrg.render.raster import (
     DepthBuffer,
     Discs,
@@ -26,6 +25,7 @@ from torchrg.render.raster import (
     light_colors,
     shade_hollows,
 )
+from torchrg.render.surface import Surface, sample_surface
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -51,8 +51,7 @@ decide what the picture shows."""
 
 def draw_picture(
     camera: "PinholeCamera",
-    grid: CloudGrid,
-    spacing: Tensor,
+    surface: Surface,
     kept: Tensor,
     colors: Tensor,
     normals: Tensor | None,
@@ -63,37 +62,30 @@ def draw_picture(
 
     Args:
         camera: A batch of one, with the size of the picture.
-        grid: The cloud, of at least one finite point.
-        spacing: Distance of each finite point from its neighbours, shape ``(n,)``.
-        kept: Which of them to draw, shape ``(n,)``, bool.
+        surface: The cloud, of at least one finite point.
+        kept: Which of its n points to draw, shape ``(n,)``, bool.
         colors: Colours of all points, shape ``(N, 3)``, uint8.
-        normals: Normals of all points, shape ``(N, 3)``. Default: those of small cubes of the
-            cloud.
+        normals: Normals of all points, shape ``(N, 3)``. Default: those of the voxels.
         supersampling: Pixels along the side of each pixel of the picture.
 
     Returns:
         Shape ``(H, W, 3)``, uint8.
     """
     width, height = int(camera.width), int(camera.height)
-    project = projection_of(camera, grid.origin, finer=supersampling)
-    lengths = _RADIUS * spacing.clamp(max=_LARGEST * float(spacing.median()))
+    project = projection_of(camera, surface.origin, finer=supersampling)
+    lengths = _RADIUS * surface.spacing.clamp(max=_LARGEST * float(surface.spacing.median()))
     places = kept.nonzero().squeeze(-1)
-    radius, length = _usual_radius(project, grid.points, lengths, places)
+    radius, length = _usual_radius(project, surface.points, lengths, places)
     widest = supersampling * max(_ALWAYS, _WIDEST * width)
     buffer = DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
-    cells = surface_cells(grid) if normals is None else None
 
     def discs_of(some: Tensor) -> Discs:
-        rows = grid.rows[some]
-        if cells is not None:
-            slant = cells.normals[cells.cell_of[some]]
-        elif normals is not None:
-            slant = normals[rows].float()
-        return _discs(
-            project, grid.points[some], colors[rows], slant, lengths[some], least=supersampling / 2
-        )
+        rows = surface.rows[some]
+        slant = surface.normals_at(some) if normals is None else normals[rows]
+        place, least = surface.points[some], supersampling / 2
+        return _discs(project, place, colors[rows], slant.float(), lengths[some], least=least)
 
     parts = torch.split(places, _POINTS_AT_ONCE)
     for some in parts:
@@ -172,6 +164,7 @@ def render_cloud(
     colors: Tensor | NDArray[np.uint8],
     *,
     normals: Tensor | NDArray[np.floating] | None = None,
+    labels: Tensor | NDArray[np.integer] | None = None,
     view: View = "cutaway",
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     azimuth_deg: float | None = None,
@@ -194,7 +187,9 @@ def render_cloud(
         points: Points, shape ``(N, 3)``; those with NaN or Inf are left out.
         colors: Shape ``(N, 3)``, uint8.
         normals: For tilt and light, of arbitrary sign, shape ``(N, 3)``; zero where unknown.
-            Default: those of small cubes of the cloud.
+            Default: those of voxels of the cloud.
+        labels: Plane of each point, shape ``(N,)``, integers, negative for none, to tell walls and
+            ceilings. Default: the voxels of the cloud are segmented.
         view: See above.
         up: Upward direction; not used from the sensor.
         azimuth_deg: Angle of the viewer about ``up``, from the normal of the largest walls.
@@ -218,31 +213,35 @@ def render_cloud(
         (torch.Size([40, 3]), True, [255, 255, 255])
     """
     cloud, paint, slant = _check_cloud("render_cloud", points, colors, normals)
+    planes = None
+    if labels is not None:
+        (planes,) = check_labels("render_cloud", labels=labels)
+        check_shapes("render_cloud", points=(cloud, "N 3"), labels=(planes, "N"))
     if view not in get_args(View):
         names = ", ".join(get_args(View))
         raise ConfigError(f"render_cloud: expected view to be one of {names}, got {view!r}.")
     if not any(up):
         raise ConfigError("render_cloud: expected up to be a direction, got zeros.")
     _check_at_least_one("render_cloud", width=width, height=height, supersampling=supersampling)
-    grid = build_grid(cloud)
-    if len(grid.rows) == 0:
+    surface = sample_surface(cloud)
+    if len(surface.rows) == 0:
         shape = (height or round(0.75 * width), width, 3)
         return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
-    spacing = local_spacing(grid)
-    near = spacing <= _FAR_APART * spacing.median()
+    near = surface.spacing <= _FAR_APART * surface.spacing.median()
     kept = torch.ones_like(near)
     if view == "sensor":
-        camera = sensor_camera(cloud[grid.rows[near]], width=width, height=height)
+        camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
     else:
-        upward = functional.normalize(grid.points.new_tensor(up), dim=0)
+        upward = functional.normalize(surface.points.new_tensor(up), dim=0)
+        sides = find_sides(surface, None if planes is None else planes[surface.rows], upward)
         viewpoint = choose_viewpoint(
-            surface_cells(grid), view, upward, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
+            surface, sides, view, upward, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
         )
-        kept = viewpoint.keeps(grid.points)
-        shown = grid.points[kept & near].double() + grid.origin
+        kept = (sides.of_points & viewpoint.cut) == 0
+        shown = surface.points[kept & near].double() + surface.origin
         axes = view_axes(viewpoint.toward, viewpoint.up)
         camera = fit_camera(shown, axes, width=width, height=height)
-    return draw_picture(camera, grid, spacing, kept, paint, slant, supersampling=supersampling)
+    return draw_picture(camera, surface, kept, paint, slant, supersampling=supersampling)
 
 
 def render_points(
@@ -280,17 +279,15 @@ def render_points(
     """
     cloud, paint, slant = _check_cloud("render_points", points, colors, normals)
     _check_at_least_one("render_points", supersampling=supersampling)
-    grid = build_grid(cloud)
-    if len(grid.rows) == 0:
+    surface = sample_surface(cloud)
+    if len(surface.rows) == 0:
         shape = (int(camera.height), int(camera.width), 3)
         return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
-    kept = torch.ones_like(grid.rows, dtype=torch.bool)
-    return draw_picture(
-        camera, grid, local_spacing(grid), kept, paint, slant, supersampling=supersampling
-    )
+    kept = torch.ones_like(surface.rows, dtype=torch.bool)
+    return draw_picture(camera, surface, kept, paint, slant, supersampling=supersampling)
 
 
-def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[Any]) -> None:
+def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:
     """Write a picture, or an image of labels, as a PNG file.
 
     Args:

@@ -255,16 +255,9 @@ def close_gaps(keys: Tensor, *, reach: int, thickness: float) -> Tensor:
 
 def _largest_around(image: Tensor, reach: int) -> Tensor:
     """Return the largest value in the square around each pixel of an image ``(H, W)``."""
-    for axis in (0, 1):
-        edges = (reach, reach, 0, 0) if axis else (0, 0, reach, reach)
-        image = functional.pad(image, edges, value=-torch.inf)
-        width = 1
-        while width <= 2 * reach:
-            step = min(width, 2 * reach + 1 - width)
-            count = image.shape[axis] - step
-            image = torch.maximum(image.narrow(axis, 0, count), image.narrow(axis, step, count))
-            width += step
-    return image
+    size = 2 * reach + 1
+    rows = functional.max_pool2d(image[None, None], (1, size), 1, (0, reach))
+    return functional.max_pool2d(rows, (size, 1), 1, (reach, 0))[0, 0]
 
 
 def light_colors(colors: Tensor, normals: Tensor, positions: Tensor) -> Tensor:

@@ -1,0 +1,138 @@
+"""How dense a cloud is and where its surface faces, by voxels that hold a few points each."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg.linalg import covariance, eigh3
+from torchrg.neighbors import gather_patches, search_knn
+from torchrg.neighbors.order import spread_bits
+
+_BITS = 20
+"""The longest side of a cloud is ``2**_BITS`` steps; points of one step are duplicates."""
+_MOST_VOXELS = 60_000
+"""Most voxels of a cloud: a room of 6 m has them every 5 cm."""
+_ALL_BELOW = 1000
+"""A cloud of fewer points has a voxel for each of them."""
+_NEIGHBORS = 16
+"""Voxels around each that tell how dense the surface is and where it faces."""
+_FLAT = 0.15
+"""Largest ratio of the two smallest eigenvalues of voxels on a plane."""
+
+
+class Surface(NamedTuple):
+    """The finite points of a cloud along a Morton curve, and the n points' V voxels.
+
+    Attributes:
+        rows: Row of each point in the cloud, shape ``(n,)``, int64.
+        points: Coordinates about ``origin``, shape ``(n, 3)``, float32.
+        origin: Lowest corner of the bounding box, shape ``(3,)``, float64.
+        spacing: Distance of each point from its neighbours on the surface, shape ``(n,)``; 0 if all
+            points are in one place.
+        voxel_of: Voxel of each point, shape ``(n,)``.
+        first: The first point of each voxel, shape ``(V,)``.
+        centers: Means of the points, shape ``(V, 3)``, float32, about ``origin``.
+        normals: Unit normals of arbitrary sign, shape ``(V, 3)``; zero where there is no plane.
+        near: The nearest voxels of each, itself first, shape ``(V, K)``.
+        size: Edge of a voxel, or the usual spacing if that is larger.
+    """
+
+    rows: Tensor
+    points: Tensor
+    origin: Tensor
+    spacing: Tensor
+    voxel_of: Tensor
+    first: Tensor
+    centers: Tensor
+    normals: Tensor
+    near: Tensor
+    size: float
+
+    def normals_at(self, places: Tensor) -> Tensor:
+        """Return unit normals of some of the n points, ``(*, 3)``; zero where there is no plane.
+
+        In a voxel at an edge a point has that of the plane around that passes nearest to it.
+        """
+        voxel = self.voxel_of[places]
+        normals = self.normals[voxel]
+        at_edge = (normals == 0).all(dim=1).nonzero().squeeze(1)
+        near = self.near[voxel[at_edge]]
+        around = self.normals[near]
+        away = self.points[places[at_edge], None] - self.centers[near]
+        heights = (away * around).sum(dim=2).abs()
+        heights.masked_fill_((around == 0).all(dim=2), torch.inf)
+        best = heights.argmin(dim=1)
+        return normals.index_copy(0, at_edge, around[torch.arange(len(best)), best])
+
+
+def sample_surface(points: Tensor) -> Surface:
+    """Sort the finite points of a cloud into voxels, and measure the surface around each voxel.
+
+    Nothing depends on the order of the points: means are of whole numbers of steps, which add up
+    exactly.
+
+    Example:
+        >>> surface = sample_surface(torch.tensor([[8.0, 0, 0], [torch.nan, 0, 0], [4, 1, 0]]))
+        >>> surface.rows.tolist(), surface.origin.tolist(), surface.centers[:, 0].round().tolist()
+        ([2, 0], [4.0, 0.0, 0.0], [0.0, 4.0])
+    """
+    rows = points.isfinite().all(dim=-1).nonzero().squeeze(-1)
+    finite = points[rows].detach()
+    low = finite.amin(dim=0) if len(rows) else finite.new_zeros(3)
+    local = (finite - low).float()
+    step = float(local.amax()) / 2**_BITS if len(rows) else 0.0
+    steps = torch.zeros_like(local, dtype=torch.int64)
+    if step > 0:
+        steps = (local / step).int().clamp_(max=2**_BITS - 1).long()
+    codes = sum((spread_bits(steps[:, axis]) << axis for axis in range(3)), torch.zeros_like(rows))
+    codes, order = codes.sort(stable=True)
+    distinct = torch.unique_consecutive(codes)
+    level = _level_of_voxels(distinct)
+    counts = torch.unique_consecutive(distinct >> 3 * level, return_counts=True)[1]
+    _, voxel_of, held = torch.unique_consecutive(
+        codes >> 3 * level, return_inverse=True, return_counts=True
+    )
+    sums = steps.new_zeros(len(held), 3).index_add_(0, voxel_of, steps[order])
+    centers = ((sums / held.double()[:, None] + 0.5) * step).float()
+    spacing, normals, near = _measure(centers, counts)
+    return Surface(
+        rows[order],
+        local[order],
+        low.double(),
+        spacing[voxel_of],
+        voxel_of,
+        held.cumsum(0) - held,
+        centers,
+        normals,
+        near,
+        max(step * 2**level, float(spacing.median()) if len(spacing) else 0.0),
+    )
+
+
+def _level_of_voxels(codes: Tensor) -> int:
+    """Return how often steps are doubled until voxels hold two on average, and are few enough."""
+    most = min(_MOST_VOXELS, max(_ALL_BELOW, len(codes) // 2))
+    level = 0
+    while int((codes >> 3 * level).diff().count_nonzero()) >= most:
+        level += 1
+    return level
+
+
+def _measure(centers: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the distance between points ``(V,)``, the normal and the nearest of each voxel.
+
+    Voxels with eigenvalues ``a <= b <= c`` of their covariance cover about ``12 sqrt(b c)`` of a
+    plane, ``sqrt(12 c)`` of a line.
+    """
+    if len(centers) < 2:
+        nothing = torch.zeros_like(centers)
+        return nothing[:, 0], nothing, nothing[:, :1].long()
+    near = search_knn(centers, min(_NEIGHBORS, len(centers))).indices.long()
+    values, vectors = eigh3(covariance(gather_patches(centers, near))[1])
+    num_points = counts[near].sum(dim=1)
+    smallest, middle, largest = values.clamp(min=0).unbind(dim=1)
+    area, length = 12 * (middle * largest).sqrt(), (12 * largest).sqrt()
+    flat = (smallest < _FLAT * middle)[:, None]
+    spacing = torch.maximum((area / num_points).sqrt(), length / num_points)
+    return spacing, torch.where(flat, vectors[..., 0], 0.0), near
