@@ -82,7 +82,7 @@ def test_right_angles_have_one_answer():
         ("stairs", 5000),
         ("bracket", 5000),
         ("torus", 5000),
-        ("coral", 5000),
+        ("rounded_box", 5000),
         ("thin_plate", 15_000),
     ],
 )

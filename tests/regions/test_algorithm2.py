@@ -8,8 +8,8 @@ import pytest
 import torch
 from pypcd4 import PointCloud
 
-from tests.made.settings import papers_growing
 from tests.regions import algorithm2, growing_clouds
+from tests.regions.growing_clouds import papers_growing
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 
