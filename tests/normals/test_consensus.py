@@ -41,14 +41,6 @@ def fit_all(points, estimate, k=50):
     return fit_points(points, search_knn(points, k), estimate)
 
 
-@pytest.mark.slow
-def test_an_exact_cube_has_exact_normals_but_for_a_few_points_on_its_edges():
-    points, truth = shape("cube", 100_000)
-    mean, rms = errors(consensus(points), truth)
-    assert mean <= 0.06
-    assert rms <= 0.6
-
-
 @pytest.mark.parametrize("name", ["cube", "octahedron", "stairs", "cylinder"])
 @pytest.mark.parametrize("noise", [0.0, 0.0025])
 def test_edges_are_sharper_than_those_of_pca_and_jet(name, noise):

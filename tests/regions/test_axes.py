@@ -30,12 +30,9 @@ def degrees_off(rotation):
     return tilt, abs(angle - 90 * round(angle / 90))
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *[pytest.param(n, marks=pytest.mark.slow) for n in range(1, 100)]]
-)
-def test_made_rooms_are_set_upright_along_their_walls(seed):
-    rng = np.random.default_rng(seed)
-    room = make_room(num_points=12_000, noise=0.005, seed=seed)
+def test_made_rooms_are_set_upright_along_their_walls():
+    rng = np.random.default_rng(0)
+    room = make_room(num_points=12_000, noise=0.005, seed=0)
     turn = tilted(rng)
     points = room.points.double() @ turn.T + torch.tensor([1e5, -20, 3.0])
     motion = align_axes(segment_planes(points))
