@@ -6,30 +6,14 @@ from hypothesis import strategies as st
 
 import torchrg
 from tests.robust.oracle_cases import (
-    LIBRA,
+    ESTIMATORS,
     angle_deg,
     fit_all,
     load_oracles,
     local_float32,
     normal_of,
 )
-from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
-
-ESTIMATORS = {
-    "paper": fit_detmcd,
-    "libra": lambda patches, **k: fit_detmcd(patches, **LIBRA, **k),
-    "planes": lambda patches, **k: fit_detmcd(patches, starts="planes", **k),
-    "more": lambda patches, **k: fit_detmcd(patches, starts="more", **k),
-    "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=20, **k),
-    "mve": lambda patches, **k: fit_mve(patches, num_starts=20, **k),
-    "dets": fit_dets,
-    "detmm": fit_detmm,
-}
-
-
-@pytest.fixture(params=ESTIMATORS)
-def estimator(request):
-    return ESTIMATORS[request.param]
+from torchrg.robust import fit_detmcd, fit_dets
 
 
 def assert_sound(fit):

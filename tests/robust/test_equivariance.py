@@ -1,25 +1,10 @@
 import pytest
 import torch
 
-from tests.robust.oracle_cases import LIBRA
-from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
+from tests.robust.oracle_cases import ESTIMATORS
+from torchrg.robust import fit_detmcd, qn
 from torchrg.robust.lanes import smallest_points
 from torchrg.robust.scale import sum_points
-
-ESTIMATORS = {
-    "paper": fit_detmcd,
-    "libra": lambda patches, **k: fit_detmcd(patches, **LIBRA, **k),
-    "planes": lambda patches, **k: fit_detmcd(patches, starts="planes", **k),
-    "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=30, **k),
-    "mve": lambda patches, **k: fit_mve(patches, num_starts=30, **k),
-    "dets": fit_dets,
-    "detmm": fit_detmm,
-}
-
-
-@pytest.fixture(params=ESTIMATORS)
-def estimator(request):
-    return ESTIMATORS[request.param]
 
 
 @pytest.fixture

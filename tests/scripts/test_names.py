@@ -4,8 +4,6 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 BEHIND = {"environment.sh": "test.sh", "docs.py": "docs.sh"}
