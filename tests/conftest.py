@@ -58,6 +58,14 @@ def rng():
 
 
 @pytest.fixture
+def set_threads():
+    """``set_threads(n)``: torch works in n threads, until the end of the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def scan():
     """Path of a real scan by name; the test is skipped where the scans are absent."""
 

@@ -91,19 +91,15 @@ def test_order_changes_nothing(scene, config):
     assert_same_planes(other.planes, plain.planes)
 
 
-def test_chunks_and_threads_change_nothing(scene, config):
+def test_chunks_and_threads_change_nothing(scene, config, set_threads):
     points = scene.points[:3000]
     plain = segment_planes(points, config)
-    threads = torch.get_num_threads()
-    try:
-        for chunk_size, num_threads in ((397, 1), (100_000, 2)):
-            torch.set_num_threads(num_threads)
-            other = segment_planes(points, dataclasses.replace(config, chunk_size=chunk_size))
-            assert torch.equal(other.labels, plain.labels)
-            assert torch.equal(other.normals, plain.normals)
-            assert torch.equal(other.curvature, plain.curvature)
-    finally:
-        torch.set_num_threads(threads)
+    for chunk_size, num_threads in ((397, 1), (100_000, 2)):
+        set_threads(num_threads)
+        other = segment_planes(points, dataclasses.replace(config, chunk_size=chunk_size))
+        assert torch.equal(other.labels, plain.labels)
+        assert torch.equal(other.normals, plain.normals)
+        assert torch.equal(other.curvature, plain.curvature)
 
 
 @pytest.mark.parametrize("unit", [2.0**-13, 1000.0])

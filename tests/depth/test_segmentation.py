@@ -174,16 +174,12 @@ def test_unit_origin_and_dtype_do_not_matter():
     torch.testing.assert_close(shift, seg.planes.offset, atol=1e-3, rtol=0)
 
 
-def test_threads_do_not_matter():
+def test_threads_do_not_matter(set_threads):
     frame = rendered(2, 3, sensor="kinect", width=320, height=240)
-    before = torch.get_num_threads()
-    try:
-        found = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            found.append(segment_depth(frame.depth, frame.camera.intrinsics))
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 3):
+        set_threads(threads)
+        found.append(segment_depth(frame.depth, frame.camera.intrinsics))
     assert torch.equal(found[0].labels, found[1].labels)
     assert torch.equal(found[0].normals, found[1].normals)
 

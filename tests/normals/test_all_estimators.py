@@ -108,18 +108,14 @@ def test_batch_is_a_loop_of_singles(corner, method):
 
 
 @pytest.mark.parametrize("method", ["pca", "jet", "paper", "detmcd"])
-def test_number_of_threads_changes_nothing(method):
+def test_number_of_threads_changes_nothing(method, set_threads):
     # Enough numbers for torch to share them out: it does not below 32,768.
     points = torch.rand(1700, 3, generator=torch.Generator().manual_seed(0))
     points[:, 2] *= torch.arange(1700) % 2 / 10
-    threads = torch.get_num_threads()
     found = []
-    try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            found.append(estimate_normals(points, method=method, k=K))
-    finally:
-        torch.set_num_threads(threads)
+    for count in (1, 2):
+        set_threads(count)
+        found.append(estimate_normals(points, method=method, k=K))
     assert_equal(*found)
 
 

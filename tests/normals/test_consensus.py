@@ -96,15 +96,11 @@ def same(a, b):
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def test_chunk_size_and_threads_change_nothing(noisy_bracket):
+def test_chunk_size_and_threads_change_nothing(noisy_bracket, set_threads):
     points, fit = noisy_bracket
     assert same(fit, consensus(points, chunk_size=701))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(3 - min(threads, 2))
-    try:
-        assert same(fit, consensus(points))
-    finally:
-        torch.set_num_threads(threads)
+    set_threads(3 - min(torch.get_num_threads(), 2))
+    assert same(fit, consensus(points))
 
 
 def test_order_changes_nothing(noisy_bracket, rng):

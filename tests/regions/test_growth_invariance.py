@@ -62,19 +62,14 @@ def test_swapped_duplicates_are_all_that_another_order_changes(config, rng):
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_labels_do_not_depend_on_chunk_size_or_threads(config, monkeypatch):
+def test_labels_do_not_depend_on_chunk_size_or_threads(config, set_threads):
     cloud = clouds("quantized", dtype=torch.float32)
     labels = grow_regions(*cloud, config)
     for chunk_size in (1, 7, 64, 1000):
         assert torch.equal(grow_regions(*cloud, config, chunk_size=chunk_size), labels)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(3)
+    for threads in (3, 1):
+        set_threads(threads)
         assert torch.equal(grow_regions(*cloud, config, chunk_size=50), labels)
-        torch.set_num_threads(1)
-        assert torch.equal(grow_regions(*cloud, config, chunk_size=50), labels)
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)

@@ -170,17 +170,13 @@ def test_planes_are_what_most_points_are_on(room, parts):
     assert 5 < (parts.plane >= 0).sum() < len(parts.plane)
 
 
-def test_order_threads_and_chunks_change_nothing(room, parts, monkeypatch):
+def test_order_threads_and_chunks_change_nothing(room, parts, monkeypatch, set_threads):
     order = torch.randperm(6000, generator=torch.Generator().manual_seed(1))
     moved = partition_points(*(values[order] for values in room), CONFIG)
     assert torch.equal(moved.labels, parts.labels[order])
     assert torch.equal(moved.plane, parts.plane)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2 if before == 1 else 1)
-    try:
-        assert torch.equal(partition_points(*room, CONFIG).levels[1], parts.levels[1])
-    finally:
-        torch.set_num_threads(before)
+    set_threads(2 if torch.get_num_threads() == 1 else 1)
+    assert torch.equal(partition_points(*room, CONFIG).levels[1], parts.levels[1])
     monkeypatch.setattr(superpoints, "ROWS_AT_ONCE", 77)
     assert torch.equal(partition_points(*room, CONFIG).labels, parts.labels)
 

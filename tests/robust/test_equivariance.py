@@ -46,16 +46,12 @@ def test_devices_agree(estimator, patches, device):
     torch.testing.assert_close(there.covariance.cpu(), fit.covariance, **close)
 
 
-def test_result_does_not_depend_on_threads(patches):
-    setting = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            results.append((fit_detmcd(patches, chunk_size=5), qn(patches.repeat(80, 1, 1))))
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(setting)
+def test_result_does_not_depend_on_threads(patches, set_threads):
+    results = []
+    for threads in (1, 3):
+        set_threads(threads)
+        results.append((fit_detmcd(patches, chunk_size=5), qn(patches.repeat(80, 1, 1))))
+    assert torch.get_num_threads() == 3
     assert_equal_fits(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
 

@@ -102,6 +102,13 @@ def test_shapes_are_closed_with_normals_outwards_and_points_by_area(name):
     assert (height.mean() - 3 * volume / area).abs() <= tolerance + 1e-7
 
 
+@pytest.mark.parametrize("name", ["cuboid", "octahedron", "dodecahedron", "hexagonal_prism"])
+def test_no_point_of_a_convex_shape_is_beyond_a_face(name):
+    shape = make_shape(name, 20_000)
+    heights = shape.points.double() @ shape.face_normals.T - shape.face_offsets
+    assert heights.max() < 1e-6
+
+
 @pytest.mark.parametrize("name", IMPLICIT)
 def test_points_and_normals_are_those_of_the_equation(name):
     shape = make_shape(name, 20_000)
