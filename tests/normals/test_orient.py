@@ -182,8 +182,8 @@ def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng)
     assert torch.equal(oriented[few], inwards[few])
 
 
-def test_points_between_those_over_which_signs_spread_follow_them(room, monkeypatch):
-    scene, normals = room
+def test_points_between_those_over_which_signs_spread_follow_them(scanned, monkeypatch):
+    scene, normals = scanned
     whole = orient_normals(scene.points, normals)
     monkeypatch.setattr(orient, "_MOST_SPREADING", 15_000)
     half = orient_normals(scene.points, normals)
