@@ -92,12 +92,12 @@ def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
         "end_header", "element face 2\nproperty list uchar int vertex_indices\nend_header"
     )
     if order == "ascii":
-        body = b"1.5\n2 0 1\n2 1 2\n" + text_body() + b"3 0 1 2\n4 0 1 2 0\n"
+        body = b"1.5\n2 0 1\n2 1 2\n" + text_body() + b"3 0 1 2\n3 0 2 1\n"
     else:
         mark = ORDERS[order]
         strips = struct.pack(mark + "dBiiBii", 1.5, 2, 0, 1, 2, 1, 2)
         body = strips + binary_body(mark)
-        body += struct.pack(mark + "BiiiBiiii", 3, 0, 1, 2, 4, 0, 1, 2, 0)
+        body += struct.pack(mark + "BiiiBiii", 3, 0, 1, 2, 3, 0, 2, 1)
     cloud = read_cloud(save(tmp_path / "a.ply", header, body))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
     assert set(cloud.fields) == {"color", "labels"}

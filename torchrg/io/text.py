@@ -9,7 +9,6 @@ in ASCII files of other formats are read here, too.
 
 import csv
 import os
-import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
@@ -97,12 +96,10 @@ def read_rows(
     content: str,
     *,
     line_number: int,
-    skipped: int = 0,
 ) -> Values:
-    """Read rows of a structured type from an ASCII file that is open behind its header.
+    """Read rows of a structured type from an ASCII file, the next line of which has this number.
 
-    Its next line has this number; so many lines are skipped before the rows. ``content`` is what
-    rows are, for messages.
+    ``content`` is what rows are, for messages.
     """
     # A digit and what separates it from the next; the last may end with the file.
     least, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
@@ -110,8 +107,16 @@ def read_rows(
     content = f"{num_rows:,} {content}"
     check_promise(path, start, least, content, available=available, at_least=True)
     lines = (raw.decode("latin-1") for raw in stream)
-    line_number += sum(1 for _ in islice(lines, min(skipped, sys.maxsize)))
     return _read_table(path, lines, dtype, line_number, num_rows=num_rows)
+
+
+def skip_lines(stream: BinaryIO, count: int) -> int:
+    """Pass so many lines of an ASCII file that are not blank, and return how many that took."""
+    passed = 0
+    while count > 0 and (line := stream.readline()):
+        passed += 1
+        count -= bool(line.strip())
+    return passed
 
 
 def _read_table(
