@@ -12,7 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -226,10 +226,17 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _refusing_member(path: Path, name: str) -> AbstractContextManager[None]:
-    """Raise what reading a member raises as an error that names it."""
-    message = f"{path}: {f'{name}.npy'!r}: "
-    return refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again")
+@contextmanager
+def _open_member(
+    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
+) -> Iterator[IO[bytes]]:
+    """Open an array of an archive; errors name both."""
+    message = f"{path}: {member.filename!r}: "
+    with (
+        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again"),
+        archive.open(member) as stream,
+    ):
+        yield stream
 
 
 def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, _Layout]:
@@ -243,17 +250,18 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
                 f"{path}: expected {member.filename!r} stored or deflated, got compression "
                 f"{member.compress_type}; write it with numpy.savez."
             )
-        content, name = repr(member.filename), member.filename.removesuffix(".npy")
+        content = repr(member.filename)
         most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
         check_promise(path, member.header_offset, member.file_size, content, available=most)
-        with _refusing_member(path, name), archive.open(member) as stream:
+        with _open_member(path, archive, member) as stream:
+            name = member.filename.removesuffix(".npy")
             layouts[name] = _check_array(path, stream, member.file_size, content)
     return layouts
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
     """Read one array of an archive, and on to its end, where its checksum is compared."""
-    with _refusing_member(path, name), archive.open(f"{name}.npy") as stream:
+    with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
         values: Values = npy_format.read_array(stream, allow_pickle=False)
         while stream.read(_BYTES_AT_ONCE):
             pass
