@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, check_exact, flatten_cloud
+from torchrg.io.columns import Spelling, check_exact, flatten_cloud, slices
 from torchrg.io.fields import Values, assemble_table, check_names
 from torchrg.io.files import atomic_path, check_promise
 from torchrg.structures import Cloud
@@ -78,7 +78,12 @@ def write_text(path: Path, cloud: Cloud) -> None:
     with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
         if cloud.fields:
             file.write(f"# {' '.join(columns)}\n")
-        file.writelines(_format_table(columns.values()))
+        # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
+        marks = {"f4": "%.9g", "f8": "%r"}
+        row = " ".join(marks.get(c.dtype.str[1:], "%d") for c in columns.values()) + "\n"
+        for rows in slices(len(cloud), LINES_AT_ONCE):
+            block = [column[rows].tolist() for column in columns.values()]
+            file.write(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
 
 
 def count_text(path: Path, size: int) -> int:
@@ -327,15 +332,3 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _format_table(columns: Iterable[Values]) -> Iterator[str]:
-    """Yield columns as text that reads back to the same values, a block of lines at a time."""
-    kept = list(columns)
-    # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
-    marks = {"f4": "%.9g", "f8": "%r"}
-    row = " ".join(marks.get(column.dtype.str[1:], "%d") for column in kept) + "\n"
-    for start in range(0, len(kept[0]), LINES_AT_ONCE):
-        block = [column[start : start + LINES_AT_ONCE].tolist() for column in kept]
-        values = tuple(chain.from_iterable(zip(*block, strict=True)))
-        yield row * len(block[0]) % values
