@@ -122,16 +122,12 @@ def _sort_keys(
     found: list[str] = []
     ambiguous: list[str] = []
     for key, value in entries.items():
-        if is_whole(key, whole) or num_points == 0 or not _is_as_long(value, num_points):
+        is_whole = key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
+        if is_whole or num_points == 0 or not _is_as_long(value, num_points):
             continue
         is_array = isinstance(value, Tensor | np.ndarray)
         (found if is_array and (by_length or key in by_name) else ambiguous).append(key)
     return found, ambiguous
-
-
-def is_whole(key: object, whole: Collection[str] = ()) -> bool:
-    """Return whether an entry has no row for each point by its name."""
-    return key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
 
 
 def check_in_step(caller: str, entries: Entries, num_points: int) -> None:
