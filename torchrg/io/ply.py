@@ -59,7 +59,8 @@ that no property is called so."""
 def read_ply(path: Path, size: int) -> Cloud:
     """Read a PLY file: every property of the element ``vertex``, and its front by the faces.
 
-    Other elements are left out, and so are faces that come before the vertices.
+    Other elements are left out, and so are faces that come before the vertices, or that have
+    different numbers of corners.
     """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
