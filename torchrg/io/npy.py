@@ -43,7 +43,8 @@ from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Supe
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
 _COORDINATES = ("points", "coord")
-_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
+POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
+"""What a segmentation says of each point."""
 _NOT_PER_POINT = {
     *(f"plane_{name}" for name in (*Planes._fields, "of_superpoint")),
     *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
@@ -161,7 +162,7 @@ def write_npz(
                 )
             arrays[name] = values
     else:
-        arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in _RESULTS}
+        arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in POINT_RESULTS}
         arrays |= planes_to_arrays(segmentation.planes, cloud.origin)
     if superpoints is not None:
         for name, level in superpoints.by_level().items():
