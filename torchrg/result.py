@@ -20,7 +20,7 @@ from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
-from torchrg.io.npy import map_folder, read_beside
+from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.plane_table import Arrays, arrays_of_description, planes_from_arrays
@@ -59,8 +59,6 @@ _KINDS = {
     "valid": ("b", ()),
 }
 """NumPy's kinds of numbers of a field, and shape of a row."""
-_FOUND = ("labels", "normals", "curvature", "sharp", "valid")
-"""What a segmentation says of each point."""
 _MOST_SEARCHED = 100_000
 """Points of a random sample that tell which planes meet where no result says it."""
 _NEIGHBORS = 50
@@ -116,7 +114,7 @@ class Result:
             name: getattr(segmentation, name)
             .numpy(force=True)
             .reshape(len(cloud), *_KINDS[name][1])
-            for name in _FOUND
+            for name in POINT_RESULTS
         }
         if superpoints is not None:
             found |= superpoints.by_level()

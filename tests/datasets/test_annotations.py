@@ -110,12 +110,6 @@ def test_any_other_bad_line_is_an_error_that_shows_it(file, line, extra):
     assert repr(line + extra) in str(caught.value)
 
 
-def test_a_minus_that_became_a_line_end_is_not_read_as_plus(file):
-    file.write_bytes(b"1.000 2.000 3.000 10 20 30\n\r9.160 2.000 3.000 10 20 30\n")
-    with pytest.raises(FormatError, match="line 2"):
-        read_annotation(file)
-
-
 def read_by_rules(content):
     """Read line by line as the rules say, None where a line is bad."""
     allowed = set(b"+-.0123456789eE \t")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from torchrg.datasets import collate_offset
 from torchrg.errors import ShapeError
@@ -45,12 +44,6 @@ def test_batches_join_to_batches():
 
 def test_other_names_of_the_coordinates():
     assert collate_offset([{"pos": torch.zeros(4, 3)}], coord="pos")["offset"].tolist() == [4]
-
-
-def test_it_serves_a_data_loader():
-    samples = [sample_of(count, str(count)) for count in (1, 2, 3)]
-    batches = list(DataLoader(samples, batch_size=2, collate_fn=collate_offset))
-    assert [batch["offset"].tolist() for batch in batches] == [[1, 3], [3]]
 
 
 def test_samples_that_differ_are_refused():

@@ -114,16 +114,6 @@ def test_the_table_describes_the_labels(sample, seg, tmp_path):
         assert np.sqrt((distances**2).mean()) == pytest.approx(row["rms"], rel=1e-2)
 
 
-def test_the_table_is_in_the_coordinates_of_the_data_set(seg):
-    near, far = (describe_planes(seg.planes, origin=o)["planes"] for o in (None, [5e6, -3.0, 2.0]))
-    shift = np.array([5e6, -3.0, 2.0])
-    for a, b in zip(near, far, strict=True):
-        assert np.allclose(np.array(a["centroid"]) + shift, b["centroid"], rtol=0, atol=1e-8)
-        at_centroid = np.array(b["normal"]) @ np.array(b["centroid"])
-        before = np.array(a["normal"]) @ np.array(a["centroid"]) - a["offset"]
-        assert at_centroid - b["offset"] == pytest.approx(before, abs=1e-8)
-
-
 def test_optional_columns_are_described(sample):
     config = load_config("classic")
     seg = segment_planes(sample["coord"], config)
@@ -159,11 +149,6 @@ def test_what_torchrg_wrote_is_replaced(sample, seg, tmp_path):
     assert np.array_equal(np.load(tmp_path / "normal.npy"), flipped.normals)
     assert np.array_equal(np.load(tmp_path / "coord.npy"), moved["coord"])
     assert (np.load(tmp_path / "plane.npy") == -1).all()
-
-
-def test_a_superpoint_of_an_older_run_does_not_stay(sample, seg, tmp_path):
-    write_pointcept_scene(tmp_path, sample, seg, superpoint=seg.labels)
-    write_pointcept_scene(tmp_path, sample, seg)
     assert not (tmp_path / "superpoint.npy").exists()
 
 

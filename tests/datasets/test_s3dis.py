@@ -50,11 +50,6 @@ def test_a_sample_is_the_room(root):
     assert data.classes[sample["segment"][0]] == "floor"
 
 
-def test_the_transform_is_called_with_the_sample(root):
-    data = S3DIS(root, [3], transform=lambda sample: sample["name"])
-    assert data[0] == "Area_3/hallway_1"
-
-
 def test_data_sets_survive_pickling(root):
     data = pickle.loads(pickle.dumps(S3DIS(root, [1])))
     assert data[2]["name"] == "Area_1/WC_1"

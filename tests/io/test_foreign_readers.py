@@ -41,20 +41,6 @@ def test_open3d_reads_and_writes_all_fields(
         np.testing.assert_array_equal(ours.fields["normals"], seg.normals)
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_open3d_legacy_reader_agrees_in_single_precision(tmp_path, make_cloud):
-    open3d = pytest.importorskip("open3d")
-    cloud = make_cloud()
-    for suffix in (".ply", ".pcd", ".xyz"):
-        write_cloud(tmp_path / f"a{suffix}", cloud)
-        theirs = open3d.io.read_point_cloud(str(tmp_path / f"a{suffix}"))
-        np.testing.assert_allclose(np.asarray(theirs.points), cloud.coordinates, rtol=1e-8)
-        if suffix != ".xyz":
-            np.testing.assert_allclose(
-                np.asarray(theirs.colors) * 255, cloud.fields["color"], atol=1e-9
-            )
-
-
 @pytest.mark.parametrize(
     ("name", "num_points", "num_finite", "grid_shape", "fields"),
     [

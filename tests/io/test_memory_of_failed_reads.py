@@ -1,4 +1,4 @@
-"""A file that cannot be read gives back its memory, however often it is tried."""
+"""A file that a library cannot read gives back its memory, however often it is tried."""
 
 import gc
 import os
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import FORMATS, read_cloud, write_cloud
+from torchrg.io import read_cloud, write_cloud
 from torchrg.structures import Cloud
 
 NUM_POINTS = 2_000
-NUM_READS = 10_000
-MOST_KEPT_BYTES = 10_000_000
-"""A kilobyte a read."""
+NUM_READS = 150
+MOST_KEPT_BYTES = 30_000_000
+"""A fifth of a megabyte a read; a reader that is not given back takes some."""
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
 
@@ -32,11 +32,10 @@ def damaged_files(whole):
     return [*map(bytes, flipped), whole[: len(whole) // 2], whole[:-1]]
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("suffix", list(FORMATS))
+@pytest.mark.parametrize("suffix", [".e57", ".las", ".laz"])
 def test_failed_reads_keep_no_memory(tmp_path, suffix, request):
-    pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
+    pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}[suffix])
     points = np.random.default_rng(0).random((NUM_POINTS, 3))
     write = request.getfixturevalue("write_scan") if suffix == ".e57" else write_cloud
     write(tmp_path / f"whole{suffix}", Cloud(points))
@@ -48,15 +47,13 @@ def test_failed_reads_keep_no_memory(tmp_path, suffix, request):
             read_cloud(path)
         except FormatError:
             paths.append(path)
-    if not paths:
-        pytest.skip("text and bare arrays do not notice such damage")
 
     def fail(count):
         for number in range(count):
             with pytest.raises(FormatError):
                 read_cloud(paths[number % len(paths)])
 
-    fail(100)
+    fail(20)
     before = resident_bytes()
     fail(NUM_READS)
     assert resident_bytes() - before < MOST_KEPT_BYTES

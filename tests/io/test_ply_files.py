@@ -92,12 +92,12 @@ def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
         "end_header", "element face 2\nproperty list uchar int vertex_indices\nend_header"
     )
     if order == "ascii":
-        body = b"1.5\n2 0 1\n2 1 2\n" + text_body() + b"3 0 1 2\n4 0 1 2 0\n"
+        body = b"1.5\n2 0 1\n2 1 2\n" + text_body() + b"3 0 1 2\n3 0 2 1\n"
     else:
         mark = ORDERS[order]
         strips = struct.pack(mark + "dBiiBii", 1.5, 2, 0, 1, 2, 1, 2)
         body = strips + binary_body(mark)
-        body += struct.pack(mark + "BiiiBiiii", 3, 0, 1, 2, 4, 0, 1, 2, 0)
+        body += struct.pack(mark + "BiiiBiii", 3, 0, 1, 2, 3, 0, 2, 1)
     cloud = read_cloud(save(tmp_path / "a.ply", header, body))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
     assert set(cloud.fields) == {"color", "labels"}
@@ -135,35 +135,6 @@ def test_lists_of_one_length_in_vertices_become_columns(tmp_path):
     header = header.replace("binary_little_endian", "ascii")
     with pytest.raises(FormatError, match="expected vertices without lists in an ASCII file"):
         read_cloud(save(tmp_path / "a.ply", header, b"1 2 3 2 7 8\n4 5 6 2 9 10\n"))
-
-
-WITH_LISTS = """ply
-format {} 1.0
-element camera 2
-property list uchar int q
-element vertex 5
-property float x
-property double y
-property short z
-property list uchar ushort w
-end_header
-"""
-
-
-def test_ply_with_lists_before_and_in_the_vertices(tmp_path):
-    cameras = np.array([(2, (1, 2))] * 2, [("n", "u1"), ("q", "<i4", 2)])
-    vertices = np.zeros(5, [("x", "<f4"), ("y", "<f8"), ("z", "<i2"), ("n", "u1"), ("w", "<u2", 3)])
-    vertices["x"], vertices["n"], vertices["w"] = np.arange(5), 3, np.arange(15).reshape(5, 3)
-    header = WITH_LISTS.format("binary_little_endian").encode()
-    path = tmp_path / "a.ply"
-    path.write_bytes(header + cameras.tobytes() + vertices.tobytes() + b"rest")
-    cloud = read_cloud(path)
-    assert cloud.coordinates[:, 0].tolist() == [0, 1, 2, 3, 4]
-    assert cloud.fields["w"].tolist() == vertices["w"].tolist()
-    vertices["n"][4] = 2
-    path.write_bytes(header + cameras.tobytes() + vertices.tobytes())
-    with pytest.raises(FormatError, match="expected lists of one length in element vertex"):
-        read_cloud(path)
 
 
 @pytest.mark.parametrize("order", ["ascii", *ORDERS])

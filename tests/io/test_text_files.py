@@ -83,10 +83,6 @@ LEICA = "0 1.5 -2 {} 255 128 7\n3 4 1e3 {} 0 1 2\n"
     [
         ("0 1.5 -2\n3 4 1e3\n", ""),
         ("x y z i\n0 1.5 -2 7\n3 4 1e3 8\n", ""),
-        ("0 1.5 -2 7\n3 4 1e3 8\n", "x y z intensity"),
-        ("0 1.5 -2 7 9\n3 4 1e3 8 9\n", "x y z column_4 column_5"),
-        ("0 1.5 -2 7 9 255\n3 4 1e3 8 9 0\n", "x y z red green blue"),
-        ("0 1.5 -2 0 -1 0\n3 4 1e3 1 0 0\n", "x y z nx ny nz"),
         # Intensities as Cyclone writes them, and as programs that scale them do.
         (LEICA.format(-1640, 900), "x y z intensity red green blue"),
         (LEICA.format(0.5, 0.25), "x y z intensity red green blue"),

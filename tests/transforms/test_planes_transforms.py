@@ -83,17 +83,6 @@ def test_an_unknown_key_is_refused():
         SegmentPlanes("classic", keys={"points": "pos"})
 
 
-def test_normals_then_regions_with_the_residual_are_the_whole_method():
-    config = load_config("consensus")
-    sample = {"coord": make_room(4000, 0.003, 5).points}
-    steps = nn.Sequential(EstimateNormals(config.normals), GrowRegions(config.growing))
-    whole = SegmentPlanes(config)(sample)["plane"]
-    assert whole.max() >= 3
-    assert torch.equal(steps(sample)["plane"], whole)
-    with pytest.raises(ConfigError, match="residual"):
-        GrowRegions(config.growing)(EstimateNormals(config.normals, residual=False)(sample))
-
-
 def test_who_says_nothing_gets_the_same_everywhere():
     points = make_room(4000, 0.003, 5).points
     seg = segment_planes(points)
@@ -104,6 +93,8 @@ def test_who_says_nothing_gets_the_same_everywhere():
     assert torch.equal(seg.normals, fit.normals)
     for transform in (SegmentPlanes(), nn.Sequential(EstimateNormals(), GrowRegions())):
         assert torch.equal(transform({"coord": points})["plane"], seg.labels)
+    with pytest.raises(ConfigError, match="residual"):
+        GrowRegions()(EstimateNormals(residual=False)({"coord": points}))
     assert load_config() == PipelineConfig() == PipelineConfig(NormalsConfig(), GrowingConfig())
 
 

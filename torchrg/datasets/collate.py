@@ -66,19 +66,13 @@ def collate_offset(
     batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}
     if inverse in batch:
         starts = itertools.accumulate((len(s[coord]) for s in samples), initial=0)
-        batch[inverse] = torch.cat(
-            [_shifted(s[inverse], start) for s, start in zip(samples, starts, strict=False)]
-        )
+        rows = [as_tensor("collate_offset", "inverse", s[inverse]) for s in samples]
+        pairs = zip(rows, starts, strict=False)
+        batch[inverse] = torch.cat([torch.where(r >= 0, r + start, r) for r, start in pairs])
     if LISTED in batch:
         names = itertools.chain.from_iterable(listed_keys(s) or () for s in samples)
         batch[LISTED] = list(dict.fromkeys(names))
     return {**batch, "offset": torch.cat(counts).cumsum(0)}
-
-
-def _shifted(rows: object, start: int) -> Tensor:
-    """Return numbers of points in a sample as those in a batch, where it begins at ``start``."""
-    tensor = as_tensor("collate_offset", "inverse", rows)
-    return torch.where(tensor >= 0, tensor + start, tensor)
 
 
 def _join(key: str, values: Sequence[object]) -> object:

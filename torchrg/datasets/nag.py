@@ -77,7 +77,14 @@ def make_nag(
             f"make_nag: expected a superpoint of every point, got {without:,} points without one; "
             "take out points that are not finite first."
         )
-    make = _pyg_data() if data is None else data
+    if data is None:
+        try:
+            data = importlib.import_module("torch_geometric.data").Data
+        except ImportError as error:
+            raise MissingDependencyError(
+                "make_nag: torch_geometric is not installed; pip install torch_geometric, or pass "
+                "data."
+            ) from error
     entries: dict[str, Any] = {"pos": pos, **values}
     below = torch.arange(len(pos), device=pos.device)
     levels = []
@@ -85,7 +92,7 @@ def make_nag(
         labels, count = labels.to(pos.device), int(labels.max()) + 1 if len(labels) else 0
         # Every point of a node below is in one node here.
         super_index = labels.new_empty(len(entries["pos"])).index_copy(0, below, labels)
-        levels.append(make(**entries, super_index=super_index))
+        levels.append(data(**entries, super_index=super_index))
         order = super_index.argsort(stable=True)
         pointers = torch.bincount(super_index, minlength=count).cumsum(0)
         sizes = torch.bincount(labels, minlength=count)
@@ -93,15 +100,4 @@ def make_nag(
         mean = sums.index_add(0, labels, pos.double()) / sizes[:, None]
         sub = cluster(torch.nn.functional.pad(pointers, (1, 0)), order)
         entries, below = {"pos": mean.to(pos.dtype), "node_size": sizes, "sub": sub}, labels
-    return [*levels, make(**entries)]
-
-
-def _pyg_data() -> Callable[..., Any]:
-    """Return PyG's class of samples."""
-    try:
-        found: Callable[..., Any] = importlib.import_module("torch_geometric.data").Data
-    except ImportError as error:
-        raise MissingDependencyError(
-            "make_nag: torch_geometric is not installed; pip install torch_geometric, or pass data."
-        ) from error
-    return found
+    return [*levels, data(**entries)]

@@ -251,13 +251,10 @@ def _find(
 
 
 def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of TUM RGB-D [1], which are listed in ``depth.txt``.
+    """Yield the frames of TUM RGB-D, which are listed in ``depth.txt``.
 
-    Colour (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are those nearest in time,
-    within 0.02 seconds; without one, the frame has none.
-
-    References:
-        [1] J. Sturm et al. A benchmark for the evaluation of RGB-D SLAM systems. IROS, 2012.
+    Colour (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are those nearest in time;
+    without one, the frame has none.
     """
     lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
     times, images = read_timed(lists[0])
@@ -282,40 +279,47 @@ def _tum_camera(folder: Path) -> tuple[Tensor, tuple[Path, ...]]:
 
 
 def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of ICL-NUIM [1] in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
+    """Yield the frames of ICL-NUIM in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
 
     There is perhaps one trajectory ``*.gt.freiburg``, whose first column is the number of the
     image.
-
-    References:
-        [1] A. Handa et al. A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM. ICRA,
-        2014.
     """
     tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
     numbers, matrices = read_trajectory(tracks[0]) if tracks else ([], [])
     poses = {f"{number:.0f}": pose for number, pose in zip(numbers, matrices, strict=True)}
-    for image in _numbered_images(folder / "depth"):
-        color = _image_beside(folder / "rgb", image.stem)
-        yield ListedFrame(image.stem, image, color, poses.get(image.stem), tracks)
+    for name, image in _depth_images(folder, "depth/*"):
+        yield ListedFrame(name, image, _color_image(folder / "rgb" / name), poses.get(name), tracks)
+
+
+def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterator[ListedFrame]]:
+    """Return what yields frames by the names of their files, where ``*`` is that of the frame."""
+
+    def frames(folder: Path) -> Iterator[ListedFrame]:
+        for name, image in _depth_images(folder, depth):
+            path = folder / pose.replace("*", name)
+            known = (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
+            yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *known)
+
+    return frames
+
+
+def _depth_images(folder: Path, pattern: str) -> Iterator[tuple[str, Path]]:
+    """Yield names and depth images of a folder, in natural order; the pattern has no suffix."""
+    before, after = pattern.split("*")
+    for path in listed(folder / before):
+        if path.suffix.lower() in DEPTH_SUFFIXES and path.stem.endswith(after):
+            yield path.stem.removesuffix(after), path
+
+
+def _color_image(path: Path) -> Path | None:
+    """Return the colour image of a path without its suffix, None if there is none."""
+    paths = (path.with_name(f"{path.name}{suffix}") for suffix in _COLOR_SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _same_camera(*values: float) -> Camera:
     """Return what gives every recording the same fx, fy, cx, cy."""
     return lambda folder: (make_intrinsics(*values), ())
-
-
-def _scannet_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of ScanNet [1], as its reader exports it: ``depth/0.png``, ``color/0.jpg``.
-
-    Poses are in ``pose/0.txt``, ..., intrinsics in ``intrinsic/intrinsic_depth.txt``.
-
-    References:
-        [1] A. Dai et al. ScanNet: richly-annotated 3D reconstructions of indoor scenes. CVPR, 2017.
-    """
-    for image in _numbered_images(folder / "depth"):
-        color = _image_beside(folder / "color", image.stem)
-        pose = _read_pose(folder / "pose" / f"{image.stem}.txt")
-        yield ListedFrame(image.stem, image, color, *pose)
 
 
 def _scannet_camera(folder: Path) -> tuple[Tensor, tuple[Path, ...]]:
@@ -324,20 +328,6 @@ def _scannet_camera(folder: Path) -> tuple[Tensor, tuple[Path, ...]]:
     camera = read_matrix(calibration)[:3, :3]
     check_camera(str(calibration), camera)
     return camera, (calibration,)
-
-
-def _seven_scenes_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of 7-Scenes [1]: ``frame-000000.depth.png``, ``.color.png``, ``.pose.txt``.
-
-    References:
-        [1] J. Shotton et al. Scene coordinate regression forests for camera relocalization in RGB-D
-        images. CVPR, 2013.
-    """
-    for image in listed(folder):
-        name = image.name.removesuffix(".depth.png")
-        if name != image.name:
-            pose = _read_pose(folder / f"{name}.pose.txt")
-            yield ListedFrame(name, image, _image_beside(folder, f"{name}.color"), *pose)
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
@@ -353,9 +343,11 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
 LAYOUTS = {
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(_icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0),
-    "scannet": FrameLayout(_scannet_frames, "depth", _scannet_camera, 1000.0),
+    "scannet": FrameLayout(
+        _named_frames("depth/*", "color/*", "pose/*.txt"), "depth", _scannet_camera, 1000.0
+    ),
     "7-scenes": FrameLayout(
-        _seven_scenes_frames,
+        _named_frames("*.depth", "*.color", "*.pose.txt"),
         "frame-*.depth.png",
         _same_camera(*_SEVEN_SCENES_INTRINSICS),
         1000.0,
@@ -363,7 +355,10 @@ LAYOUTS = {
     ),
     "images": FrameLayout(_all_images),
 }
-"""Shapes of folders of frames by their names."""
+"""Shapes of folders of frames by their names: those of J. Sturm et al., A benchmark for the
+evaluation of RGB-D SLAM systems, IROS, 2012; A. Handa et al., A benchmark for RGB-D visual
+odometry, 3D reconstruction and SLAM, ICRA, 2014; A. Dai et al., ScanNet, CVPR, 2017, as its reader
+exports it; J. Shotton et al., Scene coordinate regression forests, CVPR, 2013; and any other."""
 
 
 def _recordings(root: Path, mark: str) -> Iterator[tuple[str, Path]]:
@@ -385,19 +380,3 @@ def _recordings(root: Path, mark: str) -> Iterator[tuple[str, Path]]:
     for folder in found:
         name = (folder.resolve() if folder == root else folder).name
         yield f"{name}/", folder
-
-
-def _numbered_images(folder: Path) -> list[Path]:
-    """Return the depth images of a folder in natural order."""
-    return [path for path in listed(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
-
-
-def _image_beside(folder: Path, stem: str) -> Path | None:
-    """Return the colour image of a name, None if there is none."""
-    paths = (folder / f"{stem}{suffix}" for suffix in _COLOR_SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
-
-
-def _read_pose(path: Path) -> tuple[Tensor | None, tuple[Path, ...]]:
-    """Return the pose in a file, None if it is not known, and the file if it is there."""
-    return (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())

@@ -149,11 +149,8 @@ def known_pose(matrix: Tensor) -> Tensor | None:
 
 def read_timed(path: Path) -> tuple[list[float], list[str]]:
     """Read rows of a time and a file name; return times, ascending, and names."""
-    rows = _rows(path, 2, "a time and a file name")
-    times = [row[0] for row in _numbers(path, [[row[0]] for row in rows])]
-    _check_times(path, times)
-    order = sorted(range(len(times)), key=times.__getitem__)
-    return [times[i] for i in order], [rows[i][1] for i in order]
+    rows = _rows_by_time(path, 2, "a time and a file name")
+    return [float(time) for time, _ in rows], [name for _, name in rows]
 
 
 def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
@@ -162,21 +159,12 @@ def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
     Poses are matrices from camera to world, shape ``(4, 4)``, float64, or None; see
     :func:`known_pose`.
     """
-    rows = _rows(path, 8, "time tx ty tz qx qy qz qw")
+    rows = _rows_by_time(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
-    _check_times(path, values[:, 0].tolist())
-    values = values[values[:, 0].argsort(stable=True)]
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
     poses[:, :3, :3] = _rotations(values[:, 4:])
     poses[:, :3, 3] = values[:, 1:4]
     return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
-
-
-def _check_times(path: Path, times: Sequence[float]) -> None:
-    """Refuse times that come neither before nor after others."""
-    wrong = next((time for time in times if not math.isfinite(time)), None)
-    if wrong is not None:
-        raise FormatError(f"{path}: expected finite times, got {wrong}; repair or delete its row.")
 
 
 def read_nearest(
@@ -214,12 +202,16 @@ def _rotations(quaternions: Tensor) -> Tensor:
     return matrices
 
 
-def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
-    """Return the words of each row, which are so many."""
+def _rows_by_time(path: Path, num_words: int, what: str) -> list[list[str]]:
+    """Return the words of each row, which are so many, by the time that the first of them is."""
     rows = _words(path)
     if not rows or any(len(row) != num_words for row in rows):
         raise FormatError(f"{path}: expected {what} in each row.")
-    return rows
+    times = [time for (time,) in _numbers(path, [row[:1] for row in rows])]
+    wrong = next((time for time in times if not math.isfinite(time)), None)
+    if wrong is not None:
+        raise FormatError(f"{path}: expected finite times, got {wrong}; repair or delete its row.")
+    return [rows[i] for i in sorted(range(len(rows)), key=times.__getitem__)]
 
 
 def _words(path: Path) -> list[list[str]]:

@@ -12,6 +12,7 @@ import os
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,10 +80,9 @@ class Room(NamedTuple):
 class S3DIS(SceneDataset):
     """The rooms of S3DIS, read from ``ROOT/Area_i/<room>/Annotations/*.txt``, aligned or not.
 
-    A sample has ``coord`` ``(N, 3)`` float32 in metres, ``color`` ``(N, 3)`` uint8, ``segment``
-    ``(N,)`` int64 (a place in ``classes``), ``instance`` ``(N,)`` int64 (the object, counted
-    from zero in natural order of the file names), and ``name``, as in ``Area_1/office_1``. Points
-    are in the order of the objects, not in that of the room's own text file.
+    A sample has ``coord``, ``color``, ``segment`` and ``instance`` of a :class:`Room`, the last two
+    as int64, and ``name``, as in ``Area_1/office_1``. Points are in the order of the objects, not
+    in that of the room's own text file.
 
     The text is read each time, and nothing is written; ``torchrg convert s3dis`` writes arrays,
     which :class:`torchrg.datasets.FolderOfClouds` reads at once.
@@ -203,10 +203,9 @@ def class_names(class_order: str) -> tuple[str, ...]:
 
 def object_files(room: Path) -> tuple[Path, ...]:
     """Return the files of a room's objects; none of a broken room, which fails when it is read."""
-    try:
+    with suppress(FormatError):
         return tuple(file for _, file in _list_room(room)[0])
-    except FormatError:
-        return ()
+    return ()
 
 
 def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:

@@ -196,10 +196,9 @@ def read_objects(mesh: Path, count: int) -> list[tuple[dict[str, Any], NDArray[n
     if not {"segments", "groups"} <= files.keys():
         return None
     most = np.iinfo(np.int32).max
-    by_id, by_object = (_groups(files, count, key, most) for key in ("id", "objectId"))
     return [
         ({"id": number, "objectId": other, "label": label}, rows)
-        for (label, number, rows), (_, other, _) in zip(by_id, by_object, strict=True)
+        for label, (number, other), rows in _groups(files, count, ("id", "objectId"), most)
     ]
 
 
@@ -216,9 +215,9 @@ def _scene(root: Path, mesh: Path) -> SceneFiles:
     """Return a scan with its input files, named without its split."""
     is_plus = mesh.name == MESH_PLUSPLUS
     name = mesh.parent.parent.name if is_plus else mesh.parent.name
-    tables = ("map_benchmark.csv", "top100.txt") if is_plus else (CATEGORIES,)
-    found = [path for table in tables if (path := _find(root, table))]
-    return SceneFiles(name, mesh, (mesh, *_files_of(mesh).values(), *found))
+    names = ("map_benchmark.csv", "top100.txt") if is_plus else (CATEGORIES,)
+    tables = filter(None, (_find(root, table) for table in names))
+    return SceneFiles(name, mesh, (mesh, *_files_of(mesh).values(), *tables))
 
 
 def _files_of(mesh: Path) -> dict[str, Path]:
@@ -293,7 +292,7 @@ def _labels(files: Mapping[str, Path], root: Path, count: int) -> Arrays:
     if "groups" in files and "segments" in files:
         instance = np.full(count, _NONE, dtype=np.int64)
         numbers = np.zeros((count, 2), dtype=np.int64)
-        for label, number, rows in _groups(files, count, "id", np.iinfo(np.int32).max):
+        for label, (number,), rows in _groups(files, count, ["id"], np.iinfo(np.int32).max):
             instance[rows] = number
             numbers[rows] = words.get(label, (0, 0))
         found["instance"] = instance
@@ -329,7 +328,7 @@ def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
     instance = segment.copy()
     sizes = np.full(segment.shape, np.inf)
     used = np.zeros(count, dtype=np.int64)
-    for word, number, inside in _groups(files, count, "objectId", np.iinfo(np.int16).max):
+    for word, (number,), inside in _groups(files, count, ["objectId"], np.iinfo(np.int16).max):
         label = classes.get(renamed.get(word, ""))
         rows = inside[used[inside] < _MOST_LABELS]
         if label is None or not len(rows):
@@ -346,11 +345,11 @@ def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
 
 
 def _groups(
-    files: Mapping[str, Path], count: int, key: str, most: int
-) -> Iterator[tuple[str, int, NDArray[np.integer]]]:
-    """Yield label and number of each object of an annotation with the rows of its vertices.
+    files: Mapping[str, Path], count: int, keys: Sequence[str], most: int
+) -> Iterator[tuple[str, list[int], NDArray[np.integer]]]:
+    """Yield label and numbers of each object of an annotation with the rows of its vertices.
 
-    The number is under a key, and at most so large.
+    The numbers are under some keys, and at most so large.
     """
     path = files["segments"]
     segments = _read_list(path, "segIndices")
@@ -362,24 +361,18 @@ def _groups(
     of_vertices = _whole(path, "segIndices", segments)
     path = files["groups"]
     for place, group in enumerate(_read_list(path, "segGroups")):
-        label, number, own = (
-            group.get(name) if isinstance(group, dict) else None
-            for name in ("label", key, "segments")
-        )
-        if not (
-            isinstance(label, str)
-            and type(number) is int
-            and 0 <= number <= most
-            and isinstance(own, list)
-        ):
+        entries = group if isinstance(group, dict) else {}
+        label, own = entries.get("label"), entries.get("segments")
+        found = [entries.get(key) for key in keys]
+        numbers = [n for n in found if type(n) is int and 0 <= n <= most]
+        if not (isinstance(label, str) and isinstance(own, list) and len(numbers) == len(keys)):
             raise FormatError(
-                f"{path}: object {place}: expected a label, a number from 0 to {most:,} as {key}, "
-                f"and a list of segments, got {shortened(group)}; fetch it again."
+                f"{path}: object {place}: expected a label, a number from 0 to {most:,} as "
+                f"{' and '.join(keys)}, and a list of segments, got {shortened(group)}; fetch it "
+                "again."
             )
-        rows = np.flatnonzero(
-            np.isin(of_vertices, _whole(path, f"segments of object {place}", own))
-        )
-        yield label, number, rows
+        whole = _whole(path, f"segments of object {place}", own)
+        yield label, numbers, np.flatnonzero(np.isin(of_vertices, whole))
 
 
 def _read_list(path: Path, key: str) -> list[Any]:

@@ -1,8 +1,7 @@
 """Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,12 +40,10 @@ class Format(NamedTuple):
     """How a kind of file is read and written; a new kind is a file, a row of FORMATS, and a test.
 
     Attributes:
-        read: Reads a file of so many bytes, not 0. Raises FormatError if it is damaged. Where
-            columns can be without names, these come third.
+        read: Reads a file of so many bytes, not 0; names of columns come third.
         count: Returns the number of points by the header of a file of so many bytes, or about their
             number by its size, in no time. May raise anything of a damaged file.
-        write: Writes a cloud. Raises FormatError if the format cannot hold it. None for a kind that
-            is read only.
+        write: Writes a cloud; None for a kind that is read only.
         check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
         takes_columns: Whether columns can be without names.
     """
@@ -111,30 +108,23 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
     source = Path(path)
-    with _reporting_unreadable(source), np.errstate(over="ignore", invalid="ignore"):
-        # Files may hold any bits as numbers: those that overflow or signal are kept, not reported.
-        size, found = check_file(source), _format_of(source)
-        if columns is None:
-            return found.read(source, size)
-        if not found.takes_columns:
-            raise FormatError(
-                f"{source}: expected text or .npy for names of columns, got a file that has its "
-                "own; leave them out."
-            )
-        return found.read(source, size, columns)
-
-
-@contextmanager
-def _reporting_unreadable(path: Path) -> Iterator[None]:
-    """Raise errors of the operating system, and of memory, as a FormatError that names the file."""
+    size, found = check_file(source), _format_of(source)
+    if columns is not None and not found.takes_columns:
+        raise FormatError(
+            f"{source}: expected text or .npy for names of columns, got a file that has its own; "
+            "leave them out."
+        )
+    names = () if columns is None else (columns,)
     try:
-        yield
+        # Files may hold any bits as numbers: those that overflow or signal are kept, not reported.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return found.read(source, size, *names)
     except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from error
+        raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
     except MemoryError as error:
         raise FormatError(
-            f"{path}: its points do not fit into memory; use a machine with more, or cut the cloud "
-            "into parts."
+            f"{source}: its points do not fit into memory; use a machine with more, or cut the "
+            "cloud into parts."
         ) from error
 
 

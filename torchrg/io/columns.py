@@ -50,7 +50,7 @@ def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, Val
         values = _storable(path, name, values, spelling)
         if name in _LABELS:
             values = narrow_integers(values, ("i4",))
-        for column_name, column in _spread(name, values, spelling):
+        for column_name, column in _spread(name, values, spelling).items():
             if column_name in columns:
                 raise FormatError(
                     f"{path}: expected fields of different names, got {column_name!r} twice; "
@@ -94,24 +94,18 @@ def _storable(path: Path, name: str, values: Values, spelling: Spelling) -> Valu
     return values if spelling.color_bits == 16 else np.rint(values / WIDEN).astype(np.uint8)
 
 
-def _spread(name: str, values: Values, spelling: Spelling) -> list[tuple[str, Values]]:
+def _spread(name: str, values: Values, spelling: Spelling) -> dict[str, Values]:
     """Cut a field into named columns."""
-    names = _spell(name, values.shape[1:], spelling)
-    parts = [values.reshape(-1)] if values.shape[1:] == (1,) else [values]
-    if len(names) > 1:
-        parts = [values[:, i] for i in range(len(names))]
-    return list(zip(names, parts, strict=True))
-
-
-def _spell(name: str, row_shape: tuple[int, ...], spelling: Spelling) -> tuple[str, ...]:
-    """Return the names of the columns of a field of which rows have a shape."""
     word = (name if spelling.blanks else "_".join(name.split())) or "field"
-    if row_shape in ((), (1,)):
-        return ({"labels": "label", "curvature": spelling.curvature}.get(name, word),)
+    if values.shape[1:] in ((), (1,)):
+        word = {"labels": "label", "curvature": spelling.curvature}.get(name, word)
+        return {word: values.reshape(-1)}
     triples = {"normals": spelling.normals, "color": spelling.color}
-    if name in triples and row_shape == (3,):
-        return triples[name]
-    return (word,) if spelling.vectors else tuple(f"{word}_{i}" for i in range(row_shape[0]))
+    if name in triples and values.shape[1] == 3:
+        return dict(zip(triples[name], values.T, strict=True))
+    if spelling.vectors:
+        return {word: values}
+    return {f"{word}_{i}": column for i, column in enumerate(values.T)}
 
 
 def check_exact(path: Path, columns: Columns) -> None:

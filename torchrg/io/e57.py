@@ -9,6 +9,7 @@ coordinate system are read.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate, pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -109,10 +110,10 @@ def read_e57(path: Path, size: int) -> Cloud:
         system = root[_SYSTEM_NODE].value() if root.isDefined(_SYSTEM_NODE) else ""
         num_pictures = len(root["images2D"]) if root.isDefined("images2D") else 0
     names = dict.fromkeys(name for block in blocks for name in block)
-    lacks = [[name for name in names if name not in block] for block in blocks]
+    lacks = [names.keys() - block.keys() for block in blocks]
     notes: tuple[str, ...] = ()
     if any(lacks):
-        missing = ", ".join(dict.fromkeys(name for each in lacks for name in each))
+        missing = ", ".join(name for name in names if any(name in each for each in lacks))
         notes = (f"{sum(map(bool, lacks))} of {len(scans)} scans lack {missing}, zero there",)
     if num_pictures:
         notes += (f"pictures left out: {num_pictures}",)
@@ -143,17 +144,14 @@ def _joined(blocks: Sequence[_Block], name: str, counts: Sequence[int]) -> Value
 
 def _rows_of_scans(counts: Sequence[int]) -> list[slice]:
     """Return the rows of each scan."""
-    return [
-        slice(stop - count, stop)
-        for stop, count in zip(np.cumsum(counts).tolist(), counts, strict=True)
-    ]
+    return [slice(*ends) for ends in pairwise(accumulate(counts, initial=0))]
 
 
 def _fronts(scans: Sequence[ScanPose], counts: Sequence[int], cloud: Cloud) -> Fronts:
     """Return the direction from each point to its scanner, and whose place is no scanner's.
 
-    Programs that know no poses write one that moves nothing, or use it to keep coordinates small.
-    The first kind is known by being that of all scans, the second by a place outside of the points.
+    Programs that know no poses write one that moves nothing, which all scans have then, or use it
+    to keep coordinates small, with a place outside of the points.
     """
     if not any(scan.is_moved for scan in scans) or not cloud.finite.any():
         return None, ()
@@ -249,16 +247,12 @@ def _to_world(path: Path, block: _Block, scan: ScanPose) -> _Block:
             points[block.pop(name) != 0] = np.nan
     if scan.is_moved and all(name in block for name in _NORMALS):
         normals = np.stack([block[name] for name in _NORMALS], axis=1)
-        turned = scan.turn(normals).astype(normals.dtype)
-        block.update(zip(_NORMALS, turned.T, strict=True))
-    plain = Counter(map(_plain, block))
-    named = {_plain(name) if plain[_plain(name)] == 1 else name: c for name, c in block.items()}
+        block.update(zip(_NORMALS, scan.turn(normals).astype(normals.dtype).T, strict=True))
+    # The extension that a field belongs to is no part of its name, unless two have one name.
+    plain = {name: _CHANNELS.get(name, name.rpartition(":")[2]) for name in block}
+    times = Counter(plain.values())
+    named = {plain[name] if times[plain[name]] == 1 else name: c for name, c in block.items()}
     return {**named, **dict(zip("xyz", scan.to_world(points).T, strict=True))}
-
-
-def _plain(name: str) -> str:
-    """Return the name of a column by that of a field, without the extension it belongs to."""
-    return _CHANNELS.get(name, name.rpartition(":")[2])
 
 
 def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,32 +4,24 @@ A face is a list of three or more vertices, counter-clockwise as seen from its f
 kept of it but what it adds to sums at its vertices.
 """
 
-import sys
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchrg.errors import FormatError
 
 Fronts = tuple[NDArray[np.float32] | None, tuple[str, ...]]
 """Front of each point of a cloud, as :attr:`torchrg.Cloud.front`, and notes on it."""
 _CORNERS_AT_ONCE = 1 << 18
 """Corners of faces that are added up together, which take some tens of megabytes."""
-_FACES_AT_ONCE = 1 << 16
-"""Faces with lists of different lengths that are in memory together."""
-_LONGEST_LIST = 1 << 20
-"""Bytes, or words of text, of the longest list; a longer one is taken for damage."""
 _LEAST_AGREEMENT = 1e-3
 """Least length of a sum of normals as a share of the areas. A shorter one is rounding, as where
 each face is there twice, once for each of its sides."""
 
 
-class BrokenFacesError(Exception):
-    """A list of faces is not what it should be; the text says what is wrong with it."""
-
-
 def find_fronts(
-    faces: Iterable[NDArray[np.int64]],
+    faces: Iterable[NDArray[np.number]],
     coordinates: NDArray[np.floating],
     finite: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
@@ -46,7 +38,7 @@ def find_fronts(
         Unit vectors, shape ``(N, 3)``; zero where no face has the vertex, or its faces cancel.
 
     Raises:
-        BrokenFacesError: If a face has a vertex that there is not.
+        FormatError: If a face has a vertex that there is not.
 
     Example:
         >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -55,17 +47,17 @@ def find_fronts(
     """
     places, count = coordinates.astype(np.float64, copy=False), len(coordinates)
     sums, areas = np.zeros((3, count)), np.zeros(count)
-    for part in faces:
+    for part in (block.astype(np.int64) for block in faces):
         if part.size and not 0 <= part.min() <= part.max() < count:
             wrong = part.min() if part.min() < 0 else part.max()
-            raise BrokenFacesError(f"vertex {wrong:,} of {count:,}")
+            raise FormatError(f"expected faces of {count:,} vertices, got vertex {wrong:,}")
         at_once = max(_CORNERS_AT_ONCE // max(part.shape[1], 1), 1)
         for start in range(0, len(part) if part.shape[1] > 2 else 0, at_once):
-            some = part[start : start + at_once]
-            some = some[finite[some].all(axis=1)]
-            normals = _vector_areas(places, some)
+            block = part[start : start + at_once]
+            block = block[finite[block].all(axis=1)]
+            normals = _vector_areas(places, block)
             sizes = np.linalg.norm(normals, axis=1)
-            for corner in some.T:
+            for corner in block.T:
                 np.add.at(areas, corner, sizes)
                 for total, values in zip(sums, normals.T, strict=True):
                     np.add.at(total, corner, values)
@@ -84,31 +76,3 @@ def _vector_areas(places: NDArray[np.float64], faces: NDArray[np.int64]) -> NDAr
         normals += np.cross(last, arm)
         last = arm
     return normals
-
-
-def stack_faces(faces: Iterable[Sequence[float]], count: int) -> Iterator[NDArray[np.int64]]:
-    """Yield so many faces, those with equally many corners together, shape ``(n, corners)``.
-
-    Raises:
-        BrokenFacesError: If there are fewer faces.
-
-    Example:
-        >>> [part.shape for part in stack_faces([(0, 1, 2), (0, 1, 2, 3), (2, 1, 0)], 3)]
-        [(2, 3), (1, 4)]
-    """
-    rest = islice(faces, min(count, sys.maxsize))
-    while block := list(islice(rest, _FACES_AT_ONCE)):
-        count -= len(block)
-        for length in sorted({len(face) for face in block}):
-            same = [face for face in block if len(face) == length]
-            # Not a number becomes a vertex that there is not.
-            yield np.array(same, np.float64).reshape(len(same), length).astype(np.int64)
-    if count:
-        raise BrokenFacesError(f"{count:,} are missing")
-
-
-def check_list(length: float, num_bytes: int) -> int:
-    """Return the length of a list of items of so many bytes, which is none that is damage."""
-    if not 0 <= length * num_bytes <= _LONGEST_LIST:
-        raise BrokenFacesError(f"a list of {length:,}")
-    return int(length)

@@ -80,8 +80,7 @@ def assemble_cloud(
 ) -> Cloud:
     """Build a cloud from columns by the file's own names.
 
-    ``x``, ``y`` and ``z`` are among them unless ``coordinates`` names the column that holds all
-    three.
+    ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, where these are no columns.
     """
     rest = dict(columns)
     if coordinates is None:
@@ -98,7 +97,7 @@ def assemble_cloud(
         places = rest.pop(coordinates)
     points = checked_coordinates(path, places)
     fields = {
-        name: _joined(path, [rest[part] for part in parts])
+        name: _stacked(path, [rest[part] for part in parts])
         for name, parts in _sources_of(rest).items()
     }
     for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
@@ -234,21 +233,18 @@ def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
 
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
     """Check names that are given for columns: one for each, and each once but for ``_``."""
-    kept = [name for name in names if name != LEFT_OUT]
-    if not {"x", "y", "z"} <= {name.lower() for name in kept} or len(set(kept)) != len(kept):
-        raise FormatError(
-            f"{path}: expected names of columns that differ, x, y and z among them, got "
-            f"{','.join(names)}; {LEFT_OUT} leaves a column out."
-        )
-    if len(names) != num_columns:
-        raise FormatError(
-            f"{path}: expected names for {num_columns} columns, got {len(names)} "
-            f"({','.join(names)}); {LEFT_OUT} leaves a column out."
-        )
+    read, shown = [name for name in names if name != LEFT_OUT], ",".join(names)
+    if not {"x", "y", "z"} <= {name.lower() for name in read} or len(set(read)) != len(read):
+        wrong = f"names of columns that differ, x, y and z among them, got {shown}"
+    elif len(names) != num_columns:
+        wrong = f"names for {num_columns} columns, got {len(names)} ({shown})"
+    else:
+        return
+    raise FormatError(f"{path}: expected {wrong}; {LEFT_OUT} leaves a column out.")
 
 
 def _check_table(path: Path, table: Values) -> None:
-    """Refuse tables of numbers without names that are no points: a pose, or points across."""
+    """Refuse tables without names that are no points: a pose, or points across."""
     num_rows, num_columns = table.shape
     if table.shape == (4, 4) and table[3].tolist() == [0, 0, 0, 1]:
         raise FormatError(
@@ -290,13 +286,6 @@ def _sources_of(columns: Columns) -> dict[str, list[str]]:
     return fields
 
 
-def _joined(path: Path, parts: list[Values]) -> Values:
-    """Return several single columns as one field, or one column as it is, in native byte order."""
-    if len(parts) > 1:
-        return _stacked(path, parts)
-    return np.ascontiguousarray(parts[0], dtype=parts[0].dtype.newbyteorder("="))
-
-
 def _free_name(name: str, values: Values, taken: Collection[str]) -> str:
     """Return torchrg's name for a column if its shape fits and no other has it yet."""
     target = _ALIASES.get(_plain(name), name.removeprefix("scalar_") or name)
@@ -330,7 +319,9 @@ def _numbered(columns: Columns) -> dict[str, list[str]]:
 
 
 def _stacked(path: Path, columns: list[Values]) -> Values:
-    """Put single columns side by side, in native byte order."""
+    """Put single columns side by side, or return one as it is, in native byte order."""
+    if len(columns) == 1:
+        return np.ascontiguousarray(columns[0], dtype=columns[0].dtype.newbyteorder("="))
     try:
         dtype = np.result_type(*columns)
     except TypeError as error:
@@ -350,8 +341,8 @@ def _labels(path: Path, labels: Values) -> NDArray[np.int64]:
     flat = labels.reshape(-1) if labels.shape[1:] == (1,) else labels
     if flat.ndim != 1 or flat.dtype.kind not in "biuf":
         raise FormatError(
-            f"{path}: expected one whole number a point as labels, got shape {_row_text(labels)} "
-            f"of {labels.dtype}; rename or remove that field."
+            f"{path}: expected one whole number a point as labels, got shape "
+            f"{_row_shape(labels)} of {labels.dtype}; rename or remove that field."
         )
     if flat.dtype.kind == "f":
         flat = np.where(np.isnan(flat), flat.dtype.type(UNLABELED), flat)
@@ -400,15 +391,15 @@ def _color(path: Path, color: Values) -> Values:
     return narrow
 
 
-def _row_text(values: Values) -> str:
-    """Return the shape of a field for a message, without the number of points."""
-    return f"({', '.join(['N', *map(str, values.shape[1:])])})"
-
-
 def _check_triples(path: Path, name: str, values: Values) -> None:
     """Check that a field is three real numbers a point."""
     if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
         raise FormatError(
-            f"{path}: expected {name} to be three numbers a point, got shape {_row_text(values)} "
+            f"{path}: expected {name} to be three numbers a point, got shape {_row_shape(values)} "
             f"of {values.dtype}; rename or remove that field."
         )
+
+
+def _row_shape(values: Values) -> str:
+    """Return the shape of a field for a message, without the number of points."""
+    return f"({', '.join(['N', *map(str, values.shape[1:])])})"

@@ -8,7 +8,7 @@ came with keep their name, type, scale, offset, value for no data and descriptio
 import copy
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -92,16 +92,14 @@ def read_las(path: Path, size: int) -> Cloud:
     extra = header.point_format.extra_dimensions
     ours = {dim.name for dim in extra if dim.description == _UNFIT_DESCRIPTION}
     columns = {
-        name.removesuffix(_UNFIT) if name in ours else name: _joined(parts, name)
+        # Taken out of the parts, so that a column is not there twice for long.
+        name.removesuffix(_UNFIT) if name in ours else name: np.concatenate(
+            [part.pop(name) for part in parts]
+        )
         for name in names
         if name not in unused
     }
     return assemble_cloud(path, columns, header={"las": header})
-
-
-def _joined(parts: Sequence[dict[str, Values]], name: str) -> Values:
-    """Return a column of all parts, and take it out of them."""
-    return np.concatenate([part.pop(name) for part in parts])
 
 
 @contextmanager

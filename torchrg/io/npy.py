@@ -12,7 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -43,7 +43,8 @@ from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Supe
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
 _COORDINATES = ("points", "coord")
-_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
+POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
+"""What a segmentation says of each point."""
 _NOT_PER_POINT = {
     *(f"plane_{name}" for name in (*Planes._fields, "of_superpoint")),
     *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
@@ -161,7 +162,7 @@ def write_npz(
                 )
             arrays[name] = values
     else:
-        arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in _RESULTS}
+        arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in POINT_RESULTS}
         arrays |= planes_to_arrays(segmentation.planes, cloud.origin)
     if superpoints is not None:
         for name, level in superpoints.by_level().items():
@@ -226,10 +227,17 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _refusing_member(path: Path, name: str) -> AbstractContextManager[None]:
-    """Raise what reading a member raises as an error that names it."""
-    message = f"{path}: {f'{name}.npy'!r}: "
-    return refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again")
+@contextmanager
+def _open_member(
+    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
+) -> Iterator[IO[bytes]]:
+    """Open an array of an archive; errors name both."""
+    message = f"{path}: {member.filename!r}: "
+    with (
+        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again"),
+        archive.open(member) as stream,
+    ):
+        yield stream
 
 
 def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, _Layout]:
@@ -243,17 +251,18 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
                 f"{path}: expected {member.filename!r} stored or deflated, got compression "
                 f"{member.compress_type}; write it with numpy.savez."
             )
-        content, name = repr(member.filename), member.filename.removesuffix(".npy")
+        content = repr(member.filename)
         most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
         check_promise(path, member.header_offset, member.file_size, content, available=most)
-        with _refusing_member(path, name), archive.open(member) as stream:
+        with _open_member(path, archive, member) as stream:
+            name = member.filename.removesuffix(".npy")
             layouts[name] = _check_array(path, stream, member.file_size, content)
     return layouts
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
     """Read one array of an archive, and on to its end, where its checksum is compared."""
-    with _refusing_member(path, name), archive.open(f"{name}.npy") as stream:
+    with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
         values: Values = npy_format.read_array(stream, allow_pickle=False)
         while stream.read(_BYTES_AT_ONCE):
             pass

@@ -5,17 +5,12 @@ meshio reads ``uchar`` as signed, knows no ``short``, ends the process at elemen
 and face, and takes the memory a header promises; trimesh writes float32 and drops fields.
 """
 
-import struct
-import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.columns import (
@@ -26,10 +21,10 @@ from torchrg.io.columns import (
     slices,
     write_records,
 )
-from torchrg.io.faces import BrokenFacesError, Fronts, check_list, find_fronts, stack_faces
+from torchrg.io.faces import Fronts, find_fronts
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import check_promise
-from torchrg.io.text import read_rows, words_of
+from torchrg.io.text import read_rows, skip_lines, words_of
 from torchrg.structures import Cloud
 
 _TYPES = {
@@ -47,8 +42,6 @@ _NUMPY_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", 
 _READ_TYPES = _TYPES | {
     name: np.dtype(name).str[1:] for name in (*_NUMPY_NAMES, "float32", "float64")
 }
-_LETTERS = {code: np.dtype(code).char for code in _TYPES.values()} | {"i8": "q", "u8": "Q"}
-"""Letters of the module struct by NumPy's codes."""
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
 """Bytes of the longest header; a longer one is taken for damage."""
@@ -57,9 +50,7 @@ _LONGEST_LIST = 1 << 20
 _CORNERS = ("vertex_indices", "vertex_index")
 """Names of the list of a face's vertices."""
 _BYTES_AT_ONCE = 1 << 22
-"""Bytes of faces that are read together."""
-_SHOWN = 60
-"""Characters of what is wrong in a text that are told."""
+"""Bytes of records with lists that are read together."""
 _LENGTH, _LIST = " length", " list"
 """Ends of the names of a list and its length in records. Names in a PLY file have no spaces, so
 that no property is called so."""
@@ -68,7 +59,8 @@ that no property is called so."""
 def read_ply(path: Path, size: int) -> Cloud:
     """Read a PLY file: every property of the element ``vertex``, and its front by the faces.
 
-    Other elements are left out, and so are faces that come before the vertices.
+    Other elements are left out, and so are faces that come before the vertices, or that have
+    different numbers of corners.
     """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
@@ -94,7 +86,7 @@ def read_ply(path: Path, size: int) -> Cloud:
         return cloud
     del records, columns
     mesh = header._replace(elements=header.elements[: face + 1])
-    front, more = _fronts(path, mesh, vertex, size, cloud)
+    front, more = _fronts(path, mesh, size, cloud)
     return replace(cloud, front=front, notes=notes + more)
 
 
@@ -234,46 +226,42 @@ def _shown(raw: bytes) -> str:
 
 def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the last of the elements of a binary file."""
-    *before, vertex = header.elements
-    start = _pass_elements(path, stream, header, before, size)
-    dtype = _check_element(path, stream, vertex, header.byte_order, start, size)
-    records = np.fromfile(stream, dtype, count=vertex.num_records)
-    _check_lists(path, vertex, records)
+    dtype = _go_to_last(path, stream, header, size)
+    records = np.fromfile(stream, dtype, count=header.elements[-1].num_records)
+    _check_lists(path, header.elements[-1], records)
     return records
 
 
-def _pass_elements(
-    path: Path, stream: BinaryIO, header: _Header, elements: list[_Element], size: int
-) -> int:
-    """Return the byte behind the first elements of a binary file, whose records have one size."""
+def _go_to_last(path: Path, stream: BinaryIO, header: _Header, size: int) -> np.dtype[np.void]:
+    """Go to the last of the elements of a binary file, and return the type of its records."""
+    *before, last = header.elements
     start = header.num_bytes
-    for element in elements:
+    for element in before:
         dtype = _check_element(path, stream, element, header.byte_order, start, size)
         if any(prop.length_code for prop in element.properties):
-            at_once = max(_BYTES_AT_ONCE // dtype.itemsize, 1)
-            for rows in slices(element.num_records, at_once):
-                records = np.fromfile(stream, dtype, count=rows.stop - rows.start)
-                _check_lists(path, element, records)
+            for _ in _blocks(path, stream, element, dtype):
+                pass
         start += element.num_records * dtype.itemsize
-    return start
+    return _check_element(path, stream, last, header.byte_order, start, size)
+
+
+def _blocks(
+    path: Path, stream: BinaryIO, element: _Element, dtype: np.dtype[np.void]
+) -> Iterator[Values]:
+    """Yield the records of an element of a binary file, many at a time."""
+    for rows in slices(element.num_records, max(_BYTES_AT_ONCE // dtype.itemsize, 1)):
+        records = np.fromfile(stream, dtype, count=rows.stop - rows.start)
+        _check_lists(path, element, records)
+        yield records
 
 
 def _check_element(
     path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
 ) -> np.dtype[np.void]:
-    """Return the type of the records of an element, all of which are there; go to the first."""
-    dtype = _record_type(path, stream, element, byte_order, start, size)
-    promised = element.num_records * dtype.itemsize
-    content = f"{element.num_records:,} records of {element.name}"
-    check_promise(path, start, promised, content, available=size - start)
-    stream.seek(start)
-    return dtype
+    """Return the type of the records of an element, all of which are there; go to the first.
 
-
-def _record_type(
-    path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
-) -> np.dtype[np.void]:
-    """Return the type of a record; lists have the length that the first record gives them."""
+    Lists have the length that the first record gives them.
+    """
     parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for prop in element.properties:
         code = byte_order + prop.code
@@ -290,137 +278,88 @@ def _record_type(
                 f"{length:,}; the file is damaged, fetch it again."
             )
         parts.append((prop.name + _LIST, code, (length,)))
-    return np.dtype(parts)
+    dtype = np.dtype(parts)
+    promised = element.num_records * dtype.itemsize
+    content = f"{element.num_records:,} records of {element.name}"
+    check_promise(path, start, promised, content, available=size - start)
+    stream.seek(start)
+    return dtype
 
 
 def _check_lists(path: Path, element: _Element, records: Values) -> None:
     """Check that the lists of an element all have one length, so that records have one size."""
-    if not _have_one_length(records):
-        raise FormatError(
-            f"{path}: expected lists of one length in element {element.name}, which comes "
-            "with or before the vertices; write the vertices first and without lists."
-        )
+    for name in (name for name in records.dtype.names or () if name.endswith(_LENGTH)):
+        (length,) = records.dtype[name.removesuffix(_LENGTH) + _LIST].shape
+        if (records[name] != length).any():
+            raise _lists_differ(path, element)
 
 
-def _have_one_length(records: Values) -> bool:
-    """Return whether each list has in all records the length that its type says."""
-    names = [name for name in records.dtype.names or () if name.endswith(_LENGTH)]
-    lengths = [records.dtype[name.removesuffix(_LENGTH) + _LIST].shape[0] for name in names]
-    return all((records[n] == k).all() for n, k in zip(names, lengths, strict=True))
+def _lists_differ(path: Path, element: _Element) -> FormatError:
+    """Return the error that the lists of an element have several lengths."""
+    return FormatError(
+        f"{path}: expected lists of one length in element {element.name}; write the vertices "
+        "first and without lists, and only triangles as faces."
+    )
 
 
 def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
-    """Read the last of the elements of an ASCII file."""
+    """Read the last of the elements of an ASCII file, the vertices."""
     *before, vertex = header.elements
     if any(prop.length_code for prop in vertex.properties):
         raise FormatError(
             f"{path}: expected vertices without lists in an ASCII file; write it as binary."
         )
-    return read_rows(
-        path,
-        stream,
-        np.dtype([(prop.name, prop.code) for prop in vertex.properties]),
-        vertex.num_records,
-        "vertices",
-        line_number=header.num_lines + 1,
-        skipped=sum(element.num_records for element in before),
-    )
+    dtype = np.dtype([(prop.name, prop.code) for prop in vertex.properties])
+    number = header.num_lines + 1 + skip_lines(stream, _num_records(before))
+    return read_rows(path, stream, dtype, vertex.num_records, "vertices", line_number=number)
 
 
-def _fronts(path: Path, header: _Header, vertex: int, size: int, cloud: Cloud) -> Fronts:
+def _num_records(elements: list[_Element]) -> int:
+    """Return the number of records of several elements."""
+    return sum(element.num_records for element in elements)
+
+
+def _corners_of_text(path: Path, stream: BinaryIO, header: _Header) -> Values:
+    """Read the vertices of the last of the elements of an ASCII file, the faces."""
+    *before, faces = header.elements
+    stream.seek(header.num_bytes)
+    number = header.num_lines + 1 + skip_lines(stream, _num_records(before))
+    start = stream.tell()
+    num_words = len(next(filter(bytes.strip, stream), b"").split())
+    stream.seek(start)
+    dtype = np.dtype([("row", "f8", (num_words,))])
+    read = read_rows(path, stream, dtype, faces.num_records, "faces", line_number=number)
+    rows, place, corners = read["row"], 0, slice(0)
+    for prop in faces.properties:
+        length = 1
+        if prop.length_code is not None:
+            place += 1
+            lengths = rows[:, place - 1 : place]
+            fits = lengths.size > 0 and 0 <= lengths[0, 0] <= num_words - place
+            if not fits or (lengths != lengths[0]).any():
+                raise _lists_differ(path, faces)
+            length = int(lengths[0, 0])
+            if prop.name in _CORNERS:
+                corners = slice(place, place + length)
+        place += length
+    if place != num_words:
+        raise _lists_differ(path, faces)
+    return rows[:, corners]
+
+
+def _fronts(path: Path, header: _Header, size: int, cloud: Cloud) -> Fronts:
     """Return the front of each vertex by the last of the elements, and what is wrong with that."""
+    faces = header.elements[-1]
+    name = next(prop.name for prop in faces.properties if prop.name in _CORNERS) + _LIST
     try:
         with path.open("rb") as stream:
             if header.byte_order:
-                faces = _corners_of_binary(path, stream, header, size)
+                dtype = _go_to_last(path, stream, header, size)
+                blocks = _blocks(path, stream, faces, dtype)
+                front = find_fronts((b[name] for b in blocks), cloud.coordinates, cloud.finite)
             else:
-                faces = _corners_of_text(stream, header, vertex)
-            return find_fronts(faces, cloud.coordinates, cloud.finite), ()
-    except BrokenFacesError as error:
-        return None, (f"its faces left out, as they are damaged: {error}",)
+                corners = _corners_of_text(path, stream, header)
+                front = find_fronts([corners], cloud.coordinates, cloud.finite)
+        return front, ()
     except FormatError as error:
         return None, (f"its faces left out: {str(error).removeprefix(f'{path}: ').rstrip('.')}",)
-
-
-def _corners_of_binary(
-    path: Path, stream: BinaryIO, header: _Header, size: int
-) -> Iterator[NDArray[np.int64]]:
-    """Yield the vertices of faces, of many at a time as long as all lists have one length."""
-    *before, faces = header.elements
-    start = _pass_elements(path, stream, header, before, size)
-    dtype = _record_type(path, stream, faces, header.byte_order, start, size)
-    name = next(prop.name for prop in faces.properties if prop.name in _CORNERS)
-    done, at_once = 0, max(_BYTES_AT_ONCE // dtype.itemsize, 1)
-    while done < faces.num_records:
-        stream.seek(start + done * dtype.itemsize)
-        wanted = min(at_once, faces.num_records - done)
-        records = np.fromfile(stream, dtype, count=wanted)
-        if len(records) < wanted or not _have_one_length(records):
-            break
-        yield records[name + _LIST].astype(np.int64)
-        done += wanted
-    stream.seek(start + done * dtype.itemsize)
-    yield from stack_faces(
-        _faces_of_bytes(stream, faces, header.byte_order), faces.num_records - done
-    )
-
-
-def _faces_of_bytes(
-    stream: BinaryIO, element: _Element, byte_order: str
-) -> Iterator[tuple[float, ...]]:
-    """Yield the vertices of the faces from here to the end of a binary file."""
-
-    def take(letter: str, count: int) -> tuple[float, ...]:
-        form = f"{byte_order}{count}{letter}"
-        return struct.unpack(form, stream.read(struct.calcsize(form)))
-
-    lists = [
-        (
-            None if prop.length_code is None else _LETTERS[prop.length_code],
-            _LETTERS[prop.code],
-            np.dtype(prop.code).itemsize,
-            prop.name in _CORNERS,
-        )
-        for prop in element.properties
-    ]
-    corners: tuple[float, ...] = ()
-    with suppress(struct.error):  # Raised at the end of the file.
-        while True:
-            for length_letter, letter, size, is_corners in lists:
-                if length_letter is None:
-                    take(letter, 1)
-                    continue
-                values = take(letter, check_list(take(length_letter, 1)[0], size))
-                corners = values if is_corners else corners
-            yield corners
-
-
-def _corners_of_text(stream: BinaryIO, header: _Header, vertex: int) -> Iterator[NDArray[np.int64]]:
-    """Yield the vertices of the faces of an ASCII file, a face a line."""
-    stream.seek(header.num_bytes)
-    *before, faces = header.elements
-    counts = [element.num_records for element in before]
-    lines = islice(stream, min(sum(counts[:vertex]), sys.maxsize), None)
-    between = min(sum(counts[vertex:]), sys.maxsize)
-    lines = islice((line for line in lines if line.strip()), between, None)
-    return stack_faces((_face_of_line(line, faces) for line in lines), faces.num_records)
-
-
-def _face_of_line(line: bytes, element: _Element) -> list[float]:
-    """Return the vertices of the face of a line."""
-    try:
-        words = [float(word) for word in line.split()]
-    except ValueError as error:
-        raise BrokenFacesError(str(error)[:_SHOWN]) from None
-    place, corners = 0, list[float]()
-    for prop in element.properties:
-        length = 1
-        if prop.length_code is not None:
-            length = check_list(words[place] if place < len(words) else -1, 1)
-            place += 1
-        if prop.name in _CORNERS and prop.length_code is not None:
-            corners = words[place : place + length]
-        place += length
-    if place > len(words):
-        raise BrokenFacesError("a line of too few numbers")
-    return corners

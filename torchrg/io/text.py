@@ -9,7 +9,6 @@ in ASCII files of other formats are read here, too.
 
 import csv
 import os
-import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
@@ -19,7 +18,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, check_exact, flatten_cloud
+from torchrg.io.columns import Spelling, check_exact, flatten_cloud, slices
 from torchrg.io.fields import Values, assemble_table, check_names
 from torchrg.io.files import atomic_path, check_promise
 from torchrg.structures import Cloud
@@ -79,7 +78,12 @@ def write_text(path: Path, cloud: Cloud) -> None:
     with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
         if cloud.fields:
             file.write(f"# {' '.join(columns)}\n")
-        file.writelines(_format_table(columns.values()))
+        # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
+        marks = {"f4": "%.9g", "f8": "%r"}
+        row = " ".join(marks.get(c.dtype.str[1:], "%d") for c in columns.values()) + "\n"
+        for rows in slices(len(cloud), LINES_AT_ONCE):
+            block = [column[rows].tolist() for column in columns.values()]
+            file.write(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
 
 
 def count_text(path: Path, size: int) -> int:
@@ -97,12 +101,10 @@ def read_rows(
     content: str,
     *,
     line_number: int,
-    skipped: int = 0,
 ) -> Values:
-    """Read rows of a structured type from an ASCII file that is open behind its header.
+    """Read rows of a structured type from an ASCII file, the next line of which has this number.
 
-    Its next line has this number; so many lines are skipped before the rows. ``content`` is what
-    rows are, for messages.
+    ``content`` is what rows are, for messages.
     """
     # A digit and what separates it from the next; the last may end with the file.
     least, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
@@ -110,8 +112,16 @@ def read_rows(
     content = f"{num_rows:,} {content}"
     check_promise(path, start, least, content, available=available, at_least=True)
     lines = (raw.decode("latin-1") for raw in stream)
-    line_number += sum(1 for _ in islice(lines, min(skipped, sys.maxsize)))
     return _read_table(path, lines, dtype, line_number, num_rows=num_rows)
+
+
+def skip_lines(stream: BinaryIO, count: int) -> int:
+    """Pass so many lines of an ASCII file that are not blank, and return how many that took."""
+    passed = 0
+    while count > 0 and (line := stream.readline()):
+        passed += 1
+        count -= bool(line.strip())
+    return passed
 
 
 def _read_table(
@@ -322,15 +332,3 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _format_table(columns: Iterable[Values]) -> Iterator[str]:
-    """Yield columns as text that reads back to the same values, a block of lines at a time."""
-    kept = list(columns)
-    # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
-    marks = {"f4": "%.9g", "f8": "%r"}
-    row = " ".join(marks.get(column.dtype.str[1:], "%d") for column in kept) + "\n"
-    for start in range(0, len(kept[0]), LINES_AT_ONCE):
-        block = [column[start : start + LINES_AT_ONCE].tolist() for column in kept]
-        values = tuple(chain.from_iterable(zip(*block, strict=True)))
-        yield row * len(block[0]) % values

@@ -1,4 +1,8 @@
-"""Normals, plane labels and superpoints as modules."""
+"""Normals, plane labels and superpoints as modules.
+
+``config`` is settings, a whole configuration, or the name of a preset; where none is passed it is
+that of :func:`torchrg.load_config`. ``changes`` are single settings, as in ``k=30``.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -33,8 +37,7 @@ class EstimateNormals(CloudTransform):
     Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)``, ``curvature`` and ``residual`` ``(N,)``.
 
     Args:
-        config: Settings of the estimator, a whole configuration, or the name of a preset. Default:
-            that of :func:`torchrg.load_config`.
+        config: Settings of the estimator.
         residual: Whether to add ``residual`` ``(N,)``, the root mean square distance of the
             neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
         chunk_size: Points handled at a time; bounds memory, changes no result.
@@ -68,8 +71,8 @@ class EstimateNormals(CloudTransform):
         fit = estimate_normals(
             points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
         ).each(lambda values: restore_rows(values, rows, len(cloud["coord"])))
-        found = {"normal": fit.normals, "curvature": fit.curvature}
-        return {**found, "residual": fit.residual_rms} if self.residual else found
+        added = {"normal": fit.normals, "curvature": fit.curvature}
+        return {**added, "residual": fit.residual_rms} if self.residual else added
 
 
 class OrientNormals(CloudTransform):
@@ -160,8 +163,7 @@ class GrowRegions(CloudTransform):
     none. A point with a zero normal joins no region.
 
     Args:
-        config: Settings of the growth, a whole configuration, or the name of a preset. Default:
-            that of :func:`torchrg.load_config`.
+        config: Settings of the growth.
         k: Number of neighbours, the point itself included.
         **changes: Single settings, as in ``max_angle_deg=7``.
 
@@ -219,7 +221,6 @@ class SegmentPlanes(CloudTransform):
     and ``curvature`` ``(N,)``.
 
     Args:
-        config: Settings, or the name of a preset.
         compile: Whether to run kernels compiled; see :func:`torchrg.segment_planes`.
 
     Example:
@@ -301,8 +302,7 @@ class AlignAxes(SampleTransform):
     ``axis_align_matrix`` ``(B, 4, 4)``, float64, the motion of each cloud.
 
     Args:
-        config: How the planes are found that say where floor and walls are: settings, or the name
-            of a preset.
+        config: How the planes are found that say where floor and walls are.
         up: Where up is, to within 30 degrees.
 
     Raises:

@@ -72,24 +72,6 @@ def listed_keys(entries: Entries) -> list[str] | None:
     return [names] if isinstance(names, str) else list(names)
 
 
-def point_keys(
-    caller: str, entries: Entries, num_points: int, *, whole: Collection[str] = ()
-) -> list[str]:
-    """Return the entries with a row for each point; ``whole`` are further ones that have none.
-
-    Raises:
-        ConfigError: If it cannot be told of an entry.
-    """
-    found, ambiguous = _sort_keys(entries, num_points, whole)
-    if ambiguous:
-        raise ConfigError(
-            f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has a "
-            f"row for each of {num_points} points; make it an array and name it in "
-            f"{LISTED!r}, or leave it out."
-        )
-    return found
-
-
 def recognized_keys(entries: Entries, num_points: int, *, whole: Collection[str] = ()) -> list[str]:
     """Return what belongs on a list besides ours: nothing where somebody made the list."""
     return [] if _has_chosen_list(entries) else _sort_keys(entries, num_points, whole)[0]
@@ -122,16 +104,12 @@ def _sort_keys(
     found: list[str] = []
     ambiguous: list[str] = []
     for key, value in entries.items():
-        if is_whole(key, whole) or num_points == 0 or not _is_as_long(value, num_points):
+        is_whole = key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
+        if is_whole or num_points == 0 or not _is_as_long(value, num_points):
             continue
         is_array = isinstance(value, Tensor | np.ndarray)
         (found if is_array and (by_length or key in by_name) else ambiguous).append(key)
     return found, ambiguous
-
-
-def is_whole(key: object, whole: Collection[str] = ()) -> bool:
-    """Return whether an entry has no row for each point by its name."""
-    return key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
 
 
 def check_in_step(caller: str, entries: Entries, num_points: int) -> None:
@@ -164,6 +142,8 @@ def select_points(
 ) -> SampleDict:
     """Return the entries of a sample that change when only some rows are kept, given ascending.
 
+    Entries in ``whole`` have no row for each point.
+
     Raises:
         ConfigError: If it cannot be told what changes, or an entry holds numbers of points.
     """
@@ -174,10 +154,14 @@ def select_points(
                 f"{caller}: expected a sample without {key} to take points out of, got one; apply "
                 f"the transform {repair}."
             )
-    chosen: SampleDict = {
-        key: _take(entries[key], rows)
-        for key in point_keys(caller, entries, num_points, whole=whole)
-    }
+    found, ambiguous = _sort_keys(entries, num_points, whole)
+    if ambiguous:
+        raise ConfigError(
+            f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has a "
+            f"row for each of {num_points} points; make it an array and name it in "
+            f"{LISTED!r}, or leave it out."
+        )
+    chosen: SampleDict = {key: _take(entries[key], rows) for key in found}
     ends = torch.tensor(_cloud_ends(sample, num_points), device=rows.device)
     ends = torch.searchsorted(rows, ends)
     if entries.get("offset") is not None:

@@ -6,7 +6,6 @@ treat each cloud by itself.
 """
 
 import copy
-import dataclasses
 import importlib
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -81,7 +80,8 @@ class SampleTransform(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        return "" if self.config is None else "\n".join(_lines_of(self.config))
+        words = "" if self.config is None else repr(self.config)
+        return textwrap.fill(words, _LINE, break_long_words=False, break_on_hyphens=False)
 
     @of_clouds
     def forward(self, sample: Sample) -> Sample:
@@ -169,8 +169,8 @@ class NeighborSearch:
 
     A sample carries it where a transform was asked to by ``keep_neighbors``. It holds the points
     that were searched: where some were moved, taken out or put in since, neighbours are searched
-    again. Of ``K`` remembered ones the next transform may use fewer, not more. No collate function
-    joins it: :func:`torchrg.datasets.collate_offset` leaves it out, torch's refuses it.
+    again. The next transform may use fewer neighbours, not more. No collate function joins it:
+    :func:`torchrg.datasets.collate_offset` leaves it out, torch's refuses it.
 
     Args:
         known: Finite points of clouds in canonical order, and their neighbours.
@@ -202,10 +202,6 @@ class NeighborSearch:
     def remember(self, points: Tensor, neighbors: Neighbors) -> None:
         """Keep the neighbours of finite points in canonical order."""
         self.used.append((points.detach(), neighbors))
-
-    def to_carry(self) -> "NeighborSearch":
-        """Return what the sample carries on: neighbours that were used, or else those known."""
-        return NeighborSearch(self.used or self.known)
 
 
 class CloudTransform(SampleTransform):
@@ -244,7 +240,7 @@ class CloudTransform(SampleTransform):
         }
         changed = self.changed(sample, added, per_point=list(added))
         if self.keep_neighbors:
-            changed[key] = search.to_carry()
+            changed[key] = NeighborSearch(search.used or search.known)
         elif isinstance(carried, NeighborSearch):
             del changed[key]
         return changed
@@ -356,21 +352,6 @@ class SampleVoxels(SampleTransform):
         return f"size={self.size}"
 
 
-def _lines_of(config: Any) -> list[str]:  # noqa: ANN401
-    """Return settings as lines of text, those of a section behind its name."""
-    parts = [(field.name, getattr(config, field.name)) for field in dataclasses.fields(config)]
-    own = ", ".join(f"{name}={part!r}" for name, part in parts if not _is_section(part))
-    lines = textwrap.wrap(own, _LINE, break_long_words=False) if own else []
-    for name, part in parts:
-        if _is_section(part):
-            lines += [f"{name}:", *(f"  {line}" for line in _lines_of(part))]
-    return lines
-
-
-def _is_section(part: object) -> bool:
-    return dataclasses.is_dataclass(part)
-
-
 def is_separable(sample: Sample) -> bool:
     """Return whether a sample is a PyG ``Batch`` that can be taken apart into its clouds.
 
@@ -399,7 +380,8 @@ def with_each(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
     for key in set(batch.keys()) - set(batch._slice_dict) - made:  # noqa: SLF001
         value = batch[key]
         if isinstance(value, Tensor) and value.ndim and len(value) == batch.num_nodes:
-            for cloud, part in zip(clouds, _parts(value, batch), strict=True):
+            counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
+            for cloud, part in zip(clouds, torch.split(value, counts), strict=True):
                 cloud[key] = part
         else:
             whole[key] = value
@@ -408,9 +390,3 @@ def with_each(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
     for key, value in whole.items():
         changed[key] = value
     return changed
-
-
-def _parts(values: Tensor, batch: Sample) -> list[Tensor]:
-    """Return the rows of each cloud of a batch."""
-    counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
-    return list(torch.split(values, counts))
