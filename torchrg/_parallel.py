@@ -70,10 +70,10 @@ def map_chunks(
     *,
     least: int = _LEAST_ROWS,
 ) -> list[Result]:
-    """Call ``work`` on slices that together cover all rows; see :func:`map_tasks`.
+    """Call ``work`` on slices that together cover all rows, in their order; see :func:`map_tasks`.
 
-    ``work`` is called at least once, without rows on an empty slice; ``least`` is the number of
-    rows below which another thread is not worth its start. The results are in the order of rows.
+    Without rows it is called once, on an empty slice; ``least`` is the number of rows below which
+    another thread is not worth its start.
 
     Example:
         >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))
@@ -93,10 +93,8 @@ def map_rows(
 ) -> list[Tensor]:
     """Call ``work`` on an equal share of rows for each thread, and return what it returns, whole.
 
-    Args:
-        work: Takes rows of each column, then the others as they are; returns tensors of rows.
-        columns: Tensors of one length.
-        others: What ``work`` takes beside them.
+    It takes rows of each of the ``columns``, of one length, then the ``others`` as they are, and
+    returns tensors of rows.
 
     Example:
         >>> map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3))
@@ -166,9 +164,8 @@ def run_beside(
 def sequential_operations() -> Iterator[None]:
     """Let each operation of torch run on this thread alone; also a decorator.
 
-    :func:`map_tasks` goes on to use as many threads as torch might before. Nothing changes for
-    other threads: :func:`torch.set_num_threads` would also set the number of those that start
-    meanwhile.
+    :func:`map_tasks` goes on to use as many threads as torch might before. Other threads keep their
+    setting, which :func:`torch.set_num_threads` would change for those that start meanwhile.
 
     Example:
         >>> before = torch.get_num_threads()
@@ -218,8 +215,7 @@ def _begin_thread(grad_enabled: bool, context: Context) -> None:
 def _set_own_threads(numbers: Sequence[int]) -> list[int]:
     """Set on how many threads the operations of this thread run; return what it was.
 
-    The first number is that of MKL (0: what it takes by default), the others are those of each
-    OpenMP library.
+    First that of MKL (0: what it takes by default), then those of each OpenMP library.
     """
     mkl, libraries = _mkl_setter(), _openmp_libraries()
     before = [mkl(numbers[0]), *(library.num_threads for library in libraries)]

@@ -211,8 +211,8 @@ def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
 def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
     """Return the connected components of an image ``(H * W,)``, -1 where it is not flat.
 
-    From which pixels join the next one, ``(H - 1, W)`` and ``(H, W - 1)``. On a grid with a place
-    for each pixel and each pair they are the connected components of scipy.
+    ``down`` ``(H - 1, W)`` and ``right`` ``(H, W - 1)`` tell which pixels join the next one; on a
+    grid with a place for each pixel and each pair scipy finds the components.
     """
     from scipy.ndimage import label
 
@@ -226,22 +226,13 @@ def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
 
 
 class PixelGrid:
-    """Who is beside whom in an image: the eight pixels around each one, by row-major place.
-
-    As :class:`torchrg.regions.repair.Beside` asks for it.
-
-    Args:
-        shape: Rows and columns.
-    """
+    """The eight pixels around each pixel of an image, a :class:`torchrg.regions.repair.Beside`."""
 
     def __init__(self, shape: torch.Size) -> None:
         self.height, self.width = shape
 
     def around(self, rows: Tensor) -> Tensor:
-        """Return the pixels around each of some ``(n,)``, shape ``(n, 8)``.
-
-        For those outside of the image stand the nearest inside.
-        """
+        """Return the pixels around each of some ``(n, 8)``; for those outside the nearest inside."""
         down, right = torch.tensor(_AROUND, device=rows.device).T
         row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
@@ -284,10 +275,7 @@ def _refine(
 
     Twice, pixels without a region join the one beside them whose plane they are on, and flat
     regions that touch and lie on one plane are merged. Then borders between regions move to the
-    lines where their planes meet.
-
-    At least one pixel has a label. Returns labels by descending size, and the planes of the regions
-    in the cloud; curved are those thicker than noise and a slight bend can make them.
+    lines where their planes meet. Returns labels by descending size, and the planes of the regions.
     """
     beside, seen = PixelGrid(cloud.seen.shape), cloud.seen.flatten()
     for _ in range(_NUM_PASSES):

@@ -161,8 +161,8 @@ class _SquareWindows(NamedTuple):
 class _NarrowWindows(NamedTuple):
     """Flat narrow windows ``(k,)``, and the pixels that they hold ``(k, 27)``, -1 for none.
 
-    ``shape`` is 0 or 1, the row of :data:`torchrg.depth.windows.NARROW`, and ``pixel`` the one in
-    the middle, by row-major place in an image of so many columns.
+    ``shape`` is the row of :data:`torchrg.depth.windows.NARROW`, and ``pixel`` the one in the
+    middle, by row-major place in an image of so many columns.
     """
 
     first: int

@@ -82,13 +82,7 @@ def prepare_depth_kernels(announce: Callable[[str], None] = lambda text: None) -
     """Compile the kernels of :func:`segment_depth`, and tell whether that can be done.
 
     That takes a minute on two cores the first time on a machine; see
-    :func:`torchrg.pipeline.prepare_kernels`.
-
-    Args:
-        announce: Called with a line of text where there is something to compile.
-
-    Returns:
-        False, after a warning that says why, if there is no compiler.
+    :func:`torchrg.pipeline.prepare_kernels`. A warning says why there is no compiler.
     """
 
     def rehearse() -> None:

@@ -204,7 +204,7 @@ def noise_at(
 def noise_by_size(
     windows: Mapping[int, WindowPlanes], given: tuple[float, float] | None, dtype: torch.dtype
 ) -> dict[int, WindowNoise]:
-    r"""Return the noise of inverse depth as windows of each size see it.
+    """Return the noise of inverse depth as windows of each size see it.
 
     A standard deviation of ``a + b z^2`` in depth is one of ``b + a w^2`` in inverse depth
     ``w = 1 / z``. Where ``a`` and ``b`` are not given, they are fitted to what windows deviate from

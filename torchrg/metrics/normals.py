@@ -27,9 +27,7 @@ class NormalScore(NamedTuple):
         rms: Root mean square angle error, degrees.
         mean: Mean angle error, degrees.
         median: Median angle error, degrees.
-        under_5_deg: Share of points with an error below 5 degrees, in [0, 1].
-        under_10_deg: The same below 10 degrees.
-        under_20_deg: The same below 20 degrees.
+        under_5_deg: Share of points with an error below 5 degrees, in [0, 1]; and so on.
         points: Points that were scored.
         invalid: Points with a true normal and no estimated one; in none of the indices.
     """
@@ -59,8 +57,7 @@ def score_normals(
     Convention:
         Normals need no unit length. A point without an estimated normal (zero, not finite, or
         ``valid`` False) is in no index and counted in ``invalid``: look at that count before
-        comparing estimators that may abstain. A point without a true normal (zero or not finite)
-        counts nowhere. Angles are computed in float64 from chords, so that small ones are right.
+        comparing estimators that may abstain. A point without a true normal counts nowhere.
 
     Args:
         normals: Estimated normals, shape ``(*, 3)``, floating point.

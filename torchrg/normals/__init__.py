@@ -97,8 +97,7 @@ def estimate_normals(
         what is chosen held fixed, that is neighbours, inliers, sharp points, and the noise that
         ``irls`` assumes. With the covariance ``C`` of the points of the fit, its eigenvalues ``l``
         and eigenvectors ``v``, ``dn = sum_j v_j (v_j . dC n) / (l_0 - l_j)``. ``jet`` adds the
-        gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none
-        and refuses points that require one.
+        gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none.
 
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
@@ -108,8 +107,7 @@ def estimate_normals(
         k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud
             with fewer points uses those it has.
         neighbors: Neighbours found before, for finite points. Default: searched.
-        max_distance: Neighbours farther than this do not count: a hybrid search. In the unit of the
-            cloud. Default: no limit.
+        max_distance: As of :func:`torchrg.search_knn`.
         chunk_size: Points handled at a time; bounds memory, changes no result.
 
     Returns:
@@ -121,8 +119,7 @@ def estimate_normals(
         ShapeError: If a shape or dtype is not as above.
 
     Warns:
-        PrecisionWarning: If the steps of float32 are more than a tenth of the spacing of the
-            points, as they are far from the origin.
+        PrecisionWarning: As :func:`torchrg.segment_planes` does.
 
     Example:
         >>> floor = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))

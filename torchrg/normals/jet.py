@@ -1,9 +1,8 @@
 """Quadratic height fields: normals and curvatures of curved surfaces.
 
-There are two solvers because there are two purposes. Jets serve all points of a cloud, with
-gradients, and are as exact as CGAL's in float64, so they are fitted by orthogonalisation. The
-paraboloids of the consensus need three digits and no gradient. Normal equations, which square the
-condition number, do them no harm and take half the time.
+Jets serve all points of a cloud, with gradients, and are as exact as CGAL's in float64, so they
+are fitted by orthogonalisation. The paraboloids of the consensus need three digits and no gradient:
+normal equations, which square the condition number, do them no harm and take half the time.
 """
 
 from collections.abc import Sequence
@@ -35,8 +34,7 @@ def fit_normals_jet(
     """Fit a quadratic surface to each patch and return its normal at the point itself.
 
     See :func:`fit_jet`, which gives the principal curvatures too. ``curvature`` is the surface
-    variation of PCA, so that regions grow in the same order; ``residual_rms`` belongs to the
-    quadratic surface.
+    variation of PCA; ``residual_rms`` belongs to the quadratic surface.
 
     Example:
         >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
@@ -78,7 +76,7 @@ class JetFit(NamedTuple):
 def fit_jet(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
 ) -> JetFit:
-    r"""Fit a quadratic height field to each patch: a jet of degree 2 [1].
+    """Fit a quadratic height field to each patch: a jet of degree 2 [1].
 
     In the frame of the patch's PCA about the point itself, the first of the patch that counts, the
     height ``w`` is fitted by least squares as ``a0 + a1 u + a2 v + a3 u^2/2 + a4 u v + a5 v^2/2``.
@@ -86,12 +84,8 @@ def fit_jet(
     eigenvalues of the shape operator there. This is what CGAL's ``jet_estimate_normals`` does in
     degree 2.
 
-    Convention:
-        Gradients flow through everything but the principal directions, and are finite where two
-        eigenvalues are equal.
-
-    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`, the point itself
-    first in each patch.
+    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. Gradients flow
+    through everything but the principal directions, and are finite where two eigenvalues are equal.
 
     Returns:
         The fit. Terms that the points do not determine are left out, the last ones first: two

@@ -25,7 +25,7 @@ def find_sharp_points(
     angle_deg: float = 5.0,
     chunk_size: int = CHUNK_SIZE,
 ) -> Tensor:
-    r"""Tell sharp feature points from regular ones by the angles to their neighbours' normals.
+    """Tell sharp feature points ``(N,)`` by the angles to their neighbours' normals.
 
     With ``a_j`` the angle between the normals of a point and of its j-th neighbour (the point
     itself included, with angle 0), a point is sharp if ``Qn(a) > angle_deg`` (``"qn"``, eq. 9), or
@@ -40,9 +40,6 @@ def find_sharp_points(
         rule: See above.
         angle_deg: Limit in degrees.
         chunk_size: Points handled at a time.
-
-    Returns:
-        Shape ``(N,)``, bool.
 
     Raises:
         ConfigError: If ``rule`` is unknown.

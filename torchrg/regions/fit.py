@@ -123,14 +123,13 @@ class RegionPlanes(NamedTuple):
 
 
 def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
-    r"""Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
+    """Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
 
     The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
     (1.4826 times their median), so that points of another surface do not tilt the plane.
-
     ``normals`` of any sign decide where points do not, in regions of one or two points or along a
-    line. Of a plane's normal the component of largest magnitude, of equal ones the last, is
-    positive. Nothing is known of the noise: the floor is 0.
+    line; the sign is that of :func:`with_table_sign`. Nothing is known of the noise: the floor is
+    0.
 
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
@@ -184,14 +183,12 @@ def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> Region
 
 
 def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> RegionPlanes:
-    """Return the planes of the regions of a cloud in canonical order.
+    """Return the planes of the regions of a cloud in canonical order, of some points of each.
 
-    They are fitted to some thousand points of each, in even steps. The floor of the thickness is a
-    fraction of the median neighbourhood's radius, as in the test of coplanarity. Curved are regions
-    whose normals are spread and that noise alone does not make so thick: in faces a few centimetres
-    wide, noise spreads normals, too.
-
-    ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative.
+    The floor of the thickness is a fraction of the median neighbourhood's radius, as in the test of
+    coplanarity. Curved are regions whose normals are spread and that noise alone does not make so
+    thick: in faces a few centimetres wide, noise spreads normals, too. ``labels`` ``(N,)`` are 0 to
+    M-1, each at least once, or negative.
     """
     segments = Segments(labels, most=MOST_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)

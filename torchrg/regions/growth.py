@@ -139,10 +139,7 @@ def grow_regions(
 def label_regions(
     cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
-    """Return labels of regions that have grown, after all that the settings ask for.
-
-    ``roots`` ``(N,)`` are what :func:`grow` gives. This needs the whole cloud, too.
-    """
+    """Return labels of regions that have grown, after all steps that the settings ask for."""
     least = config.min_size
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
@@ -255,8 +252,8 @@ def by_column(vectors: Tensor) -> Tensor:
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, those of equal size by their first point.
 
-    ``regions`` ``(N,)`` holds any number below N that is the same in a region and another
-    elsewhere, -1 for none. Regions smaller than ``min_size`` become :data:`torchrg.UNLABELED`.
+    ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
+    ``min_size`` become :data:`torchrg.UNLABELED`.
     """
     old = regions.cpu().numpy()
     sizes = np.bincount(old[old >= 0], minlength=len(old))
@@ -348,10 +345,9 @@ def grow_first_in_first_out(
     the order of the queue does not matter: all edges given make seeds, and those ``neighbors``
     ``(N, K)`` that the seeds of a region merely ``claim`` join when the seeds are all known.
 
-    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue.
-    This claims exactly what one seed after the other does.
-
-    Returns the root of each point's region, -1 where not valid.
+    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue:
+    this claims exactly what one seed after the other does. Returns the root of each point's region,
+    -1 where not valid.
     """
     all_codes, starts = edges.targets, memoryview(edges.starts.data)
     free = bytearray(valid.tobytes())

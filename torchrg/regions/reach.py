@@ -17,10 +17,8 @@ from torchrg.regions.edges import EdgeLists, chain_of, first_to_reach
 class Condensed(NamedTuple):
     """The edges of a block without those between points that reach one another.
 
-    Attributes:
-        components: Component of each point, 0 to C-1, shape ``(n,)``, int32.
-        sources: Component that each edge leaves, shape ``(E,)``, int32.
-        targets: Row in the whole cloud that it leads to, shape ``(E,)``, int32.
+    The component of each point ``(n,)``, 0 to C-1; the component that each edge ``(E,)`` leaves,
+    and the row in the whole cloud that it leads to; all int32.
     """
 
     components: NDArray[np.int32]

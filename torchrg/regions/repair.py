@@ -140,9 +140,9 @@ def absorb_points(
     the plane's. Of several regions it joins the one whose plane is nearest. Points that joined have
     the next beside them.
 
-    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud, or of the pixels of an image, as
-    ``beside`` is. Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all.
-    ``valid`` ``(N,)`` tells which points may join.
+    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud or an image, as ``beside`` is.
+    Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all; ``valid`` ``(N,)``
+    may join.
     """
     # Narrow numbers are gathered faster, and take half of the memory.
     labels = labels.to(torch.int32)
@@ -202,15 +202,13 @@ def merge_coplanar(
     """Merge regions that touch and lie on one plane, the pair that fits best first.
 
     Two regions are merged when one plane explains both: the root mean square distance of either to
-    the plane through both is at most ``tolerance`` times what it is to its own. Of the smaller one
-    the larger one's noise counts if that is more: what noise breaks off a face is thinner than the
-    face, or curved. Otherwise curved regions have no plane. What is merged is one region from then
-    on.
+    the plane through both is at most ``tolerance`` times what it is to its own, or the floor of the
+    planes. Of the smaller one the larger one's noise counts if that is more: what noise breaks off
+    a face is thinner than the face, or curved. Otherwise curved regions have no plane.
 
     ``contacts`` are pairs of regions that touch ``(E, 2)``, and how many contacts each has, as
-    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. A region's distance to its
-    own plane counts as at least the floor of the planes. A merged region has the smallest label of
-    its parts.
+    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. What is merged is one
+    region from then on, with the smallest label of its parts.
     """
     pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
@@ -231,10 +229,8 @@ def merge_facets(
     mean square distance of either to the plane through both is at most ``tolerance``, in the unit
     of the cloud, and that plane is turned against neither by more than 25 degrees: a strip narrower
     than the tolerance lies near any plane that it touches. Nor may the turn alone lift the points
-    of either by more than two thirds of the tolerance. What is merged is one region from then on,
-    so that the facets of a bend join only as far as one plane goes.
-
-    ``contacts`` and labels are those of :func:`merge_coplanar`.
+    of either by more than two thirds of the tolerance. So the facets of a bend join only as far as
+    one plane goes. ``contacts`` and labels are those of :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= LEAST_CONTACTS]
@@ -384,7 +380,7 @@ def _are_turned(a: _Moments, b: _Moments, max_tilt: float) -> Tensor:
 def refine_borders(
     cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    r"""Give points where regions touch to the one that explains them best.
+    """Give points where regions touch to the one that explains them best.
 
     Of the flat regions of a point's 8 nearest neighbours and its own, the two with the nearest
     planes, by their thickness, count if they are within reach. With the distances :math:`r` from a
@@ -394,9 +390,8 @@ def refine_borders(
     on one side of that. Points of nearly parallel planes stay where they are. Points that moved
     and their neighbours are decided again in the next pass.
 
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are those returned. ``reach``
-    ``(M,)`` is the distance up to which points may be on a plane, NaN for regions that are not flat
-    and keep what they have.
+    ``reach`` ``(M,)`` is the distance up to which points may be on a plane, NaN for regions that
+    are not flat and keep what they have.
     """
     beside = NearestPoints(cloud.neighbors)
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])

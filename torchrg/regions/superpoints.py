@@ -85,11 +85,10 @@ def partition_points(
     increase of the variance within regions. Divided by the length of the border that vanishes it is
     the strength of regularisation at which the energy of Mumford and Shah falls [3], the energy
     that cut pursuit minimises [4] and, with places and normals, the supervoxels of [5] and [6];
-    normals come first as in [7]. Pairs merge up to each strength of the configuration, or until
-    each of its numbers of superpoints is left.
-    Contacts are that length up to noise, hence their root. Regions that are each other's cheapest
-    partner merge at a time, and small ones with a much larger one that is theirs: this needs no
-    order of visits.
+    normals come first as in [7]. Contacts are that length up to noise, hence their root. Pairs
+    merge up to each strength of the configuration, or until each of its numbers of superpoints is
+    left. Regions that are each other's cheapest partner merge at a time, and small ones with a much
+    larger one that is theirs: this needs no order of visits.
 
     ``labels`` ``(N,)`` are those of planes, negative for none. Of a mesh with ``faces`` ``(F, 3)``
     contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the finite
@@ -250,8 +249,7 @@ def _cut_planes(
 
     Pieces are what is in a cell of a cubic grid. Those whose colours vary, more than by the noise
     that neighbours show, or that have too many points for the number of superpoints, are cut at
-    half the side again and again, in the end into points. The side follows the median spacing, so
-    where points are dense, pieces have more of them.
+    half the side again and again, in the end into points.
     """
     side = _PIECE_SPACINGS * spacing
     if config.max_extent is not None:

@@ -92,9 +92,6 @@ def summarize_planes(
             as ``"z"`` or ``"-y"``.
         outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
 
-    Returns:
-        The table, M rows.
-
     Raises:
         ShapeError: If a shape or dtype is not as above.
         ConfigError: If ``up`` is not a direction.
@@ -166,11 +163,7 @@ def summarize_planes(
 
 
 class _Measures(NamedTuple):
-    """What is measured in the planes of some regions.
-
-    The mean of the points about the center ``(M, 3)``, the area ``(M,)``, sides, directions and
-    middle of the rectangles as :class:`Rectangles` has them, and outlines if asked for.
-    """
+    """What is measured in the planes of regions: see :class:`Rectangles`, and :class:`Planes`."""
 
     mean: Tensor
     area: Tensor
@@ -360,13 +353,10 @@ def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
 
 
 def _outer_places(places: NDArray[np.float64]) -> NDArray[np.integer]:
-    """Return the rows of points ``(n, 2)`` that may be corners of their convex hull.
+    """Return the points ``(n, 2)`` by row that may be corners of their convex hull.
 
-    Not those inside the octagon of the farthest points in eight directions [1].
-
-    References:
-        [1] S. Akl, G. Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5),
-        1978.
+    Not those inside the octagon of the farthest points in eight directions: S. Akl, G. Toussaint. A
+    fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
     along = _COMPASS @ places.T
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])

@@ -39,14 +39,9 @@ def vote_planes(
     of a corner and of a plate has. The best candidate is fitted anew to the neighbours within reach
     of it, first closely, then with the bisquare weights that use nearly all the points of a face.
 
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        noise: Standard deviation of the noise, shape ``(n,)``, positive.
-        start: Normals to try first, shape ``(n, 3)``.
-        counted: Weights 0 or 1, shape ``(n, K)``.
-
-    Returns:
-        Unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes ``normal . q = offset``.
+    The noise ``(n,)`` is positive, and ``counted`` ``(n, K)`` are weights 0 or 1 of the neighbours,
+    by columns about each point. Returns unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes
+    ``normal . q = offset``.
 
     Example:
         >>> from torchrg.linalg.moments import split_columns

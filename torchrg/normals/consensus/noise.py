@@ -45,7 +45,7 @@ class Survey(NamedTuple):
 def survey_noise(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = CHUNK_SIZE
 ) -> Survey:
-    r"""Estimate the noise about each point, at edges and on curved surfaces too.
+    """Estimate the noise about each point, at edges and on curved surfaces too.
 
     The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
     points lie on one smooth face, and more elsewhere. Small neighbourhoods lie on one face more
@@ -59,16 +59,8 @@ def survey_noise(
     line, as on scan lines, do not count. At corners, where none of the three finds a face, the
     noise is at most 3 times the 15th percentile of the noise of the neighbours. Where points are so
     few that even the nearest are of both faces of a plate, two parallel planes take the place of
-    the one of all neighbours, if they leave 0.35 of its deviation or less.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        fit: Planes of all neighbours.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        Offsets, deviations, noise and radius. Noise is at least the rounding of the coordinates.
+    the one of all neighbours, if they leave 0.35 of its deviation or less. ``fit`` are the planes
+    of all neighbours; noise is at least the rounding of the coordinates.
 
     Example:
         >>> from torchrg.neighbors import search_knn
@@ -130,7 +122,7 @@ def survey_noise(
 
 
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return the noise of the region around each point from the noise about single ones.
+    """Return the noise ``(N,)`` of the region around each point from the noise about single ones.
 
     Where a reconstruction has rounded the step between two parallel faces into a ramp, no
     neighbourhood on it is of one face, not even the smallest, and all of them find the step to be
@@ -139,16 +131,6 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 
     Where the noise of each point is its own, as scanners have it, estimates scatter, and this is
     about three quarters of it.
-
-    Nothing else than steps from neighbour to neighbour is asked, so that a part of a cloud with the
-    points around it gives what the whole gives.
-
-    Args:
-        noise: Noise about each point, shape ``(N,)``.
-        neighbors: Neighbours of all points.
-
-    Returns:
-        Noise of the region, shape ``(N,)``.
 
     Example:
         >>> line = torch.arange(8)
