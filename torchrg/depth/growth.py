@@ -9,9 +9,8 @@ from torch import Tensor
 from torchrg._compile import kernel
 from torchrg._parallel import map_rows, map_tasks, places_of
 from torchrg.config import DepthConfig
-from torchrg.depth.hidden import hidden_contacts
+from torchrg.depth.faces import hidden_contacts, join_strips
 from torchrg.depth.normals import PixelPlanes
-from torchrg.depth.strips import join_strips
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MOST_FITTED, RegionPlanes
@@ -232,7 +231,7 @@ class PixelGrid:
         self.height, self.width = shape
 
     def around(self, rows: Tensor) -> Tensor:
-        """Return the pixels around each of some ``(n, 8)``; for those outside the nearest inside."""
+        """Return the pixels around some, ``(n, 8)``; for those outside the nearest inside."""
         down, right = torch.tensor(_AROUND, device=rows.device).T
         row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._optional import require
 from torchrg._parallel import run_beside
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, coordinates_along, fit_planes
-from torchrg.regions.outline import trace_outline
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 
 _TIE = 1e-9
@@ -279,6 +279,56 @@ def _outlines(
         lifted = (center + ring[:, :1] * first + ring[:, 1:] * second for ring in rings)
         outlines.append(tuple(ring.to(dtype) for ring in lifted))
     return tuple(outlines)
+
+
+def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
+    """Return the outline of points in a plane: rings through some of them.
+
+    The points near an edge, found with square cells, are triangulated. Triangles over cells without
+    points are left out, and the others united.
+
+    Holes and dents narrower than ``width``, that of the cells, are filled. Outer rings ``(V, 2)``,
+    the first point not repeated, run counter-clockwise, holes clockwise; points on one line have
+    none.
+
+    Raises:
+        MissingDependencyError: If shapely is not installed.
+    """
+    from scipy.ndimage import binary_erosion
+    from scipy.spatial import Delaunay, QhullError
+
+    shapely = require("shapely", extra="outline", purpose="trace outlines")
+    if width <= 0:
+        return []
+    cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
+    occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
+    occupied[tuple(cells.T)] = True
+    inside = binary_erosion(occupied, np.ones((3, 3), dtype=bool))
+    corners = places[~inside[tuple(cells.T)]]
+    try:
+        triangles = corners[Delaunay(corners).simplices]
+    except (QhullError, ValueError):
+        return []
+    ends = np.roll(triangles, 1, axis=1)
+    tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
+    reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
+    covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
+    # Triangles that share whole edges are a coverage, which is united twenty times as fast.
+    shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
+    return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
+
+
+def _rings(shapely: Any, shape: Any, min_area: float) -> list[NDArray[np.float64]]:  # noqa: ANN401
+    """Return the rings of a polygon or of several, largest polygon first, without specks."""
+    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    largest = max((part.area for part in parts), default=0.0)
+    parts = [part for part in parts if part.area >= min(min_area, largest)]
+    rings: list[NDArray[np.float64]] = []
+    for part in sorted(parts, key=lambda part: -part.area):
+        turned = shapely.geometry.polygon.orient(part)
+        holes = [hole for hole in turned.interiors if shapely.Polygon(hole).area >= min_area]
+        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *holes)]
+    return rings
 
 
 class Rectangles(NamedTuple):

@@ -47,10 +47,7 @@ _CHECK_EVERY = 4
 
 
 class _Shape(NamedTuple):
-    """Weights ``(K, M)`` of the points of each lane, and their scatter scaled to determinant one.
-
-    The distances are squared, and those to the scaled scatter, shape ``(K, M)``.
-    """
+    """Weights ``(K, M)`` of each lane, their scatter of determinant one, squared distances to it."""
 
     weights: Tensor
     ellipsoid: Ellipsoid

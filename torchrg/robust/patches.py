@@ -51,8 +51,7 @@ class RobustFit(NamedTuple):
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
         covariance: Their covariance with its consistency factor, shape ``(*, P, P)``. Of an exact
-            fit: that of the points on the plane, singular, so that its eigenvector of the
-            smallest eigenvalue is the plane's normal.
+            fit: that of the points on the plane, singular.
         support: Points that are not outliers, shape ``(*, K)``, bool.
         sq_distances: Squared Mahalanobis distances to the raw fit, shape ``(*, K)``; these decide
             ``support``. Of an exact fit: 0 on the plane and inf off it. Points that do not count,

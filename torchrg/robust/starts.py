@@ -287,9 +287,9 @@ def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
 def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tensor:
     """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
 
-    The same sets serve every patch, so a patch's result depends on the seed and on nothing else
-    in its batch. Returns point indices ``(S, size)``: all sets in lexicographic order where there
-    are at most ``5 * num_sets``, otherwise ``num_sets`` of them.
+    The same sets serve every patch, so a patch's result depends on the seed and on nothing else in
+    its batch. Returns point indices ``(S, size)``: all sets where there are at most
+    ``5 * num_sets``, otherwise ``num_sets`` of them.
     """
     if comb(num_points, size) <= 5 * num_sets:
         return torch.tensor(list(combinations(range(num_points), size)), device="cpu")
