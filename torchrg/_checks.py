@@ -59,14 +59,7 @@ def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
-    """Check that tensors hold float32 or float64, all the same, on one device; None is skipped.
-
-    Example:
-        >>> check_floating("f", points=torch.zeros(2, 3, dtype=torch.int64))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected points of float32 or float64, got int64.
-    """
+    """Check that tensors hold float32 or float64, all the same, on one device; None is skipped."""
     given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in given.items():
         if tensor.dtype not in (torch.float32, torch.float64):
@@ -90,14 +83,7 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
 
 
 def check_points(caller: str, points: Tensor) -> None:
-    """Check that points are those of a cloud, and say what to do with those of an image.
-
-    Example:
-        >>> check_points("f", torch.zeros(2, 4, 3))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected points of shape (N, 3), got (2, 4, 3); pass ...
-    """
+    """Check that points are those of a cloud, and say what to do with those of an image."""
     if points.ndim == 3 and points.shape[2] == 3:
         raise ShapeError(
             f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "

@@ -117,7 +117,7 @@ def segment_planes(
     """
     points = as_tensor("segment_planes", "points", points).detach()
     check_points("segment_planes", points)
-    warn_of_steps("segment_planes", points, stacklevel=4)
+    warn_of_steps("segment_planes", points)
     if not isinstance(config, PipelineConfig):
         config = settings_of("segment_planes", PipelineConfig, config)
     if compile is not None:
@@ -351,8 +351,7 @@ def segment_mesh(
         faces: Rows of the corners of triangles, shape ``(F, 3)``. Superpoints are connected along
             their edges. Default: along neighbours, for points without a mesh.
         k_thresh: As of Segmentator, in proportion: 0.01 is a strength of 2 in
-            :class:`torchrg.config.SuperpointsConfig`, with which superpoints of depth frames with
-            noise were as many as Segmentator's.
+            :class:`torchrg.config.SuperpointsConfig`.
         seg_min_verts: Smaller superpoints join a neighbour, in vertices.
         colors: As of :func:`make_superpoints`; Segmentator knows none.
         config: How planes are found, settings or the name of a preset.

@@ -48,9 +48,8 @@ def segment_depth(
         compile: Whether to run kernels compiled; see :func:`prepare_depth_kernels`.
 
     Returns:
-        A segmentation whose ``labels``, ``normals``, ``curvature``, ``sharp`` and ``valid`` are
-        images: shapes ``(H, W)`` and ``(H, W, 3)``. Sharp are the pixels so near to an edge that no
-        flat window lies around them. An image without depth has no planes and is nowhere valid.
+        A segmentation whose fields are images, of ``(H, W)`` or ``(H, W, 3)``. Sharp are the pixels
+        so near to an edge that no flat window lies around them.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.

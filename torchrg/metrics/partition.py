@@ -58,11 +58,10 @@ def score_partition(
     are never worse, so compare partitions of equally many.
 
     Convention:
-        * Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored;
-          their superpoints count in ``count``.
-        * A point whose superpoint is -1 belongs to none, and is wrong.
-        * Of equally frequent parts a superpoint takes that of the lowest label.
-        * A point is at a border when one of its 8 nearest scored points has another label.
+        Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored. A
+        point whose superpoint is -1 belongs to none, and is wrong. Of equally frequent parts a
+        superpoint takes that of the lowest label. A point is at a border when one of its 8 nearest
+        scored points has another label.
 
     Args:
         superpoints: Superpoint of each point, shape ``(N,)``, integers.

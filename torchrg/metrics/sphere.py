@@ -129,12 +129,6 @@ def measure_spreads(
     Larger clusters, and larger sets of possible ends of a diameter, are subsampled to
     ``sample_size``; third and fourth are the clusters whose mean is of a subsample, and whether no
     diameter is.
-
-    Example:
-        >>> axes = torch.eye(3, dtype=torch.float64)
-        >>> means, _, num_sampled, _ = measure_spreads([axes[:1], axes[1:]], axes[:2])
-        >>> means.rad2deg().round().tolist(), num_sampled
-        ([0.0, 90.0], 0)
     """
     means, diameters, num_sampled, exact = [], [], 0, True
     for part, center in zip(parts, centers, strict=True):

@@ -52,10 +52,6 @@ def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxe
     """Return the boxes of at most so many points ``(N, 3)`` in canonical order.
 
     Only a cell of the finest level may hold more: nearly equal points.
-
-    Example:
-        >>> find_boxes(np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1]]), 2).starts.tolist()
-        [0, 2, 3]
     """
     codes = morton_codes(points)
     is_start = np.zeros(len(points) + 1, dtype=bool)
@@ -130,13 +126,6 @@ def search_blocks(
 
     The points ``(N, 3)`` are in canonical order, k at most N; ``search`` answers for some rows of a
     smaller cloud.
-
-    Example:
-        >>> from torchrg.neighbors.knn import search_rows
-        >>> points = np.arange(4.0)[:, None] * [1, 0, 0]
-        >>> for block, near in search_blocks(points, 2, search_rows):
-        ...     print(block, near.tolist())
-        slice(0, 4, None) [[0, 1], [1, 0], [2, 1], [3, 2]]
     """
     boxes = find_boxes(points)
     ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, len(points), BLOCK_SIZE))]

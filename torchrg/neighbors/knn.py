@@ -147,12 +147,7 @@ def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int
 
 @sequential_operations()
 def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np.int32]:
-    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``.
-
-    Example:
-        >>> search_rows(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), slice(1, 2), 2).tolist()
-        [[1, 0]]
-    """
+    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``."""
     indices = np.empty((len(points), k), dtype=np.int32)
     _search_cloud(points, rows, None, 0, math.inf, indices, None)
     return indices[rows]

@@ -128,7 +128,7 @@ def estimate_normals(
     """
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
-    warn_of_steps("estimate_normals", tensor, stacklevel=4)
+    warn_of_steps("estimate_normals", tensor)
     changes = {"method": method, "k": k}
     given = {name: value for name, value in changes.items() if value is not None}
     settings = settings_of("estimate_normals", NormalsConfig, config, given)

@@ -85,16 +85,16 @@ def grow_regions(
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
         config: Settings, a whole configuration, or the name of a preset. Default: that of
             :func:`torchrg.load_config`, which needs ``residual_rms``.
-        valid: Points that have a normal, shape ``(N,)``, bool; the others join no region, and no
-            region passes through them. Default: all. Points whose normal or curvature is not
-            finite never join.
+        valid: Points that have a normal, shape ``(N,)``, bool; no region passes through others, nor
+            through points whose normal or curvature is not finite. Default: all.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
             :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
         colors: Colours of the points, shape ``(N, C)``.
         max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
             unit of the colours) does not join. Default: colours play no part.
-        signed_normals: Whether opposite normals differ by 180 degrees instead of 0, so that the two
-            faces of a thin wall never join. For normals that are oriented.
+        signed_normals: Whether opposite normals, if oriented, differ by 180 degrees instead of 0,
+        so
+            that the two faces of a thin wall never join.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
 

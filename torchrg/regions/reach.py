@@ -31,12 +31,6 @@ def condense(edges: EdgeLists, block: slice) -> Condensed:
 
     The edges are those of the points of the block, none of them twice (SciPy would search without
     end); those that leave it stay, one for all between two components.
-
-    Example:
-        >>> edges = EdgeLists(np.array([0, 1, 3]), np.array([11, 10, 17], dtype=np.int32))
-        >>> block = condense(edges, slice(10, 12))
-        >>> block.components.tolist(), block.sources.tolist(), block.targets.tolist()
-        ([0, 0], [0], [17])
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components

@@ -47,7 +47,7 @@ _CHECK_EVERY = 4
 
 
 class _Shape(NamedTuple):
-    """Weights ``(K, M)`` of each lane, their scatter of determinant one, squared distances to it."""
+    """Weights ``(K, M)`` of lanes, their scatter of determinant one, squared distances to it."""
 
     weights: Tensor
     ellipsoid: Ellipsoid
@@ -313,12 +313,7 @@ def _bisquare_loss(sq_ratios: Tensor) -> Tensor:
 
 @lru_cache(maxsize=64)
 def breakdown_constant(num_coordinates: int) -> float:
-    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal.
-
-    Example:
-        >>> round(breakdown_constant(3), 6)
-        3.452882
-    """
+    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal."""
 
     def excess(cutoff: float) -> float:
         moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
@@ -333,10 +328,6 @@ def efficiency_constant(num_coordinates: int, target: Target) -> float:
     """Cut-off with 95 % efficiency at the normal distribution.
 
     For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
-
-    Example:
-        >>> round(efficiency_constant(3, "shape"), 5), round(efficiency_constant(3, "location"), 5)
-        (6.09627, 5.49025)
     """
     p = num_coordinates
 

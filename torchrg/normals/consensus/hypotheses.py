@@ -42,17 +42,6 @@ def vote_planes(
     The noise ``(n,)`` is positive, and ``counted`` ``(n, K)`` are weights 0 or 1 of the neighbours,
     by columns about each point. Returns unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes
     ``normal . q = offset``.
-
-    Example:
-        >>> from torchrg.linalg.moments import split_columns
-        >>> x, y = torch.arange(-2.0, 3), torch.arange(0.0, 4)
-        >>> floor = torch.cartesian_prod(x, y, torch.zeros(1))
-        >>> wall = floor[:, [0, 2, 1]]
-        >>> corner = torch.cat([floor, wall]).sub_(torch.tensor([0.0, 1.0, 0.0]))[None]
-        >>> up = torch.tensor([[0.0, 0.7071, 0.7071]])
-        >>> columns, noise = split_columns(corner), torch.tensor([0.01])
-        >>> vote_planes(columns, noise, up, torch.ones(1, 40))[0].abs()
-        tensor([[0., 0., 1.]])
     """
     sq_distances = sq_lengths(columns)
     farthest = (sq_distances * counted).amax(dim=1, keepdim=True)
@@ -226,17 +215,6 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     beyond twice the noise on its fuller side. The point itself belongs to a plane by the same rule,
     which, unlike the nearest of two unbounded planes, is right for points that noise has moved out
     of the solid. Arguments as for :func:`fit_meeting_planes`.
-
-    Example:
-        >>> from torchrg.linalg.moments import split_columns
-        >>> x, y = torch.arange(-2.0, 3), torch.arange(0.0, 4)
-        >>> floor = torch.cartesian_prod(x, y, torch.zeros(1))
-        >>> corner = torch.cat([torch.tensor([[0.0, 1, 0]]), floor, floor[:, [0, 2, 1]]])
-        >>> columns = split_columns((corner - corner[:1])[None])
-        >>> start, zero, noise = torch.tensor([[0.0, 1, 0]]), torch.zeros(1), torch.tensor([0.1])
-        >>> planes = fit_wedges(columns, start, zero - 1, noise).planes
-        >>> planes.normals.abs(), bool(planes.deviations < 0.01)
-        (tensor([[0., 0., 1.]]), True)
     """
     rests = residuals(columns, normals, offsets)
     second, first = _beyond(rests, noise), _near(rests, noise)

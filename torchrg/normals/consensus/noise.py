@@ -61,17 +61,6 @@ def survey_noise(
     few that even the nearest are of both faces of a plate, two parallel planes take the place of
     the one of all neighbours, if they leave 0.35 of its deviation or less. ``fit`` are the planes
     of all neighbours; noise is at least the rounding of the coordinates.
-
-    Example:
-        >>> from torchrg.neighbors import search_knn
-        >>> from torchrg.normals import estimate_normals
-        >>> floor = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
-        >>> floor[:, 2] = 0.01 * torch.randn(500, generator=torch.Generator().manual_seed(1))
-        >>> neighbors = search_knn(floor, 50)
-        >>> fit = estimate_normals(floor, method="paper", neighbors=neighbors)
-        >>> survey = survey_noise(floor, neighbors, fit)
-        >>> bool((survey.noise.median() - 0.01).abs() < 0.001)
-        True
     """
     offsets, radius, whole, layered = (torch.empty_like(points[:, 0]) for _ in range(4))
     small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
