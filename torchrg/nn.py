@@ -14,8 +14,7 @@ True
 torch.Size([8, 2])
 
 Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, these to :class:`Eigh`, and this to
-:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator. All have gradients, and run
-under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)`` and ``torch.export``.
+:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator.
 """
 
 from collections.abc import Callable

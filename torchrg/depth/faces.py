@@ -48,12 +48,12 @@ def join_strips(
     the face, if its plane is turned by at most 35 degrees against the face's, and if along half of
     its length or more the two meet without a step: their planes cross near the border, or are one
     within the noise there. Of several faces it goes to the one that it meets at most pixels, of
-    equal ones to the larger. Strips of strips stay.
+    equal ones to the larger. Strips of strips stay. The width of a region is twice its pixels over
+    its circumference in sides of pixels.
 
-    The width of a region is twice its pixels over its circumference in sides of pixels. ``labels``
-    ``(H, W)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; ``rays`` ``(H, W, 3)``
-    are ``(x, y, 1)``, so that those times ``planes`` ``(M, 3)`` are inverse depths, with a standard
-    deviation ``noise`` ``(H, W)``; ``normals`` ``(M, 3)`` are those of the regions in space.
+    ``labels`` ``(H, W)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; ``rays``
+    ``(H, W, 3)`` are ``(x, y, 1)``, so that those times ``planes`` ``(M, 3)`` are inverse depths,
+    of standard deviation ``noise`` ``(H, W)``; ``normals`` ``(M, 3)`` are in space.
     """
     num_regions = len(normals)
     edges, meetings = labels.new_zeros(num_regions + 1), []
@@ -115,7 +115,7 @@ def hidden_contacts(
 
     ``points`` ``(H * W, 3)`` and ``seen`` ``(H, W)`` are those of
     :class:`torchrg.depth.growth.InverseCloud`; ``reach`` ``(M,)`` is the distance from a plane that
-    counts as on it, NaN for a curved region. Pairs ``(E, 2)`` and their numbers of contacts are as
+    counts as on it, NaN for a curved region. The pairs are as
     :func:`torchrg.regions.repair.merge_coplanar` takes them.
     """
     pixels = _Lines(points.view(*seen.shape, 3), seen, labels.view(seen.shape))

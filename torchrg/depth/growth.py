@@ -65,8 +65,7 @@ class InverseCloud(NamedTuple):
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
     the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are of float64, in
-    columns; ``noise`` ``(H * W,)`` is the standard deviation of the last coordinate, and ``seen``
-    ``(H, W)`` are the pixels with depth.
+    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` have depth.
     """
 
     points: Tensor
@@ -200,7 +199,7 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
 def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     """Tell whether windows hold pixels, by row-major place in an image of so many columns.
 
-    Of the windows: their rows and columns ``(2, n)``, and row and column of their middles.
+    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of their middles.
     """
     (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()

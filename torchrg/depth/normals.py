@@ -69,10 +69,7 @@ class PixelPlanes(NamedTuple):
 
 
 class _Tolerances(NamedTuple):
-    """What windows of one size may deviate by, each of shape ``(h, w)``.
-
-    By noise alone, by noise or a slight bend, and by the strongest bend.
-    """
+    """Limits of deviation ``(h, w)``: of noise, of noise or a slight bend, of the strongest bend."""
 
     noise: Tensor
     flat: Tensor
@@ -293,8 +290,8 @@ class _Choice:
     ) -> None:
         """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
 
-        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; ``beside`` tells
-        that the windows are not around the cells.
+        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; the windows are around
+        the cells unless ``beside``.
         """
         waiting, sizes = self.waiting, (windows.size, places.shape[1])
         (chosen,) = map_rows(

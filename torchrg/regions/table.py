@@ -222,13 +222,10 @@ def _direction(up: Sequence[float] | str, points: Tensor) -> Tensor:
 def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     """Return the role of each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
 
-    A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
-    planes take up, a ceiling in the highest, if it has at least a tenth of the area of the largest
-    horizontal one; else it is "horizontal". A plane within 15 degrees of vertical is a wall if it
-    takes up half of that height, is a fifth of it wide, as sides of pillars are not, and, unlike
-    doors and cabinets, either reaches into the highest 10 % or has a quarter of the area of the
-    largest vertical one; else it is "vertical". Planes between are "oblique". What is curved by
-    more than 2 % of its short side is "other". A single horizontal plane is a floor.
+    By the constants above: a level plane is a floor or a ceiling if it is broad, and low or high
+    among all planes, else "horizontal"; an upright one is a wall if it is tall, wide, as sides of
+    pillars are not, and, unlike doors and cabinets, reaches the top or is large, else "vertical".
+    Planes between are "oblique", bent ones "other". A single horizontal plane is a floor.
     """
     kinds = {name: place for place, name in enumerate(PLANE_KINDS)}
     kind = torch.full_like(planes.count, kinds["other"])
@@ -285,11 +282,9 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.
     """Return the outline of points in a plane: rings through some of them.
 
     The points near an edge, found with square cells, are triangulated. Triangles over cells without
-    points are left out, and the others united.
-
-    Holes and dents narrower than ``width``, that of the cells, are filled. Outer rings ``(V, 2)``,
-    the first point not repeated, run counter-clockwise, holes clockwise; points on one line have
-    none.
+    points are left out, and the others united. Holes and dents narrower than ``width``, that of the
+    cells, are filled. Outer rings ``(V, 2)``, the first point not repeated, run counter-clockwise,
+    holes clockwise; points on one line have none.
 
     Raises:
         MissingDependencyError: If shapely is not installed.
@@ -438,11 +433,9 @@ def covered_areas(
 
     The plane is divided into square cells, at first three times as wide as the mean spacing of the
     points, then wider until the area hardly grows, so that parts of low density have no holes.
-    Cells along the outline are only partly covered: the expected excess is taken off. The area
-    never exceeds that of the rectangle about the region.
-
-    Returns areas ``(M,)``, 0 where the points are on one line, and the width of cells that leaves
-    no holes between points ``(M,)``.
+    Cells along the outline are only partly covered: the expected excess is taken off. Areas ``(M,)``
+    are 0 where the points are on one line, and at most those of the rectangles; the width ``(M,)``
+    of cells leaves no holes between points.
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()

@@ -141,11 +141,9 @@ def _pairs(num_neighbors: int, num_pairs: int, power: float) -> tuple[tuple[int,
 class MeetingPlanes(NamedTuple):
     """The plane of each point, one of several that explain its neighbourhood.
 
-    Attributes:
-        normals: Unit normals, shape ``(n, 3)``.
-        offsets: Of the planes ``normal . q = offset`` about the point, shape ``(n,)``.
-        deviations: Standard deviation of all neighbours from the planes, three degrees of freedom
-            less for each, shape ``(n,)``; infinite where a plane has fewer than five points.
+    Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset`` about the point,
+    and the standard deviation of all neighbours ``(n,)``, three degrees of freedom less for each
+    plane; infinite where one has fewer than five points.
     """
 
     normals: Tensor
@@ -154,13 +152,10 @@ class MeetingPlanes(NamedTuple):
 
 
 class Wedge(NamedTuple):
-    """Two planes that meet.
+    """Two planes that meet, and their plane of each point.
 
-    Attributes:
-        planes: The plane of each point.
-        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``; the others are of the
-            second.
-        outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
+    ``first`` are the points of the first plane, weights 0 or 1; ``outer`` signed distances of the
+    neighbours from the surface, both ``(n, K)``.
     """
 
     planes: MeetingPlanes

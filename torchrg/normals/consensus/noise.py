@@ -26,14 +26,11 @@ _LAYER_PARAMETERS = 4
 
 
 class Survey(NamedTuple):
-    """What the plane of each neighbourhood leaves unexplained.
+    """What the plane of each neighbourhood leaves unexplained, each of shape ``(N,)``.
 
-    Attributes:
-        offsets: Distance of the fitted plane from the point along the normal, shape ``(N,)``.
-        deviations: Standard deviation of the residuals (3 degrees of freedom less), ``(N,)``.
-        noise: Standard deviation of the noise, positive, shape ``(N,)``; infinite where too few
-            neighbours have a plane.
-        radius: Distance of the farthest neighbour, shape ``(N,)``.
+    Distance of the plane from the point along the normal; standard deviation of the residuals (3
+    degrees of freedom less) and of the noise, infinite where too few neighbours have a plane; and
+    the distance of the farthest neighbour.
     """
 
     offsets: Tensor

@@ -19,25 +19,14 @@ _PARABOLOID_PARAMETERS = 6
 
 
 class TangentPlanes(NamedTuple):
-    """A plane at each point.
-
-    Attributes:
-        normals: Unit normals of any sign, shape ``(N, 3)``; zero where there is no plane.
-        offsets: Signed distance of the plane from its point along the normal, shape ``(N,)``.
-    """
+    """A plane at each point: unit normals ``(N, 3)``, zero for none, and distances along them."""
 
     normals: Tensor
     offsets: Tensor
 
 
 class Surfaces(NamedTuple):
-    """The surfaces of all points.
-
-    Attributes:
-        planes: Tangent planes at the points.
-        sharp: Points whose neighbourhood is broken, shape ``(N,)``, bool.
-        voted: Sharp points that took the plane of the votes, shape ``(N,)``, bool.
-    """
+    """Tangent planes at all points; those that are sharp, and those of them by votes, bool."""
 
     planes: TangentPlanes
     sharp: Tensor
