@@ -69,7 +69,7 @@ class PixelPlanes(NamedTuple):
 
 
 class _Tolerances(NamedTuple):
-    """Limits of deviation ``(h, w)``: of noise, of noise or a slight bend, of the strongest bend."""
+    """Limits of deviation ``(h, w)``: noise, noise or a slight bend, the strongest bend."""
 
     noise: Tensor
     flat: Tensor
@@ -290,8 +290,8 @@ class _Choice:
     ) -> None:
         """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
 
-        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; the windows are around
-        the cells unless ``beside``.
+        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; the windows are
+        around the cells unless ``beside``.
         """
         waiting, sizes = self.waiting, (windows.size, places.shape[1])
         (chosen,) = map_rows(

@@ -433,9 +433,9 @@ def covered_areas(
 
     The plane is divided into square cells, at first three times as wide as the mean spacing of the
     points, then wider until the area hardly grows, so that parts of low density have no holes.
-    Cells along the outline are only partly covered: the expected excess is taken off. Areas ``(M,)``
-    are 0 where the points are on one line, and at most those of the rectangles; the width ``(M,)``
-    of cells leaves no holes between points.
+    Cells along the outline are only partly covered: the expected excess is taken off. Areas
+    ``(M,)`` are 0 where the points are on one line, and at most those of the rectangles; the width
+    ``(M,)`` of cells leaves no holes between points.
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()

@@ -108,8 +108,9 @@ def fit_detmm(
 
     The scale of the S-estimate is kept, and location and shape are iterated on with a wider
     bisquare that is 95 % efficient for normal data; see the reference of :func:`fit_dets`, whose
-    arguments these are. ``tuned_for`` says whether the efficiency is that of the ``"shape"`` (cut-off
-    6.0963 for P = 3), as normals want and R's rrcov has it, or of the ``"location"`` (5.4902).
+    arguments these are. ``tuned_for`` says whether the efficiency is that of the ``"shape"``
+    (cut-off 6.0963 for P = 3), as normals want and R's rrcov has it, or of the ``"location"``
+    (5.4902).
 
     Returns:
         The fits. Location and covariance are the MM-estimate, ``raw_*`` the S-estimate it started
