@@ -305,8 +305,8 @@ def reach_from_seeds(
 ) -> tuple[NDArray[np.int32], EdgeLists]:
     """Return the first of the seeds that reaches each point, and the edges of all other points.
 
-    The edges of seeds are one graph, or on a disk the graphs of blocks, each without what reaches
-    one another in it, so that not all of them are in memory.
+    The edges of seeds are one graph, or on a disk the graphs of blocks that :func:`condense`
+    shrinks.
     """
     num_points = len(cloud.points)
     if not scratch.is_active():

@@ -2,7 +2,8 @@
 
 Where growth is free of order, the first seed that reaches a point has it. Points that reach one
 another have the same: within a block such components shrink to one node each, and what is left of
-the graph fits into memory.
+the graph fits into memory. One graph of all would not where a cloud has over 2^31 edges, some 40
+million points: SciPy searches it by copies of the edges in 64 bits.
 """
 
 from typing import NamedTuple
