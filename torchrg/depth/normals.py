@@ -47,14 +47,13 @@ _PIXELS_AT_ONCE = 2**14
 
 
 class PixelPlanes(NamedTuple):
-    """A plane in inverse depth for each pixel: that of a window.
+    """A plane in inverse depth for each pixel, that of a window, in columns and rows from the axis.
 
-    The planes are in columns and rows from the optical axis. ``window`` tells pixels of one window
-    from those of others, ``sides`` ``(2, H, W)`` are its rows and columns, and ``middle``
-    ``(2, H, W)`` row and column of its middle. ``valid`` tells which pixels have a plane, ``flat``
-    whether their window is flat, ``edge`` whether it is but could not lie around the pixel;
-    ``noise`` is the standard deviation of inverse depth, as large windows see it, and
-    ``tolerance`` what a flat window may deviate by. All others are of shape ``(H, W)``.
+    ``window`` tells pixels of one window from those of others, ``sides`` ``(2, H, W)`` are its rows
+    and columns, and ``middle`` ``(2, H, W)`` row and column of its middle. ``valid`` tells which
+    pixels have a plane, ``flat`` whether their window is flat, ``edge`` whether it is but could not
+    lie around the pixel; ``noise`` is that of inverse depth, as large windows see it, ``tolerance``
+    what a flat window may deviate by. All others are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes

@@ -12,8 +12,7 @@ from torchrg.metrics.contingency import ContingencyTable, count_overlaps, share
 class LabelScore(NamedTuple):
     """External indices of a labelling; see :func:`score_labels`.
 
-    Percentages as in the paper, counts, and shares in [0, 1] (``ari`` can be negative), as
-    ``METRICS["labels"]`` says.
+    ``METRICS["labels"]`` says which are percentages, as in the paper, counts or shares in [0, 1].
 
     Attributes:
         precision: Mean over the pairs of ``100 |C & G| / |C|`` (section III.B), percent.
@@ -127,13 +126,10 @@ def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]
 def match_regions(table: ContingencyTable) -> Tensor:
     """Pair each region with the face that it overlaps most and that it is overlapped most by.
 
-    So pairs the paper, see :func:`score_labels`. Equal overlaps, in points, are decided by the
-    larger intersection over union, that is the smaller partner; then by the lower label. (The paper
-    also says "the maximum or second maximum overlap", and not how the second enters.)
-
-    Returns:
-        The rows of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64; no region
-        and no face occurs twice.
+    So the paper pairs them, see :func:`score_labels`. Equal overlaps, in points, are decided by the
+    larger intersection over union, that is the smaller partner; then by the lower label. (It also
+    says "the maximum or second maximum overlap", and not how the second enters.) Returns the rows
+    of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64.
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
@@ -162,14 +158,11 @@ def _is_first(groups: Tensor, *keys: Tensor) -> Tensor:
 
 
 def adjusted_rand_index(table: ContingencyTable) -> float:
-    r"""Return the Rand index corrected for chance [1].
+    """Return the Rand index corrected for chance [1].
 
     The unlabelled points of a side are one more part of it: the value is that of scikit-learn's
-    ``adjusted_rand_score`` for the same labels, -1 included.
-
-    Returns:
-        At most 1 (equal partitions), about 0 for independent ones, negative for worse. 1 for two
-        partitions without any pair of points to judge, one point or no point included.
+    ``adjusted_rand_score`` for the same labels, -1 included. At most 1 (equal partitions), about 0
+    for independent ones, negative for worse; 1 where there is no pair of points to judge.
 
     References:
         [1] L. Hubert, P. Arabie. Comparing partitions. Journal of Classification, 1985, eq. 5.

@@ -25,8 +25,8 @@ class PartitionScore(NamedTuple):
             superpoint takes its most frequent part.
         oracle_miou: Mean IoU over the parts of that labelling.
         boundary_recall: Share of the points at a true border that have one at a border of
-            superpoints within ``boundary_distance``.
-        boundary_precision: The reverse share. Without coordinates all three are None.
+            superpoints within ``boundary_distance``. Without coordinates all three are None.
+        boundary_precision: The same share the other way round.
         boundary_distance: That distance, in the unit of the cloud.
         count: Superpoints, those without a scored point included.
         points_per_superpoint: Mean number of points of a superpoint, all points counted.

@@ -134,16 +134,15 @@ def fit_normals_irls(
     4. If that turned the normal by more than 5 degrees, there is an edge: a second solution starts
        across the first, and the one closer to the point with more than a tenth of the others wins.
 
-    Convention:
-        The point itself is the first of the patch that counts; it takes no part in the fit.
-        The authors' ``mu_decay`` is 1.01; 1.05 takes a fifth of the time, and its mean squared
-        errors on solids with edges are 4 to 11 % larger. (The paper prints eq. (5) without the
-        square of ``r``; the authors square it.) Their surface may be curved by a known radius;
-        here it is flat. Gradients are those of the steps as taken.
+    The point itself is the first of the patch that counts; it takes no part in the fit. The
+    authors' ``mu_decay`` is 1.01; 1.05 takes a fifth of the time, and its mean squared errors on
+    solids with edges are 4 to 11 % larger. (The paper prints eq. (5) without the square of ``r``;
+    the authors square it.) Their surface may be curved by a known radius; here it is flat.
+    Gradients are those of the steps as taken.
 
-    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. ``noise`` is that of
-    the points, a standard deviation, shape ``(*)``, in the unit of the cloud; at least 1e-4 of the
-    distance to the farthest point is assumed. ``mu_decay`` is above 1.
+    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. ``noise`` is a
+    standard deviation, shape ``(*)``, in the unit of the cloud; at least 1e-4 of the distance to
+    the farthest point is assumed. ``mu_decay`` is above 1.
 
     Returns:
         The fit. Curvature and residual are those of PCA on it and the points of weight above

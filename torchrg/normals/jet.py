@@ -47,18 +47,17 @@ def fit_normals_jet(
 
 
 class JetFit(NamedTuple):
-    """A quadratic surface through each neighbourhood; see :func:`fit_jet`.
+    """A quadratic surface through each neighbourhood, zero if not valid; see :func:`fit_jet`.
 
     Attributes:
-        normals: Unit normals of the surface at the point itself, shape ``(*, 3)``; zero where not
-            ``valid``. The sign is arbitrary.
+        normals: Unit normals of the surface at the point itself, shape ``(*, 3)``, of any sign.
         foot: Point of the surface above or below it, shape ``(*, 3)``.
         principal_curvatures: The larger and the smaller one, shape ``(*, 2)``, in 1 / unit of the
             cloud; positive where the surface bends towards ``normals``.
         principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
             two orthogonal ones where the two curvatures are equal.
         curvature: Surface variation, as of :func:`torchrg.normals.fit_normals_pca`, shape ``(*)``.
-        valid: Whether there is a plane, shape ``(*)``, bool; all else is zero where not.
+        valid: Whether there is a plane, shape ``(*)``, bool.
         residual_rms: Root mean square distance of the points to the surface along the normal of
             their plane, shape ``(*)``.
     """
@@ -217,8 +216,8 @@ def least_squares(
 
     Modified Gram-Schmidt with the target as the last column: as accurate as Householder's QR, and
     made of sums of products only, so it runs batched on any device and gradients flow. Each column
-    comes with the share of its length that must be left after those before it are taken out.
-    Returns the coefficient of each, shape ``(*, 1)``, 0 where it is left out, and the residual.
+    comes with the share of its length that must be left. Returns the coefficient of each, shape
+    ``(*, 1)``, 0 where it is left out, and the residual.
     """
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
@@ -251,9 +250,9 @@ def _principal_curvatures(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit normals of height fields, principal curvatures and their directions.
 
-    From first and second derivatives: normals of positive height ``(*, 3)``, curvatures ``(*, 2)``,
-    larger first, and directions ``(*, 2, 3)``, these without gradient. They are the eigenvalues of
-    the shape operator, of entries aa, ab, bb in an orthonormal basis of tangents.
+    From first and second derivatives: normals of positive height ``(*, 3)``; curvatures ``(*, 2)``,
+    larger first, the eigenvalues of the shape operator, of entries aa, ab, bb in an orthonormal
+    basis of tangents; and directions ``(*, 2, 3)``, without gradient.
     """
     one = torch.ones_like(slope_u)
     gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()

@@ -136,8 +136,7 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
 def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     """Return a cloud after a rigid motion ``(4, 4)`` of its coordinates and normals.
 
-    What its file says about places, as a viewpoint or a coordinate system, is left out. Points that
-    are not finite stay as they are.
+    What its file says about places, as a viewpoint or a coordinate system, is left out.
 
     Example:
         >>> import numpy as np

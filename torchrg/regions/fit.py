@@ -66,16 +66,12 @@ class RegionPlanes(NamedTuple):
         center: A point of each plane, the weighted mean, shape ``(M, 3)``.
         covariance: Weighted covariance, shape ``(M, 3, 3)``.
         thickness: Robust standard deviation of the points from the plane, at least the floor, shape
-            ``(M,)``.
-        rms: Root mean square distance of the points from the plane, shape ``(M,)``.
-        num_points: Number of points, shape ``(M,)``, int64.
-        curved: Whether the points' normals are spread too much for a plane, shape ``(M,)``, bool.
-        floor: Least thickness that counts, shape ``(M,)``.
-        reach: Median distance within which the points take others for coplanar, shape ``(M,)``,
-            infinite where that is not known.
-        bent: Whether noise does not explain the thickness, shape ``(M,)``, bool.
-        radius: Median distance of the points to the last of their neighbours, shape ``(M,)``, 0
-            where there are none.
+            ``(M,)``, as all that follow.
+        rms: Root mean square distance of the points from the plane. num_points: Number of points,
+        int64. curved: Whether the points' normals are spread too much for a plane, bool. floor:
+        Least thickness that counts. reach: Median distance within which the points take others for
+        coplanar, infinite if unknown. bent: Whether noise does not explain the thickness, bool.
+        radius: Median distance of the points to the last of their neighbours, 0 without any.
     """
 
     normal: Tensor

@@ -115,10 +115,7 @@ def _majorities(
 
 
 def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimension: int) -> Tensor:
-    """Fit a flat to the chosen points of each lane, and mark the points that lie on it.
-
-    Points ``(K, M)`` within a tolerance ``(M,)`` of the flat of some dimension lie on it.
-    """
+    """Fit a flat to the chosen points of each lane, and mark those ``(K, M)`` that lie on it."""
     columns = [column.double() for column in columns]
     weights = chosen.double()
     count = sum_points(weights)

@@ -120,9 +120,9 @@ def fit_patchwise(
 ) -> RobustFit:
     """Apply an estimator to every patch, and answer the degenerate ones.
 
-    Patches are grouped by their number of points that count, so that every group is dense. The
-    points on one plane are an exact fit where they are ``majority(n)`` of n, by default h. Only
-    gradients ask ``weigh`` for the weights ``(*, K)`` of the points that a fit is the mean of.
+    Patches are grouped by their number of points that count. Those on one plane are an exact fit if
+    they are ``majority(n)`` of n, by default h. Only gradients ask ``weigh`` for the weights
+    ``(*, K)`` of the points that a fit is the mean of.
     """
     patches = as_tensor(caller, "patches", patches)
     check_floating(caller, patches=patches)

@@ -48,10 +48,7 @@ _PLANES_AT_ONCE = 8
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:
-    """Initial sets ``(K, S, M)`` of the chosen starts, each with the size of its sets.
-
-    1 stands for a point in the set, 0 for another; ``size`` is h.
-    """
+    """Initial sets ``(K, S, M)``, as 0 and 1, of the chosen starts, each with its size."""
     half = -(-len(columns[0]) // 2)
     if starts == "paper":
         return [(_deterministic_starts(columns, half), half)]
@@ -219,8 +216,7 @@ def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
 
     The best planes are those with the smallest ``size``-th distance (least median of squares).
     With a minority of outliers some of the planes pass through clean points only, wherever the
-    outliers are; six scatter estimates may all be drawn to one cluster of them. There are only
-    sums and one sort a plane, against 27 Qn for the published starts.
+    outliers are. There are only sums and one sort a plane, against 27 Qn for the published starts.
     """
     num_points, num_lanes = columns[0].shape
     sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
