@@ -136,7 +136,9 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPla
 
 def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
     """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
-    shares, directions = eigh3_of_few(_spread_of(segments, normals))
+    columns = segments.take_columns(normals)
+    spread_of_normals = _covariances(segments, columns, torch.ones_like(columns[0]))
+    shares, directions = eigh3_of_few(spread_of_normals)
     # The direction that the normals of a region share, signs aside, and their angle to it.
     usual = directions[:, :, 2]
     spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
@@ -230,12 +232,6 @@ def coordinates_along(segments: Segments, columns: Sequence[Tensor], axes: Tenso
     for column, part in zip(columns, axes.unbind(dim=1), strict=True):
         total += column * segments.spread(part)
     return total
-
-
-def _spread_of(segments: Segments, normals: Tensor) -> Tensor:
-    """Return the second moments of the regions' normals, shape ``(M, 3, 3)``."""
-    columns = segments.take_columns(normals)
-    return _covariances(segments, columns, torch.ones_like(columns[0]))
 
 
 def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:

@@ -70,6 +70,8 @@ _MOST_BEND = 0.02
 """A region whose points are off its plane by at most this share of its short side is flat enough to
 have a role: a wall with a bulge is a wall, and a pillar is none."""
 
+_Outlines = tuple[tuple[Tensor, ...], ...]
+
 
 def summarize_planes(
     points: Tensor | NDArray[np.floating],
@@ -115,7 +117,7 @@ def summarize_planes(
     fit = fit_planes(segments, points, normals)
     first, second = _plane_axes(fit)
 
-    def measure() -> list[_Measures]:
+    def measure() -> list[tuple[list[Tensor], _Outlines]]:
         parts, start = [], 0
         for some in segments.split(POINTS_AT_ONCE):
             rows = slice(start, start + len(some.counts))
@@ -132,9 +134,8 @@ def summarize_planes(
         )
 
     measures, meeting = run_beside(measure, meet, points.device)
-    mean, area, sides, directions, middle = (
-        torch.cat(parts) for parts in list(zip(*measures, strict=True))[:5]
-    )
+    numbers, outlines = zip(*measures, strict=True)
+    mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
 
     def own(values: Tensor) -> Tensor:
@@ -155,28 +156,20 @@ def summarize_planes(
     if up is not None:
         planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
     if outline:
-        planes = planes._replace(outline=sum((part.outline for part in measures), ()))
+        planes = planes._replace(outline=sum(outlines, ()))
     if meeting is not None:
         lengths, angles = own(meeting.boundary_length), own(meeting.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
 
 
-class _Measures(NamedTuple):
-    """What is measured in the planes of regions: see :class:`Rectangles`, and :class:`Planes`."""
-
-    mean: Tensor
-    area: Tensor
-    sides: Tensor
-    directions: Tensor
-    middle: Tensor
-    outline: tuple[tuple[Tensor, ...], ...]
-
-
 def _measure(
     points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor, Tensor], *, outline: bool
-) -> _Measures:
-    """Measure regions in their planes, given by centers and two directions, each ``(M, 3)``."""
+) -> tuple[list[Tensor], _Outlines]:
+    """Measure regions in their planes, given by centers and two directions, each ``(M, 3)``.
+
+    The mean of the points about the center, the area, the rectangle, and outlines if asked for.
+    """
     center, first, second = frame
     centered = segments.take_about(points, center)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)
@@ -185,7 +178,7 @@ def _measure(
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
     rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
-    return _Measures(mean, area, boxes.sides, boxes.directions, boxes.center, rings)
+    return [mean, area, *boxes], rings
 
 
 def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
@@ -264,7 +257,7 @@ def _outlines(
     width: Tensor,
     frame: tuple[Tensor, Tensor, Tensor],
     dtype: torch.dtype,
-) -> tuple[tuple[Tensor, ...], ...]:
+) -> _Outlines:
     """Trace the outline of each region, and lift it into space."""
     outlines = []
     counts = segments.counts.tolist()

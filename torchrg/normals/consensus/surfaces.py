@@ -25,17 +25,9 @@ class TangentPlanes(NamedTuple):
     offsets: Tensor
 
 
-class Surfaces(NamedTuple):
-    """Tangent planes at all points; those that are sharp, and those of them by votes, bool."""
-
-    planes: TangentPlanes
-    sharp: Tensor
-    voted: Tensor
-
-
 def fit_surfaces(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, survey: Survey, *, chunk_size: int
-) -> Surfaces:
+) -> tuple[TangentPlanes, Tensor, Tensor]:
     r"""Give each point the plane, the paraboloid or the one of several planes that explains most.
 
     With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. The others get a
@@ -50,7 +42,8 @@ def fit_surfaces(
     is above 8, and above 20 on average over the point's 16 nearest, where a neighbourhood that is
     not broken counts as 0. Noise makes single points look broken; an edge does so to all of them.
     Points that are left with ``J > 2 s`` take the plane of the votes. ``fit`` and ``survey`` are
-    those of all neighbours by PCA.
+    those of all neighbours by PCA. Returns the tangent planes of all points, which points are
+    sharp, as their neighbourhood is broken, and which of them took the plane of the votes.
     """
     noise = survey.noise
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
@@ -92,7 +85,7 @@ def fit_surfaces(
     for chosen, planes in ((voted, by_votes), (meets, meeting)):
         normals = torch.where(chosen[:, None], planes.normals, normals)
         offsets = torch.where(chosen, planes.offsets, offsets)
-    return Surfaces(TangentPlanes(normals, offsets), voted | meets, voted)
+    return TangentPlanes(normals, offsets), voted | meets, voted
 
 
 @kernel("N 3", "N K", "N K", "N 3", "n")
