@@ -213,10 +213,7 @@ def _begin_thread(grad_enabled: bool, context: Context) -> None:
 
 
 def _set_own_threads(numbers: Sequence[int]) -> list[int]:
-    """Set on how many threads the operations of this thread run; return what it was.
-
-    First that of MKL (0: what it takes by default), then those of each OpenMP library.
-    """
+    """Set MKL's threads of this thread (0: its default), then OpenMP's; return those before."""
     mkl, libraries = _mkl_setter(), _openmp_libraries()
     before = [mkl(numbers[0]), *(library.num_threads for library in libraries)]
     for library, number in zip(libraries, numbers[1:], strict=True):

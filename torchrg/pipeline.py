@@ -166,11 +166,7 @@ def prepare_kernels(
 
 
 class _CanonicalCloud(NamedTuple):
-    """The finite points of a cloud, or those that stand for its voxels, in canonical order.
-
-    ``points`` ``(n, 3)`` are at ``rows`` ``(n,)`` of the cloud; ``inverse`` ``(N,)`` is the one
-    that stands for each of its points, or -1; None without voxels.
-    """
+    """Points in canonical order, their rows in the cloud; with voxels, that of each or -1."""
 
     points: Tensor
     rows: Tensor

@@ -49,8 +49,8 @@ def note_on_steps(
     where half of them are in one place. It does not depend on the order of the points.
 
     Args:
-        points: Coordinates as they came, shape ``(N, 3)``, float32 or float64, whose steps, sixteen
-            digits, are not looked at; what is not finite does not count.
+        points: Coordinates as they came, shape ``(N, 3)``, float32 or float64; what is not finite
+            does not count, nor do the steps of float64.
         scale: What the coordinates are multiples of in their file. Default: of nothing.
         cure: What to do where it is the type that is too coarse, and not the scale.
 

@@ -119,10 +119,7 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
 def _joins(
     pixels: PixelPlanes, normals: Tensor, u: Tensor, v: Tensor, axis: int, config: DepthConfig
 ) -> Tensor:
-    """Return whether pixels and the next ones along an axis are on one surface, one place less.
-
-    Pixels of one window are: only the pairs of two windows are looked at.
-    """
+    """Return whether pixels and the next ones along an axis are on one surface, one place less."""
     width, length = pixels.flat.shape[1], pixels.flat.shape[axis] - 1
     joins = pixels.flat.narrow(axis, 0, length) & pixels.flat.narrow(axis, 1, length)
     one_window = pixels.window.narrow(axis, 0, length) == pixels.window.narrow(axis, 1, length)
@@ -161,11 +158,7 @@ def _are_on_one_surface(
     v: Tensor,
     limits: Tensor,
 ) -> tuple[Tensor]:
-    """Tell which pixels are on one surface with the next ones along an axis, all by place.
-
-    Limits are those of the step and of the squared chords between normals, the usual one and the
-    wider one.
-    """
+    """Tell which pixels are on one surface with others; limits of step, angle and wider angle."""
     max_step, max_sq_chord, wider_sq_chord = limits.unbind()
     width = u.shape[0]
     row, column = here // width, here % width
@@ -207,11 +200,7 @@ def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
 
 
 def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
-    """Return the connected components of an image ``(H * W,)``, -1 where it is not flat.
-
-    ``down`` ``(H - 1, W)`` and ``right`` ``(H, W - 1)`` tell which pixels join the next one; on a
-    grid with a place for each pixel and each pair scipy finds the components.
-    """
+    """Return the connected components of an image ``(H * W,)``, -1 where it is not flat."""
     from scipy.ndimage import label
 
     height, width = flat.shape

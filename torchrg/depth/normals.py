@@ -155,11 +155,7 @@ class _SquareWindows(NamedTuple):
 
 
 class _NarrowWindows(NamedTuple):
-    """Flat narrow windows ``(k,)``, and the pixels that they hold ``(k, 27)``, -1 for none.
-
-    ``shape`` is the row of :data:`torchrg.depth.windows.NARROW`, and ``pixel`` the one in the
-    middle, by row-major place in an image of so many columns.
-    """
+    """Flat narrow windows ``(k,)`` by middle pixel, and what they hold ``(k, 27)``, or -1."""
 
     first: int
     planes: WindowPlanes
@@ -257,10 +253,7 @@ def _flatness(windows: _SquareWindows, quarters: _SquareWindows | None) -> Tenso
 
 
 class _Choice:
-    """The window that each pixel of an image takes, numbered through all windows of all sizes.
-
-    Pixels that have none are offered one after the other, and keep the first that they are on.
-    """
+    """The window that each pixel takes, numbered through all sizes: the first that it is on."""
 
     def __init__(self, inverse: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> None:
         self.shape = inverse.shape
@@ -328,11 +321,7 @@ def _chosen_windows(
     v: Tensor,
     sizes: Tensor,
 ) -> tuple[Tensor]:
-    """Return the window that pixels are offered if they are within its reach, else -1.
-
-    ``places`` has the window that each cell offers or -1; ``sizes`` are the width of a cell, and
-    how many are in a row.
-    """
+    """Return the window that cells offer pixels near it, or -1; ``sizes`` are width and columns."""
     size, num_columns = sizes.unbind()
     width = u.shape[0]
     row, column = pixels // width, pixels % width
@@ -428,10 +417,7 @@ def _tolerances_of_planes(
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
-    """Return the root mean square deviation of the quarters of windows ``(h, w)``; inf without any.
-
-    They are windows of half the size: the four at the corners of a window cover it exactly.
-    """
+    """Return the root mean square deviation of the windows of half the size that cover windows."""
     height, width = shape
     corner = SIDE
     padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)

@@ -221,10 +221,7 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """Return what steps of Newton's method lead to, and the last step.
-
-    The coefficients are trace, sum of the principal minors and determinant, shape ``(3, n)``.
-    """
+    """Return the root after steps, by trace, principal minors, determinant; and the last step."""
     trace, minors, determinant = coefficients
     twice, step = 2 * trace, root
     for _ in range(num_steps):

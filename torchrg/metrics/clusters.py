@@ -246,10 +246,7 @@ def _closest_chord(points: Tensor, clusters: Tensor) -> float:
 
 
 def _refine(cells: Tensor, points: Tensor, level: int) -> tuple[Tensor, Tensor]:
-    """Return the cell of each point, of side 0.5^level, and the row of a point of each cell.
-
-    The given cells are of twice that side, or clusters at level 0; each is divided into eight.
-    """
+    """Return the cell, of half the side before, of each point, and a point of each cell."""
     keys = cells
     for column in points.unbind(dim=1):
         keys = keys * 2 + ((column + 1) * 2**level).long() % 2

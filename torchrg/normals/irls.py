@@ -74,12 +74,7 @@ class _Offsets(NamedTuple):
 
 
 class _Plane(NamedTuple):
-    """Planes near points, and the scale of the weights.
-
-    Unit normals, points of the planes relative to the points themselves, both ``(n, 3)``, and the
-    squared distance ``(n, 1)`` at which the weight is a quarter; and the normals and the ``mu``
-    that the last weights were taken with.
-    """
+    """Unit normals and centers ``(n, 3)``, the scale of weights ``(n, 1)``, and those last used."""
 
     normal: Tensor
     center: Tensor

@@ -348,10 +348,7 @@ def propagate_signs(
 
 
 class _Links(NamedTuple):
-    """Links between neighbours, each of shape ``(L,)``, the end of lower row first.
-
-    Also the bend, and the cosine between the normal of one end and the mirrored one of the other.
-    """
+    """Links of neighbours ``(L,)``, lower row first; cosines are of a normal and one mirrored."""
 
     starts: Tensor
     ends: Tensor

@@ -224,11 +224,7 @@ def _edges(points: Tensor, contacts: _Contacts) -> Tensor:
 
 
 def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Tensor) -> Tensor:
-    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``.
-
-    ``along`` are directions of the lines, ``(E, 3)``, and ``spacing`` mean lengths of the edges,
-    NaN for pairs that do not meet on a line.
-    """
+    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
     origin = points[:1].double()
     cells = array("q"), array("q")
     for contacts in border.contacts():

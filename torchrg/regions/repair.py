@@ -102,10 +102,7 @@ def refine_regions(
 def _drop_scattered(
     cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
 ) -> Tensor:
-    """Return labels without regions that are too small and whose normals do not agree.
-
-    Those that agree may be large enough with the points at their borders. Numbers have gaps then.
-    """
+    """Return labels without small regions whose normals do not agree, with gaps."""
     small = torch.bincount(labels + 1, minlength=1)[1:] < config.min_size
     small = torch.cat([small, small.new_zeros(1)])
     segments = Segments(torch.where(small[labels], labels, UNLABELED))
@@ -240,11 +237,7 @@ def merge_facets(
 
 
 class _Moments(NamedTuple):
-    """What merging reads of M regions, in float64.
-
-    Number of points, their mean, about an origin near them, and covariance, the distance from its
-    plane that counts as lying on it (none from that of a curved one), and the noise it lends.
-    """
+    """Moments of regions, the distance that counts as on their planes, and noise they lend."""
 
     weight: Tensor
     mean: Tensor
@@ -288,10 +281,7 @@ def _merge(
     *,
     max_tilt: float | None = None,
 ) -> Tensor:
-    """Return labels where each region has the smallest number of those that it is merged with.
-
-    With a largest tilt, pairs stay apart if the joint plane is turned too far against either.
-    """
+    """Return labels of merged regions, the smallest of each, within a largest tilt."""
     pairs, groups = pairs.cpu(), _Moments(*(values.cpu().clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(touching))), [0] * len(touching)

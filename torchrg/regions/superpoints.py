@@ -189,10 +189,7 @@ def _mesh_edges(faces: Tensor, places: Tensor) -> Tensor:
 
 
 def _listed(edges: Tensor, num_places: int) -> Tensor:
-    """Return the places that edges lead to from each ``(n, K)``; itself where there are fewer.
-
-    Of a place with more than 64, those 64 that are first; the others list it.
-    """
+    """Return the first 64 places that edges lead to from each ``(n, K)``; itself where fewer."""
     counts = torch.bincount(edges[:, 0], minlength=num_places)
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
     kept = column < _MOST_EDGES
@@ -203,10 +200,7 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
 
 
 class _Regions(NamedTuple):
-    """Sums over the points of R regions, and the boxes around them, float64.
-
-    ``size`` ``(R,)``, ``features`` ``(F, R)``, ``low`` and ``high`` ``(3, R)``.
-    """
+    """Sums over the points of R regions along the last axis, and the boxes around them, float64."""
 
     size: Tensor
     features: Tensor
@@ -370,10 +364,7 @@ def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, sq_chord: Tensor) ->
 def _merge_to_strength(
     strength: float, graph: _Graph, min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge pairs that cost at most ``strength``, then regions that are too small.
-
-    Returns the graph of what is left, and what each region has become, shape ``(R,)``.
-    """
+    """Merge pairs that cost at most ``strength``, then small regions; return what each has become."""
     graph, become = _last(_merging(graph, bound, lambda cost, graph: cost <= strength))
     graph, merged = _last(_merging(graph, bound, partial(_joins_small, min_size)))
     return graph, merged[become]
@@ -421,11 +412,7 @@ def _merging(
     is_eligible: Callable[[Tensor, _Graph], Tensor],
     count: int = 1,
 ) -> Iterator[tuple[_Graph, Tensor]]:
-    """Merge eligible pairs, many at a time, while more than ``count`` regions are left.
-
-    Yields the graph and what each region has become, shape ``(R,)``: as they are, then after each
-    time.
-    """
+    """Yield the graph and what regions become while eligible pairs merge down to ``count``."""
     # Two that fit into the box of a third one by one may not fit together.
     ratio = _MUCH_LARGER if bound == math.inf else math.inf
     become = torch.arange(len(graph.regions.size))

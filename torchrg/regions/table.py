@@ -166,10 +166,7 @@ def summarize_planes(
 def _measure(
     points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor, Tensor], *, outline: bool
 ) -> tuple[list[Tensor], _Outlines]:
-    """Measure regions in their planes, given by centers and two directions, each ``(M, 3)``.
-
-    The mean of the points about the center, the area, the rectangle, and outlines if asked for.
-    """
+    """Return mean, area, rectangle and outlines of regions, by centers and two axes ``(M, 3)``."""
     center, first, second = frame
     centered = segments.take_about(points, center)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)

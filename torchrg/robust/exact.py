@@ -89,10 +89,7 @@ def _majorities(
     reach: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor]:
-    """Count the points near the first few candidates of each lane, and keep one full one.
-
-    Returns the lanes ``(F,)`` that have one, and the points near it ``(K, F)``.
-    """
+    """Return the lanes ``(F,)`` where a candidate is full, and its points ``(K, F)``."""
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
     simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)

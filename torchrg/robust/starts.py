@@ -134,10 +134,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
 
 
 def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
-    """Squared distances of the points after sphering by each start's scatter, ``(K, S, M)``.
-
-    ``loadings`` are the eigenvectors of the scatters, as columns, shape ``(S, M, P, P)``.
-    """
+    """Squared distances ``(K, S, M)`` of points sphered by the eigenvectors ``(S, M, P, P)``."""
     shape = (len(columns[0]), *loadings.shape[:2])
     sphered: list[Tensor] = []
     for directions in loadings.unbind(dim=3):

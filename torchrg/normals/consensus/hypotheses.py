@@ -112,10 +112,7 @@ def _refitted(
 
 
 def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
-    """Return planes through the points and two neighbours of ranks ``(P, 2)``, where they span one.
-
-    Unit normals ``(n, P, 3)`` and flags ``(n, P)``.
-    """
+    """Return normals ``(n, P, 3)`` of planes through neighbours, and if these span one."""
     a, b, c = (column.index_select(1, ranks[:, 0]) for column in columns)
     d, e, f = (column.index_select(1, ranks[:, 1]) for column in columns)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d

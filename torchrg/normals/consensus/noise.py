@@ -134,11 +134,7 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 def _deviations(
     points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return offsets, deviations and radius of planes of all neighbours, and what to look at again.
-
-    That is where the residuals have the low kurtosis of two parallel planes, and where several
-    neighbours are at one place.
-    """
+    """Return parts of a survey, where residuals are layered, and neighbours at one place."""
     columns = gather_columns(points, indices)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
     count = counted.sum(dim=1)
@@ -156,10 +152,7 @@ def _deviations(
 
 
 def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole: Tensor) -> Tensor:
-    """Return deviations from two parallel planes, the faces of a plate; inf where there are none.
-
-    ``normals`` are those of one plane and ``whole`` are the deviations from it.
-    """
+    """Return deviations from two parallel planes, the faces of a plate; inf where there are none."""
     columns = gather_columns(points, near.indices)
     counted = near.counted().to(points.dtype)
     count = counted.sum(dim=1)

@@ -117,10 +117,7 @@ def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Colum
 
 
 def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
-    """Return the points whose gain can make that of some point large enough on average.
-
-    Most of the points that look broken by noise alone are spared the fits.
-    """
+    """Return the points whose gain can make an average large enough, which spares most the fits."""
     most = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
     open_points = broken & (most > constants.MIN_POOLED_GAIN)
     pooled = neighbors.indices[open_points, : constants.NUM_POOLED].reshape(-1)
