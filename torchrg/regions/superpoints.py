@@ -412,7 +412,7 @@ def _merging(
     is_eligible: Callable[[Tensor, _Graph], Tensor],
     count: int = 1,
 ) -> Iterator[tuple[_Graph, Tensor]]:
-    """Yield the graph and what regions become while eligible pairs merge down to ``count``."""
+    """Yield the graph and what regions become while eligible pairs merge to ``count``."""
     # Two that fit into the box of a third one by one may not fit together.
     ratio = _MUCH_LARGER if bound == math.inf else math.inf
     become = torch.arange(len(graph.regions.size))

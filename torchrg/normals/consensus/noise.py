@@ -134,7 +134,7 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 def _deviations(
     points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return parts of a survey, where residuals are layered, and neighbours at one place."""
+    """Return parts of a survey, where residuals are layered, and where places repeat."""
     columns = gather_columns(points, indices)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
     count = counted.sum(dim=1)
