@@ -111,12 +111,7 @@ def map_rows(
 
 
 def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
-    """Call ``work`` on chunks of the row numbers of the chosen points; see :func:`map_chunks`.
-
-    Example:
-        >>> map_chosen(torch.Tensor.tolist, torch.tensor([True, False, True]), 5)
-        [[0, 2]]
-    """
+    """Call ``work`` on chunks of the row numbers of the chosen points; see :func:`map_chunks`."""
     rows = places_of(chosen)
     return map_chunks(lambda chunk: work(rows[chunk]), len(rows), chunk_size, rows.device)
 
@@ -150,12 +145,7 @@ def map_tasks(
 def run_beside(
     first: Callable[[], Result], second: Callable[[], Other], device: torch.device
 ) -> tuple[Result, Other]:
-    """Return the results of two calls, run side by side if there are threads.
-
-    Example:
-        >>> run_beside(lambda: 1, lambda: "a", torch.device("cpu"))
-        (1, 'a')
-    """
+    """Return the results of two calls, run side by side if there are threads."""
     results: list[Any] = map_tasks(lambda call: call(), [first, second], device)
     return results[0], results[1]
 

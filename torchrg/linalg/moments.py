@@ -251,10 +251,7 @@ def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Fit a plane to the neighbours with each of several weights; see :func:`fit_weighted_planes`.
-
-    Returns unit normals ``(n, 3)`` and offsets ``(n,)`` for each.
-    """
+    """Fit a plane to the neighbours with each of the weights; see :func:`fit_weighted_planes`."""
     means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
     normals = smallest_eigenvector3(torch.stack(covariances))[1]
     offsets = (normals * torch.stack(means)).sum(dim=-1)

@@ -46,8 +46,7 @@ def rows_at_once(length: int) -> int:
 def chord_table(a: Tensor, b: Tensor, *, aligned: bool = False) -> Tensor:
     """Return the chord between all directions of two sets, shape ``(A, B)``, in [0, sqrt(2)].
 
-    ``aligned`` promises that no angle between the vectors as given exceeds 90 degrees, and saves
-    half of the work.
+    If they are ``aligned``, no two more than 90 degrees apart, that is half of the work.
     """
     # A matrix product would be faster, and turn equal directions into chords of 1e-8.
     direct = "donot_use_mm_for_euclid_dist"

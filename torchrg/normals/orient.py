@@ -180,8 +180,8 @@ def _follow(
 ) -> Tensor:
     """Return signs of rows ``(n,)`` that agree with oriented normals of points near to them.
 
-    Of the nearest of these ``(M, 3)`` that is followed over whose link the surface bends least, as
-    along the tree of :func:`propagate_signs`: the other face of a plate may be nearer.
+    That is followed over whose link the surface bends least, as along the tree of
+    :func:`propagate_signs`: the other face of a plate may be nearer.
     """
     from scipy.spatial import cKDTree
 

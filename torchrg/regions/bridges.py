@@ -148,9 +148,7 @@ def cut_bridges(
     whole limits, and where one plane explains both. Regions with cores that do not are split: the
     other points join the core of the nearest neighbour that they have an edge to, and no core grows
     through them. Where most points are in curved cores, all that is no large flat one is one core.
-
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
-    perhaps with gaps in their numbers.
+    The regions returned may have gaps in their numbers.
     """
     rows = mixed.rows[grown >= 0]
     if len(rows) == 0:

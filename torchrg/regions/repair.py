@@ -175,10 +175,10 @@ def _least(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
 def _contacts_to_merge(
     labels: Tensor, beside: NearestPoints, planes: RegionPlanes, neighbors: Neighbors
 ) -> tuple[Tensor, Tensor]:
-    """Return pairs of regions that touch, and their contacts; of two strips all neighbours count.
+    """Return pairs of regions that touch, perhaps twice; of two strips all neighbours count.
 
     Around the end of a strip that is narrower than a neighbourhood, such as the rim of a table top,
-    the nearest points are those of the faces beside it. A pair may be there twice.
+    the nearest points are those of the faces beside it.
     """
     strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
     parts = (

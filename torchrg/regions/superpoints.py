@@ -364,7 +364,7 @@ def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, sq_chord: Tensor) ->
 def _merge_to_strength(
     strength: float, graph: _Graph, min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge pairs that cost at most ``strength``, then small regions; return what each has become."""
+    """Merge pairs that cost at most ``strength``, then small regions; return what each became."""
     graph, become = _last(_merging(graph, bound, lambda cost, graph: cost <= strength))
     graph, merged = _last(_merging(graph, bound, partial(_joins_small, min_size)))
     return graph, merged[become]

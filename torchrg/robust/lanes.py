@@ -1,8 +1,8 @@
 """Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches.
 
-Like the lanes of a vector unit, patches laid out so are called lanes. Every lane is computed by the
-same operations in the same order wherever it stands, so a result does not depend, to the last bit,
-on the chunk it was computed in.
+Patches laid out so are called lanes, as of a vector unit. Every lane is computed by the same
+operations in the same order wherever it stands, so a result does not depend, to the last bit, on
+the chunk it was computed in.
 """
 
 from collections.abc import Callable, Sequence

@@ -152,7 +152,7 @@ def _deviations(
 
 
 def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole: Tensor) -> Tensor:
-    """Return deviations from two parallel planes, the faces of a plate; inf where there are none."""
+    """Return deviations from two parallel planes, the faces of a plate; inf without any."""
     columns = gather_columns(points, near.indices)
     counted = near.counted().to(points.dtype)
     count = counted.sum(dim=1)
