@@ -61,9 +61,10 @@ def score_labels(
     :func:`match_regions`. They say nothing about regions and faces without a partner, so the counts
     and the indices over all faces stand beside them.
 
-    Arguments, errors, and how unlabelled points count are as in :func:`contingency_table`: a point
-    of no face lowers the precision of its region, a point of no region the recall of its face. The
-    paper draws regions of 50 points and more.
+    Arguments, errors, and how unlabelled points count are as in
+    :func:`torchrg.metrics.contingency_table`: a point of no face lowers the precision of its
+    region, a point of no region the recall of its face. The paper draws regions of 50 points and
+    more.
 
     Returns:
         The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
