@@ -11,17 +11,14 @@ Functions of patches (``covariance``, ``eigh3``, ``median``, ``mad``, ``qn``, ``
 ``fit_normals_pca``, ``fit_normals_jet``, ``fit_normals_irls``, ``fit_normals_robust``,
 ``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are like those of torch:
 they have gradients, and run under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``,
-``torch.export`` and ``torch.autocast``. Functions of clouds (``search_knn``, ``estimate_normals``,
-``orient_normals``, ``grow_regions``, ``segment_planes``, ``make_superpoints``, ``segment_depth``)
-search neighbours and grow regions on the CPU: a compiler breaks its graph there and compiles the
-rest, ``vmap`` and ``torch.func`` are refused in one line, and ``torch.export`` does not take them.
-Normals of ``estimate_normals`` and ``orient_normals`` have gradients, labels have none. The tests
-show all of this; on CUDA nothing was run yet.
-
-The robust fits, scales and ``fit_normals_irls`` are one operation of their own to ``vmap`` (from
-torch 2.5), ``torch.func`` and compilers, and have no second derivatives there; the method
-``consensus`` has no gradients, and refuses points that require them. The modules of
-:mod:`torchrg.nn` are like their functions.
+``torch.export`` and ``torch.autocast``. The robust fits, scales and ``fit_normals_irls`` are one
+operation of their own to ``vmap`` (from torch 2.5), ``torch.func`` and compilers, and have no
+second derivatives there. Functions of clouds (``search_knn``,
+``estimate_normals``, ``orient_normals``, ``grow_regions``, ``segment_planes``,
+``make_superpoints``, ``segment_depth``) search neighbours and grow regions on the CPU: a compiler
+breaks its graph there and compiles the rest, ``vmap`` and ``torch.func`` are refused in one line,
+and ``torch.export`` does not take them. Normals of ``estimate_normals`` and ``orient_normals`` have
+gradients, but for the method ``consensus``; labels have none. On CUDA nothing was run yet.
 
 Example:
     >>> import torchrg
@@ -31,7 +28,7 @@ Example:
     (torch.Size([2000]), torch.Size([2000, 3]), True)
 """
 
-from torchrg import _display
+from torchrg._optional import register_display
 from torchrg.version import __version__ as __version__
 
 TYPE_CHECKING = False  # As that of typing, without loading it.
@@ -90,7 +87,7 @@ def _load_display() -> "ModuleType":
     return notebook
 
 
-_display.register(_load_display)
+register_display(_load_display)
 
 __all__ = [
     "UNLABELED", "Cloud", "TorchrgError", "align_axes", "datasets", "depth", "estimate_normals",

@@ -18,11 +18,9 @@ Result = TypeVar("Result")
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     """Return a tensor as it is, and a NumPy array as a tensor that shares its memory.
 
-    Big-endian and read-only arrays are copied. ``caller``, here and below, is the name of the
-    public function, the first word of the message.
-
-    Raises:
-        ShapeError: If ``values`` is neither a tensor nor a numeric NumPy array.
+    Big-endian and read-only arrays are copied. Here and in all checks ``caller`` is the public
+    function that the message begins with, and what does not pass is a ShapeError, a setting a
+    ConfigError.
 
     Example:
         >>> as_tensor("f", "points", np.zeros((2, 3), dtype=np.float32)).dtype
@@ -45,12 +43,7 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
 
 
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
-    """Check that settings are among the choices of their ``Literal`` types.
-
-    Arguments are a value and its type by name, as in ``x=(x, Literal["a", "b"])``.
-
-    Raises:
-        ConfigError: If one is not.
+    """Check that settings are among the choices of their types, as in ``x=(x, Literal["a", "b"])``.
 
     Example:
         >>> from typing import Literal
@@ -66,17 +59,7 @@ def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
-    """Check that tensors hold float32 or float64, all the same; None is skipped.
-
-    Raises:
-        ShapeError: If one does not, or if two differ in dtype or device.
-
-    Example:
-        >>> check_floating("f", points=torch.zeros(2, 3, dtype=torch.int64))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected points of float32 or float64, got int64.
-    """
+    """Check that tensors hold float32 or float64, all the same, on one device; None is skipped."""
     given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in given.items():
         if tensor.dtype not in (torch.float32, torch.float64):
@@ -100,17 +83,7 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
 
 
 def check_points(caller: str, points: Tensor) -> None:
-    """Check that points are those of a cloud, and say what to do with those of an image.
-
-    Raises:
-        ShapeError: If they are not of shape ``(N, 3)`` and float32 or float64.
-
-    Example:
-        >>> check_points("f", torch.zeros(2, 4, 3))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected points of shape (N, 3), got (2, 4, 3); pass ...
-    """
+    """Check that points are those of a cloud, and say what to do with those of an image."""
     if points.ndim == 3 and points.shape[2] == 3:
         raise ShapeError(
             f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "
@@ -123,13 +96,9 @@ def check_points(caller: str, points: Tensor) -> None:
 def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     """Check the axes of several tensors against patterns that share their letters.
 
-    A letter stands for one length, the same in every pattern; a number for that length; a leading
-    ``*`` for any leading axes, the same in every pattern. An argument that is None is skipped.
-
-    Arguments are a tensor and its pattern by name, as in ``x=(x, "* N 3")``.
-
-    Raises:
-        ShapeError: If a tensor does not match its pattern.
+    Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for one
+    length, the same in every pattern; a number for that length; a leading ``*`` for any leading
+    axes, the same in every pattern. A tensor that is None is skipped.
 
     Example:
         >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
@@ -210,9 +179,8 @@ def made_on_cpu() -> Iterator[None]:
 def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Keep compilers out of a function of clouds, and refuse tensors without values.
 
-    A compiler breaks its graph there and compiles the rest of the model. What the function makes
-    without a word about the device is on the CPU, whatever ``torch.set_default_device`` says.
-    Subclasses of tensors are taken as tensors.
+    A compiler breaks its graph there and compiles the rest of the model. Tensors are made on the
+    CPU, as by :func:`made_on_cpu`, and subclasses of tensors are taken as tensors.
     """
 
     @wraps(function)

@@ -70,10 +70,10 @@ def map_chunks(
     *,
     least: int = _LEAST_ROWS,
 ) -> list[Result]:
-    """Call ``work`` on slices that together cover all rows; see :func:`map_tasks`.
+    """Call ``work`` on slices that together cover all rows, in their order; see :func:`map_tasks`.
 
-    ``work`` is called at least once, without rows on an empty slice; ``least`` is the number of
-    rows below which another thread is not worth its start. The results are in the order of rows.
+    Without rows it is called once, on an empty slice; ``least`` is the number of rows below which
+    another thread is not worth its start.
 
     Example:
         >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))
@@ -93,10 +93,8 @@ def map_rows(
 ) -> list[Tensor]:
     """Call ``work`` on an equal share of rows for each thread, and return what it returns, whole.
 
-    Args:
-        work: Takes rows of each column, then the others as they are; returns tensors of rows.
-        columns: Tensors of one length.
-        others: What ``work`` takes beside them.
+    It takes rows of each of the ``columns``, of one length, then the ``others`` as they are, and
+    returns tensors of rows.
 
     Example:
         >>> map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3))
@@ -113,12 +111,7 @@ def map_rows(
 
 
 def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
-    """Call ``work`` on chunks of the row numbers of the chosen points; see :func:`map_chunks`.
-
-    Example:
-        >>> map_chosen(torch.Tensor.tolist, torch.tensor([True, False, True]), 5)
-        [[0, 2]]
-    """
+    """Call ``work`` on chunks of the row numbers of the chosen points; see :func:`map_chunks`."""
     rows = places_of(chosen)
     return map_chunks(lambda chunk: work(rows[chunk]), len(rows), chunk_size, rows.device)
 
@@ -152,12 +145,7 @@ def map_tasks(
 def run_beside(
     first: Callable[[], Result], second: Callable[[], Other], device: torch.device
 ) -> tuple[Result, Other]:
-    """Return the results of two calls, run side by side if there are threads.
-
-    Example:
-        >>> run_beside(lambda: 1, lambda: "a", torch.device("cpu"))
-        (1, 'a')
-    """
+    """Return the results of two calls, run side by side if there are threads."""
     results: list[Any] = map_tasks(lambda call: call(), [first, second], device)
     return results[0], results[1]
 
@@ -166,9 +154,8 @@ def run_beside(
 def sequential_operations() -> Iterator[None]:
     """Let each operation of torch run on this thread alone; also a decorator.
 
-    :func:`map_tasks` goes on to use as many threads as torch might before. Nothing changes for
-    other threads: :func:`torch.set_num_threads` would also set the number of those that start
-    meanwhile.
+    :func:`map_tasks` goes on to use as many threads as torch might before. Other threads keep their
+    setting, which :func:`torch.set_num_threads` would change for those that start meanwhile.
 
     Example:
         >>> before = torch.get_num_threads()
@@ -216,11 +203,7 @@ def _begin_thread(grad_enabled: bool, context: Context) -> None:
 
 
 def _set_own_threads(numbers: Sequence[int]) -> list[int]:
-    """Set on how many threads the operations of this thread run; return what it was.
-
-    The first number is that of MKL (0: what it takes by default), the others are those of each
-    OpenMP library.
-    """
+    """Set MKL's threads of this thread (0: its default), then OpenMP's; return those before."""
     mkl, libraries = _mkl_setter(), _openmp_libraries()
     before = [mkl(numbers[0]), *(library.num_threads for library in libraries)]
     for library, number in zip(libraries, numbers[1:], strict=True):

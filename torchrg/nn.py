@@ -14,8 +14,7 @@ True
 torch.Size([8, 2])
 
 Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, these to :class:`Eigh`, and this to
-:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator. All have gradients, and run
-under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)`` and ``torch.export``.
+:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator.
 """
 
 from collections.abc import Callable
@@ -77,12 +76,7 @@ class Covariance(_Function):
 
 
 class Eigen(NamedTuple):
-    """What :class:`Eigh` gives.
-
-    Attributes:
-        values: Eigenvalues, ascending, shape ``(*, P)``.
-        vectors: Unit eigenvectors as columns, shape ``(*, P, P)``.
-    """
+    """Eigenvalues, ascending ``(*, P)``, and unit eigenvectors as columns ``(*, P, P)``."""
 
     values: Tensor
     vectors: Tensor
@@ -282,10 +276,8 @@ _ROBUST: dict[str, Callable[..., RobustFit]] = {
 class PatchNormals(nn.Module):
     """Unit normals of patches by an estimator of single neighbourhoods.
 
-    Args:
-        method: The estimator.
-        **settings: Its keywords, as in ``support_fraction=0.75``; ``irls`` needs ``noise``, one
-            number in the unit of the points.
+    ``settings`` are keywords of the method, as in ``support_fraction=0.75``; ``irls`` needs
+    ``noise``, one number in the unit of the points.
 
     Raises:
         ConfigError: If there is no such estimator, or it has no such setting or value.

@@ -117,7 +117,7 @@ def segment_planes(
     """
     points = as_tensor("segment_planes", "points", points).detach()
     check_points("segment_planes", points)
-    warn_of_steps("segment_planes", points, stacklevel=4)
+    warn_of_steps("segment_planes", points)
     if not isinstance(config, PipelineConfig):
         config = settings_of("segment_planes", PipelineConfig, config)
     if compile is not None:
@@ -146,12 +146,8 @@ def prepare_kernels(
     compilers, the first time on a machine. They are kept in the folder ``$TORCHRG_CACHE_DIR``, by
     default ``~/.cache/torchrg``, which machines of one kind may share, but no users: a folder that
     others own or can write to is not used. Results differ from those without them by rounding, and
-    are the same for any order of the points, chunk size and number of threads.
-
-    Args:
-        config: Settings.
-        dtype: That of the points.
-        announce: Called with a line of text where there is something to compile.
+    are as independent of order, chunks and threads. ``announce`` is called with a line of text
+    where there is something to compile.
 
     Returns:
         The settings, with ``compile`` False after a warning if there is no compiler.
@@ -170,14 +166,7 @@ def prepare_kernels(
 
 
 class _CanonicalCloud(NamedTuple):
-    """The finite points of a cloud, or those that stand for its voxels, in canonical order.
-
-    Attributes:
-        points: Shape ``(n, 3)``.
-        rows: Their rows in the cloud, shape ``(n,)``.
-        inverse: The row of ``points`` that stands for each point of the cloud, or -1, shape
-            ``(N,)``; None without voxels.
-    """
+    """Points in canonical order, their rows in the cloud; with voxels, that of each or -1."""
 
     points: Tensor
     rows: Tensor
@@ -280,14 +269,12 @@ def make_superpoints(
     Superpoints are connected (of a chain of points between any two, each is one of the 8 nearest
     neighbours of the one before or after it), of one orientation, and keep to the borders of
     objects. Planes come first: their compact pieces, or whole planes, are regions from the start.
-    Regions merge while that costs an energy like that of cut pursuit [1] at most the strength of
-    the level; see :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
+    Regions merge while that costs an energy like that of cut pursuit at most the strength of the
+    level; see :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
 
     Convention:
         The result does not depend on the order of the points or on the number of threads. Exact
-        duplicates are in one superpoint. Sizes are counted in distinct points. Neither a voxel grid
-        nor weights by local density made partitions of clouds of varying density better, so each
-        point counts once.
+        duplicates are in one superpoint. Sizes are counted in distinct points, of any density.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64.
@@ -306,10 +293,6 @@ def make_superpoints(
 
     Raises:
         ShapeError: If a shape or dtype is wrong, or ``seg`` is of another number of points.
-
-    References:
-        [1] L. Landrieu, G. Obozinski. Cut pursuit: fast algorithms to learn piecewise constant
-        functions on general weighted graphs. SIAM J. Imaging Sciences, 2017.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -364,8 +347,7 @@ def segment_mesh(
         faces: Rows of the corners of triangles, shape ``(F, 3)``. Superpoints are connected along
             their edges. Default: along neighbours, for points without a mesh.
         k_thresh: As of Segmentator, in proportion: 0.01 is a strength of 2 in
-            :class:`torchrg.config.SuperpointsConfig`, with which superpoints of depth frames with
-            noise were as many as Segmentator's.
+            :class:`torchrg.config.SuperpointsConfig`.
         seg_min_verts: Smaller superpoints join a neighbour, in vertices.
         colors: As of :func:`make_superpoints`; Segmentator knows none.
         config: How planes are found, settings or the name of a preset.

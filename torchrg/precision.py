@@ -33,6 +33,9 @@ detection of deformable objects. VMV, 2003."""
 _MIXING = 0x9E3779B97F4A7C15
 """Odd factor next to 2^64 over the golden ratio, which spreads such a hash over all 64 bits."""
 
+_ABOVE_DECORATORS = 5
+"""Frames from here to the caller of a function that has two decorators."""
+
 
 def note_on_steps(
     points: NDArray[np.floating],
@@ -47,7 +50,7 @@ def note_on_steps(
 
     Args:
         points: Coordinates as they came, shape ``(N, 3)``, float32 or float64; what is not finite
-            does not count. The steps of float64, which has sixteen digits, are not looked at.
+            does not count, nor do the steps of float64.
         scale: What the coordinates are multiples of in their file. Default: of nothing.
         cure: What to do where it is the type that is too coarse, and not the scale.
 
@@ -81,12 +84,12 @@ def note_on_steps(
     return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {cure}"
 
 
-def warn_of_steps(caller: str, points: Tensor, *, stacklevel: int) -> None:
-    """Warn of what :func:`note_on_steps` tells of the points given to a public function."""
+def warn_of_steps(caller: str, points: Tensor) -> None:
+    """Warn the user, above a public function and its decorators, of :func:`note_on_steps`."""
     given = points.detach().cpu().numpy()
     note = note_on_steps(given, cure="pass float64, or subtract an offset before it is float32")
     if note:
-        warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=stacklevel + 1)
+        warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=_ABOVE_DECORATORS)
 
 
 def _spacing(points: NDArray[np.floating], side: float) -> float:

@@ -45,10 +45,8 @@ def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
 
     Segmenting a cloud then takes about 150 bytes of memory a point, beside pages of the files that
     the system has not yet taken back, and up to nine bytes of disk for each neighbour of a point.
-    Inside a result there is no such array, so it can be used afterwards.
-
-    Args:
-        folder: Where the files without a name are; one on a disk, as some ``/tmp`` is not.
+    Inside a result there is no such array, so it can be used afterwards. The folder should be on a
+    disk, as some ``/tmp`` is not.
 
     Raises:
         FormatError: If the disk has no room, or the folder cannot be written; before the array is

@@ -7,7 +7,7 @@ import torch
 
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
-from torchrg.depth.strips import join_strips
+from torchrg.depth.faces import join_strips
 from torchrg.depth.windows import NARROW, find_jitter, fit_narrow_windows, fit_windows
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 262.5

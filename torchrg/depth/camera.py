@@ -20,8 +20,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Args:
         depth: Shape ``(B, H, W)``, floating point, in any unit.
-        intrinsics: Camera matrices, shape ``(B, 3, 3)``, without skew, or what
-            :func:`read_intrinsics` makes them of.
+        intrinsics: Camera matrices, shape ``(B, 3, 3)``; see :func:`read_intrinsics`.
         poses: Matrices from camera to world coordinates, shape ``(B, 4, 4)``. Default: the points
             are in camera coordinates.
 
@@ -59,16 +58,14 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
 
 def read_intrinsics(caller: str, given: Any) -> Tensor:  # noqa: ANN401
-    """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)``, of whatever holds them.
+    """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)`` of pinhole cameras without skew.
 
-    Args:
-        caller: Name of the public function, the first word of messages.
-        given: Such matrices, those of 4 x 4 as kornia has them, or its ``PinholeCamera``, of which
-            the intrinsics are taken and nothing else; tensors or arrays.
+    ``given`` are such matrices, tensors or arrays, those of 4 x 4 as kornia has them, or its
+    ``PinholeCamera``, of which the intrinsics are taken and nothing else.
 
     Raises:
         ShapeError: If it is no tensor, array or camera.
-        ConfigError: If it is no matrix of a pinhole camera without skew.
+        ConfigError: If it is no such matrix.
 
     Example:
         >>> read_intrinsics("f", torch.eye(4)[None]).shape
@@ -113,13 +110,10 @@ def has_depth(depth: Tensor) -> Tensor:
 
 
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
-    """Return a camera matrix, shape ``(3, 3)``, float64.
+    """Return a camera matrix ``(3, 3)``, float64, of focal lengths and optical axis in pixels.
 
-    Args:
-        fx: Focal length along rows, in pixels, not 0.
-        fy: Focal length along columns, in pixels, not 0.
-        cx: Column of the optical axis; the middle of the first pixel is 0.
-        cy: Row of the optical axis.
+    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the middle of the first pixel
+    is 0.
 
     Raises:
         ConfigError: If a focal length is 0, or a value is not finite.
@@ -141,9 +135,7 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
 def find_intrinsics(points: Tensor) -> Tensor | None:
     """Find the camera that an organised cloud was taken with.
 
-    Args:
-        points: One point for each pixel in camera coordinates, shape ``(H, W, 3)``; NaN where there
-            is none.
+    ``points`` ``(H, W, 3)`` are those of the pixels in camera coordinates, NaN where there is none.
 
     Returns:
         The camera matrix, shape ``(3, 3)``, float64; None where no pinhole camera puts nearly all

@@ -9,9 +9,8 @@ from torch import Tensor
 from torchrg._compile import kernel
 from torchrg._parallel import map_rows, map_tasks, places_of
 from torchrg.config import DepthConfig
-from torchrg.depth.hidden import hidden_contacts
+from torchrg.depth.faces import hidden_contacts, join_strips
 from torchrg.depth.normals import PixelPlanes
-from torchrg.depth.strips import join_strips
 from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MOST_FITTED, RegionPlanes
@@ -66,8 +65,7 @@ class InverseCloud(NamedTuple):
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
     the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are of float64, in
-    columns; ``noise`` ``(H * W,)`` is the standard deviation of the last coordinate, and ``seen``
-    ``(H, W)`` are the pixels with depth.
+    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` have depth.
     """
 
     points: Tensor
@@ -121,10 +119,7 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
 def _joins(
     pixels: PixelPlanes, normals: Tensor, u: Tensor, v: Tensor, axis: int, config: DepthConfig
 ) -> Tensor:
-    """Return whether pixels and the next ones along an axis are on one surface, one place less.
-
-    Pixels of one window are: only the pairs of two windows are looked at.
-    """
+    """Return whether pixels and the next ones along an axis are on one surface, one place less."""
     width, length = pixels.flat.shape[1], pixels.flat.shape[axis] - 1
     joins = pixels.flat.narrow(axis, 0, length) & pixels.flat.narrow(axis, 1, length)
     one_window = pixels.window.narrow(axis, 0, length) == pixels.window.narrow(axis, 1, length)
@@ -163,11 +158,7 @@ def _are_on_one_surface(
     v: Tensor,
     limits: Tensor,
 ) -> tuple[Tensor]:
-    """Tell which pixels are on one surface with the next ones along an axis, all by place.
-
-    Limits are those of the step and of the squared chords between normals, the usual one and the
-    wider one.
-    """
+    """Tell which pixels are on one surface with others; limits of step, angle and wider angle."""
     max_step, max_sq_chord, wider_sq_chord = limits.unbind()
     width = u.shape[0]
     row, column = here // width, here % width
@@ -201,7 +192,7 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
 def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     """Tell whether windows hold pixels, by row-major place in an image of so many columns.
 
-    Of the windows: their rows and columns ``(2, n)``, and row and column of their middles.
+    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of their middles.
     """
     (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()
@@ -209,11 +200,7 @@ def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
 
 
 def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
-    """Return the connected components of an image ``(H * W,)``, -1 where it is not flat.
-
-    From which pixels join the next one, ``(H - 1, W)`` and ``(H, W - 1)``. On a grid with a place
-    for each pixel and each pair they are the connected components of scipy.
-    """
+    """Return the connected components of an image ``(H * W,)``, -1 where it is not flat."""
     from scipy.ndimage import label
 
     height, width = flat.shape
@@ -226,22 +213,13 @@ def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
 
 
 class PixelGrid:
-    """Who is beside whom in an image: the eight pixels around each one, by row-major place.
-
-    As :class:`torchrg.regions.repair.Beside` asks for it.
-
-    Args:
-        shape: Rows and columns.
-    """
+    """The eight pixels around each pixel of an image, a :class:`torchrg.regions.repair.Beside`."""
 
     def __init__(self, shape: torch.Size) -> None:
         self.height, self.width = shape
 
     def around(self, rows: Tensor) -> Tensor:
-        """Return the pixels around each of some ``(n,)``, shape ``(n, 8)``.
-
-        For those outside of the image stand the nearest inside.
-        """
+        """Return the pixels around some, ``(n, 8)``; for those outside the nearest inside."""
         down, right = torch.tensor(_AROUND, device=rows.device).T
         row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
@@ -284,10 +262,7 @@ def _refine(
 
     Twice, pixels without a region join the one beside them whose plane they are on, and flat
     regions that touch and lie on one plane are merged. Then borders between regions move to the
-    lines where their planes meet.
-
-    At least one pixel has a label. Returns labels by descending size, and the planes of the regions
-    in the cloud; curved are those thicker than noise and a slight bend can make them.
+    lines where their planes meet. Returns labels by descending size, and the planes of the regions.
     """
     beside, seen = PixelGrid(cloud.seen.shape), cloud.seen.flatten()
     for _ in range(_NUM_PASSES):

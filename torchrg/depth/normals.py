@@ -47,14 +47,13 @@ _PIXELS_AT_ONCE = 2**14
 
 
 class PixelPlanes(NamedTuple):
-    """A plane in inverse depth for each pixel: that of a window.
+    """A plane in inverse depth for each pixel, that of a window, in columns and rows from the axis.
 
-    The planes are in columns and rows from the optical axis. ``window`` tells pixels of one window
-    from those of others, ``sides`` ``(2, H, W)`` are its rows and columns, and ``middle``
-    ``(2, H, W)`` row and column of its middle. ``valid`` tells which pixels have a plane, ``flat``
-    whether their window is flat, ``edge`` whether it is but could not lie around the pixel;
-    ``noise`` is the standard deviation of inverse depth, as large windows see it, and
-    ``tolerance`` what a flat window may deviate by. All others are of shape ``(H, W)``.
+    ``window`` tells pixels of one window from those of others, ``sides`` ``(2, H, W)`` are its rows
+    and columns, and ``middle`` ``(2, H, W)`` row and column of its middle. ``valid`` tells which
+    pixels have a plane, ``flat`` whether their window is flat, ``edge`` whether it is but could not
+    lie around the pixel; ``noise`` is that of inverse depth, as large windows see it, ``tolerance``
+    what a flat window may deviate by. All others are of shape ``(H, W)``.
     """
 
     planes: WindowPlanes
@@ -69,10 +68,7 @@ class PixelPlanes(NamedTuple):
 
 
 class _Tolerances(NamedTuple):
-    """What windows of one size may deviate by, each of shape ``(h, w)``.
-
-    By noise alone, by noise or a slight bend, and by the strongest bend.
-    """
+    """Limits of deviation ``(h, w)``: noise, noise or a slight bend, the strongest bend."""
 
     noise: Tensor
     flat: Tensor
@@ -159,11 +155,7 @@ class _SquareWindows(NamedTuple):
 
 
 class _NarrowWindows(NamedTuple):
-    """Flat narrow windows ``(k,)``, and the pixels that they hold ``(k, 27)``, -1 for none.
-
-    ``shape`` is 0 or 1, the row of :data:`torchrg.depth.windows.NARROW`, and ``pixel`` the one in
-    the middle, by row-major place in an image of so many columns.
-    """
+    """Flat narrow windows ``(k,)`` by middle pixel, and what they hold ``(k, 27)``, or -1."""
 
     first: int
     planes: WindowPlanes
@@ -261,10 +253,7 @@ def _flatness(windows: _SquareWindows, quarters: _SquareWindows | None) -> Tenso
 
 
 class _Choice:
-    """The window that each pixel of an image takes, numbered through all windows of all sizes.
-
-    Pixels that have none are offered one after the other, and keep the first that they are on.
-    """
+    """The window that each pixel takes, numbered through all sizes: the first that it is on."""
 
     def __init__(self, inverse: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> None:
         self.shape = inverse.shape
@@ -293,8 +282,8 @@ class _Choice:
     ) -> None:
         """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
 
-        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; ``beside`` tells
-        that the windows are not around the cells.
+        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; the windows are
+        around the cells unless ``beside``.
         """
         waiting, sizes = self.waiting, (windows.size, places.shape[1])
         (chosen,) = map_rows(
@@ -332,11 +321,7 @@ def _chosen_windows(
     v: Tensor,
     sizes: Tensor,
 ) -> tuple[Tensor]:
-    """Return the window that pixels are offered if they are within its reach, else -1.
-
-    ``places`` has the window that each cell offers or -1; ``sizes`` are the width of a cell, and
-    how many are in a row.
-    """
+    """Return the window that cells offer pixels near it, or -1; ``sizes`` are width and columns."""
     size, num_columns = sizes.unbind()
     width = u.shape[0]
     row, column = pixels // width, pixels % width
@@ -432,10 +417,7 @@ def _tolerances_of_planes(
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
-    """Return the root mean square deviation of the quarters of windows ``(h, w)``; inf without any.
-
-    They are windows of half the size: the four at the corners of a window cover it exactly.
-    """
+    """Return the root mean square deviation of the windows of half the size that cover windows."""
     height, width = shape
     corner = SIDE
     padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)

@@ -48,9 +48,8 @@ def segment_depth(
         compile: Whether to run kernels compiled; see :func:`prepare_depth_kernels`.
 
     Returns:
-        A segmentation whose ``labels``, ``normals``, ``curvature``, ``sharp`` and ``valid`` are
-        images: shapes ``(H, W)`` and ``(H, W, 3)``. Sharp are the pixels so near to an edge that no
-        flat window lies around them. An image without depth has no planes and is nowhere valid.
+        A segmentation whose fields are images, of ``(H, W)`` or ``(H, W, 3)``. Sharp are the pixels
+        so near to an edge that no flat window lies around them.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
@@ -82,13 +81,7 @@ def prepare_depth_kernels(announce: Callable[[str], None] = lambda text: None) -
     """Compile the kernels of :func:`segment_depth`, and tell whether that can be done.
 
     That takes a minute on two cores the first time on a machine; see
-    :func:`torchrg.pipeline.prepare_kernels`.
-
-    Args:
-        announce: Called with a line of text where there is something to compile.
-
-    Returns:
-        False, after a warning that says why, if there is no compiler.
+    :func:`torchrg.pipeline.prepare_kernels`. A warning says why there is no compiler.
     """
 
     def rehearse() -> None:

@@ -1,8 +1,7 @@
 """Planes of square windows all over a depth image, of narrow ones here and there, and their noise.
 
 Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows stand a cell
-apart, so that the sums over all large ones together cost less than those over the smallest. Narrow
-windows have 3 by 9 pixels; they are for the few pixels that no square serves.
+apart, so that the sums over all large ones together cost less than those over the smallest.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,12 +62,11 @@ class WindowPlanes(NamedTuple):
 
 
 def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int, WindowPlanes]:
-    """Fit a plane by least squares to the window around each cell, for each size of cells.
+    """Fit a plane by least squares to the window around each cell, for ascending sizes of cells.
 
     The image ``(H, W)``, float64, holds anything finite where not seen; its columns are at ``u``
     ``(W,)``, its rows at ``v`` ``(H, 1)``. Cells begin at the first pixel, and windows are cut off
-    at the borders of the image. One with too few pixels seen, or whose pixels lie nearly on a line,
-    has no plane. Sizes ascend.
+    at the borders of the image. One with too few pixels seen, or nearly on a line, has no plane.
     """
     ones = seen.to(values.dtype)
     w = torch.where(seen, values, 0.0)
@@ -204,7 +202,7 @@ def noise_at(
 def noise_by_size(
     windows: Mapping[int, WindowPlanes], given: tuple[float, float] | None, dtype: torch.dtype
 ) -> dict[int, WindowNoise]:
-    r"""Return the noise of inverse depth as windows of each size see it.
+    """Return the noise of inverse depth as windows of each size see it.
 
     A standard deviation of ``a + b z^2`` in depth is one of ``b + a w^2`` in inverse depth
     ``w = 1 / z``. Where ``a`` and ``b`` are not given, they are fitted to what windows deviate from
@@ -235,8 +233,8 @@ def find_jitter(windows: WindowPlanes) -> float:
 
     It is a standard deviation, from 0 for exact rays to 0.15. Jitter moves a value by as much of
     what it changes from one pixel to the next, so that it shows in windows that are steep: no flat
-    window deviates by less. Windows are classed by their steepness, and of the steeper half of the
-    classes the one counts where flat windows deviate least.
+    window deviates by less. Of the steeper half of the classes of steepness the one counts where
+    flat windows deviate least.
     """
     # Windows stand a cell apart and overlap.
     some = WindowPlanes(*(part[::REACH, ::REACH] for part in windows))

@@ -11,17 +11,11 @@ _ASIN_DEGREE = 10
 
 
 def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:
-    r"""Return the angle between directions without sign, in [0, 90] degrees, eq. (8).
+    """Return the angle ``(*)`` between directions without sign, in [0, 90] degrees, eq. (8).
 
     From the chord, ``2 asin(min(|a - b|, |a + b|) / 2)``: accurate for small angles, where the
-    arc cosine of a float32 product is wrong by up to 0.02 degrees.
-
-    Args:
-        a: Unit vectors, shape ``(*, 3)``.
-        b: Unit vectors, shape broadcastable to that of ``a``.
-
-    Returns:
-        Angles, shape ``(*)``.
+    arc cosine of a float32 product is wrong by up to 0.02 degrees. Unit vectors ``a`` and ``b``,
+    ``(*, 3)``, are broadcast.
 
     Example:
         >>> a = torch.tensor([[1.0, 0, 0], [1, 0, 0]])

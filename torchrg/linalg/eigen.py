@@ -67,15 +67,12 @@ def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
 
 
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Eigen-decompose symmetric 3x3 matrices by a fixed number of Jacobi rotations.
+    """Eigen-decompose symmetric 3x3 matrices ``(*, 3, 3)`` by a fixed number of Jacobi rotations.
 
     Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise, so
     it runs at the speed of memory on any device, where ``torch.linalg.eigh`` on tiny matrices is
-    slow on the CPU and much slower on a GPU. Cyclic Jacobi keeps eigenvectors orthogonal to
-    rounding even for equal eigenvalues, which closed formulas with ``acos`` do not.
-
-    Args:
-        matrices: Symmetric matrices, shape ``(*, 3, 3)``; only the upper triangle is read.
+    slow. Cyclic Jacobi [1] keeps eigenvectors orthogonal to rounding even for equal eigenvalues,
+    which closed formulas with ``acos`` do not. Only the upper triangle is read.
 
     Returns:
         Eigenvalues in ascending order ``(*, 3)`` and unit eigenvectors as columns ``(*, 3, 3)``.
@@ -182,11 +179,11 @@ def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     r"""Return eigenvalues and the first eigenvector of positive semi-definite 3x3 matrices.
 
-    It takes a third of the time of :func:`eigh3` and is more accurate for matrices of thin
-    neighbourhoods. Newton's method from 0 approaches the smallest root of the characteristic
-    polynomial from one side; a column of the adjugate of :math:`A - \lambda I` is the eigenvector.
-    Both are found in double precision. Where the first two eigenvalues are equal to rounding, it is
-    any vector across the third eigenvector.
+    It takes a third of the time of :func:`eigh3` and is more accurate for thin neighbourhoods.
+    Newton's method from 0 approaches the smallest root of the characteristic polynomial from one
+    side; a column of the adjugate of :math:`A - \lambda I` is the eigenvector. Both are found in
+    double precision. Where the first two eigenvalues are equal to rounding, it is any vector across
+    the third eigenvector.
 
     Returns ascending eigenvalues ``(*, 3)``, not negative, right to 1e-8 of the largest or to
     rounding, and unit eigenvectors of the first ``(*, 3)``, of arbitrary sign.
@@ -224,10 +221,7 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """Return what steps of Newton's method lead to, and the last step.
-
-    The coefficients are trace, sum of the principal minors and determinant, shape ``(3, n)``.
-    """
+    """Return the root after steps, by trace, principal minors, determinant; and the last step."""
     trace, minors, determinant = coefficients
     twice, step = 2 * trace, root
     for _ in range(num_steps):
@@ -313,11 +307,8 @@ def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int
 class PrincipalFrame(NamedTuple):
     """Eigenvalues and eigenvectors of covariances; gradients flow through the first two.
 
-    Attributes:
-        normals: Unit eigenvectors of the smallest eigenvalue, shape ``(*, 3)``.
-        smallest: Smallest eigenvalues, not below zero, shape ``(*)``.
-        values: All eigenvalues in ascending order, shape ``(*, 3)``, without gradient.
-        vectors: Unit eigenvectors as columns, shape ``(*, 3, 3)``, without gradient.
+    Unit eigenvectors ``(*, 3)`` of the smallest eigenvalues, these, not below zero, ``(*)``, all
+    eigenvalues ascending ``(*, 3)``, and their unit eigenvectors as columns ``(*, 3, 3)``.
     """
 
     normals: Tensor

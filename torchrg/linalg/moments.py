@@ -3,9 +3,7 @@
 Points lie along the last axis in patches, along the first in the lanes of
 :mod:`torchrg.robust.lanes`, one region after the other in :class:`Segments`, and each layout adds
 them up in its own way, so that a sum does not depend on what stands beside it. All covariances are
-:func:`second_moments` about a mean, given that way of adding. Apart stand only what is no matrix:
-the robust fits factor the scatter by Gram-Schmidt as they need determinants of thin ones, depth
-images have running sums over windows, and the grid of pictures adds whole numbers, which are exact.
+:func:`second_moments` about a mean, but for the robust fits, which need determinants of thin ones.
 """
 
 import bisect
@@ -20,14 +18,10 @@ from torchrg.linalg.eigen import smallest_eigenvector3
 
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
+    """Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
 
-    Two passes about the first point of each patch: accurate far from the origin.
-
-    Args:
-        patches: Points, shape ``(*, K, P)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything. Default:
-            all.
+    Two passes about the first point of each patch: accurate far from the origin. The points that
+    count by the mask ``(*, K)`` are those of patches ``(*, K, P)``; the others may hold anything.
 
     Returns:
         The mean ``(*, P)`` and the covariance ``(*, P, P)``. A patch without points has zeros.
@@ -79,9 +73,9 @@ def second_moments(
 ) -> Tensor:
     """Return the second moments of weighted points about zero, shape ``(*, P, P)``.
 
-    Of P coordinates, about their mean for a covariance, with weights of the shape of a column (1
-    each by default). ``add`` takes a column to its sums, shape ``(*)``, by default along the last
-    axis; these are divided by ``total``, for a covariance the sum of the weights.
+    Of P columns, about their mean for a covariance, with weights of the same shape (1 by default).
+    ``add`` takes a column to its sums, shape ``(*)``, by default along the last axis; these are
+    divided by ``total``, for a covariance the sum of the weights.
     """
     size = len(columns)
     weighted = columns if weights is None else [weights * column for column in columns]
@@ -99,11 +93,8 @@ class Segments:
     """The points of each region side by side, in the order of their rows.
 
     Sums run over one region after the other, never by atomic additions, so they do not depend on
-    threads or device scheduling.
-
-    Args:
-        labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
-        most: Points of a region that are taken, evenly along their rows. Default: all.
+    threads or device scheduling. ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative;
+    ``most`` points of a region are taken, evenly along their rows, by default all.
 
     Example:
         >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
@@ -130,10 +121,7 @@ class Segments:
         self.labels = torch.repeat_interleave(self.counts)
 
     def split(self, most: int) -> "list[Segments]":
-        """Return regions that follow one another together, up to so many points, or one region.
-
-        They are numbered from 0 in each part. At least one part is returned.
-        """
+        """Return regions, renumbered from 0, in parts of up to so many points or of one region."""
         ends = self.counts.cumsum(0).tolist()
         parts: list[Segments] = []
         region = row = 0
@@ -263,10 +251,7 @@ def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Fit a plane to the neighbours with each of several weights; see :func:`fit_weighted_planes`.
-
-    Returns unit normals ``(n, 3)`` and offsets ``(n,)`` for each.
-    """
+    """Fit a plane to the neighbours with each of the weights; see :func:`fit_weighted_planes`."""
     means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
     normals = smallest_eigenvector3(torch.stack(covariances))[1]
     offsets = (normals * torch.stack(means)).sum(dim=-1)

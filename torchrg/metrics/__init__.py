@@ -46,8 +46,7 @@ class Index(NamedTuple):
     """What a number means.
 
     Attributes:
-        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""`` for
-            shares and ratios.
+        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""`` for a share.
         higher_is_better: None where neither direction is better.
     """
 

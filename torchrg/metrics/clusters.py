@@ -12,7 +12,6 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import check_labels, check_one_device, number_labels
 from torchrg.metrics.sphere import (
-    Centers,
     chord_table,
     chord_to_angle,
     chords_between,
@@ -40,9 +39,9 @@ class ClusterScore(NamedTuple):
 
     Attributes:
         cp: Compactness (eq. 12), radians, lower is better.
-        sp: Separation (eq. 13), radians, higher is better; nan for fewer than two clusters.
-        dbi: Davies-Bouldin index (eq. 14), lower is better; nan for fewer than two clusters.
-        dvi: Dunn validity index (eq. 15), higher is better; nan for fewer than two clusters.
+        sp: Separation (eq. 13), radians, higher is better.
+        dbi: Davies-Bouldin index (eq. 14), lower is better.
+        dvi: Dunn validity index (eq. 15), higher is better.
         clusters: Number of clusters, after merging if that was asked for.
         points: Labelled points with a normal.
         invalid: Labelled points without a normal; they are left out.
@@ -85,24 +84,19 @@ def score_clusters(
     Convention:
         Two parallel walls have the same centre on the sphere. In any real room DBI therefore tends
         to infinity and DVI to 0: that is what the formulas give, and it is returned. (They bound
-        DVI by (pi/2) / CP, which the paper's printed 10.0 exceeds.) ``distinct_directions=True``
-        first merges clusters of about one direction, and answers what was meant: are the
-        *directions* compact and separate.
-
-        Points labelled ``UNLABELED`` (-1), and labelled points whose normal is zero or not
-        finite, are left out. Distances are computed in float64 from chords.
+        DVI by (pi/2) / CP, which the paper's printed 10.0 exceeds.) ``distinct_directions`` asks
+        instead whether the *directions* are compact and separate. Points labelled ``UNLABELED``
+        (-1), and labelled points whose normal is zero or not finite, are left out.
 
     Args:
         normals: Normals of any sign and length, shape ``(N, 3)``, floating point.
         labels: Cluster of each point, shape ``(N,)``, integers.
         min_size: Clusters of fewer points count as unlabelled.
         distinct_directions: Whether clusters of about one direction are merged first.
-        max_angle_deg: Centres at most this far apart are one direction, chains included; used
-            with ``distinct_directions`` only.
+        max_angle_deg: Centres at most this far apart are one direction then, chains included.
         sample_size: Clusters up to this size are scored over all pairs of points, larger ones
             over a subsample of this size: for ``w_i``, and for the diameter in DVI where more
-            points than this can be its ends (on planes they are few, and the diameter is exact at
-            any size). CP, SP and the distance between clusters are always exact.
+            points can be its ends, which are few on planes. All else is exact.
         seed: Seed of the subsample. It does not depend on the order of the points.
 
     Returns:
@@ -138,19 +132,19 @@ def score_clusters(
         )
     directions, clusters, invalid = _labeled_directions(normals, labels, min_size)
     num_clusters = int(clusters.max()) + 1 if len(clusters) else 0
-    found = find_centers(directions, clusters, num_clusters)
+    centers, turned = find_centers(directions, clusters, num_clusters)
     if distinct_directions:
-        clusters = merge_directions(found.centers, max_angle_deg=max_angle_deg)[clusters]
+        clusters = merge_directions(centers, max_angle_deg=max_angle_deg)[clusters]
         num_clusters = int(clusters.max()) + 1 if len(clusters) else 0
-        found = find_centers(directions, clusters, num_clusters)
-    members = found.directions[clusters.argsort(stable=True)]
+        centers, turned = find_centers(directions, clusters, num_clusters)
+    members = turned[clusters.argsort(stable=True)]
     parts = torch.split(members, torch.bincount(clusters).tolist()) if num_clusters else ()
     means, diameters, num_sampled, exact = measure_spreads(
-        parts, found.centers, sample_size=sample_size, seed=seed
+        parts, centers, sample_size=sample_size, seed=seed
     )
-    sp, dbi = _separation(found.centers, means)
+    sp, dbi = _separation(centers, means)
     return ClusterScore(
-        cp=_compactness(found, clusters),
+        cp=_compactness(chords_between(turned, centers[clusters]), clusters),
         sp=sp,
         dbi=dbi,
         dvi=_dunn(closest_between(directions, clusters), diameters),
@@ -173,11 +167,11 @@ def _labeled_directions(
     return directions[exists], clusters, int((~exists).sum())
 
 
-def _compactness(found: Centers, clusters: Tensor) -> float:
+def _compactness(chords: Tensor, clusters: Tensor) -> float:
     """Return the mean over the clusters of the mean angle to the centre (eq. 12)."""
     if not len(clusters):
         return math.nan
-    angles = chord_to_angle(chords_between(found.directions, found.centers[clusters]))
+    angles = chord_to_angle(chords)
     return float((torch.bincount(clusters, angles) / torch.bincount(clusters)).mean())
 
 
@@ -218,8 +212,7 @@ def closest_between(directions: Tensor, clusters: Tensor) -> float:
     kd-trees: the numbers of different clusters differ in one binary digit at least, so for each
     digit the directions are split by it and the closest pair across the split is found.
 
-    Radians, in [0, pi/2]; infinite for fewer than two clusters. Directions are unit vectors
-    ``(N, 3)``, float64.
+    Of unit vectors ``(N, 3)``, float64; infinite for fewer than two clusters.
     """
     if len(clusters) == 0 or clusters.min() == clusters.max():
         return torch.inf
@@ -253,10 +246,7 @@ def _closest_chord(points: Tensor, clusters: Tensor) -> float:
 
 
 def _refine(cells: Tensor, points: Tensor, level: int) -> tuple[Tensor, Tensor]:
-    """Return the cell of each point, of side 0.5^level, and the row of a point of each cell.
-
-    The given cells are of twice that side, or clusters at level 0; each is divided into eight.
-    """
+    """Return the cell, of half the side before, of each point, and a point of each cell."""
     keys = cells
     for column in points.unbind(dim=1):
         keys = keys * 2 + ((column + 1) * 2**level).long() % 2

@@ -56,15 +56,15 @@ def contingency_table(
     """Count the points that each predicted region shares with each true face.
 
     Convention:
-        ``UNLABELED`` (-1) means "of no region" in ``labels`` and "of no face" in ``truth``; every
-        other integer names a region or a face. A point of no face still belongs to its region and
+        Labels are integers of any value and order; ``UNLABELED`` (-1) means "of no region" in
+        ``labels`` and "of no face" in ``truth``. A point of no face still belongs to its region and
         makes it larger, a point of no region still belongs to its face.
 
     Args:
         labels: Predicted label of each point, shape ``(N,)``, integers.
         truth: True label of each point, shape ``(N,)``, integers.
         min_size: Regions of fewer points count as unlabelled; their size is taken before
-            ``ignore`` is applied.
+            ``ignore`` is applied. Faces of any size count.
         ignore: Points with this true label are left out of everything. Default: none is.
 
     Returns:
@@ -126,11 +126,7 @@ def number_labels(labels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor]:
-    """Return label arrays as int64 tensors, one label a point and all of one length and device.
-
-    Raises:
-        ShapeError: If they are not.
-    """
+    """Return label arrays as int64 tensors; a ShapeError if lengths or devices differ."""
     given = {name: as_tensor(caller, name, values) for name, values in arguments.items()}
     for name, tensor in given.items():
         if tensor.dtype not in INTEGERS:

@@ -12,9 +12,7 @@ from torchrg.metrics.contingency import ContingencyTable, count_overlaps, share
 class LabelScore(NamedTuple):
     """External indices of a labelling; see :func:`score_labels`.
 
-    ``precision``, ``recall`` and ``f1`` are percentages as in the paper; counts are integers;
-    everything else is a share in [0, 1] (``ari`` can be negative). ``METRICS["labels"]`` holds
-    unit and direction of each.
+    ``METRICS["labels"]`` says which are percentages, as in the paper, counts or shares in [0, 1].
 
     Attributes:
         precision: Mean over the pairs of ``100 |C & G| / |C|`` (section III.B), percent.
@@ -29,8 +27,8 @@ class LabelScore(NamedTuple):
         recall_iou50: Faces with a region at IoU > 0.5, of all faces.
         precision_iou80: The same at IoU > 0.8; so is ``recall_iou80``.
         share_labeled: Scored points that lie in a region.
-        covering: Segmentation covering: mean best IoU weighted by the size of the face.
-        ari: Adjusted Rand index.
+        covering: See :func:`segmentation_covering`.
+        ari: See :func:`adjusted_rand_index`.
     """
 
     precision: float
@@ -59,40 +57,22 @@ def score_labels(
 ) -> LabelScore:
     """Score predicted plane labels against true ones.
 
-    Precision, recall and F1 are the paper's [1]: means over the one-to-one pairs that
-    :func:`match_regions` finds. They say nothing about regions and faces without a partner, so
-    the counts and the indices over all faces stand beside them.
+    Precision, recall and F1 are the paper's [1]: means over the one-to-one pairs of
+    :func:`match_regions`. They say nothing about regions and faces without a partner, so the counts
+    and the indices over all faces stand beside them.
 
-    Convention:
-        Labels are integers of any value and order; ``UNLABELED`` (-1) is "no region" in
-        ``labels`` and "no face" in ``truth``. How such points count:
-
-        * They belong to no region, or to no face, so none is matched, missed or noise.
-        * A point of no face still counts in its region's size, and lowers its precision and IoU;
-          a point of no region counts in its face's size, and lowers its recall and IoU.
-        * For ``ari`` the unlabelled points of each side are one more part, as when the labels are
-          given to scikit-learn. Pass ``ignore=-1`` to leave out the points of no face altogether.
-        * ``covering`` and ``mean_best_iou`` are over faces only.
-
-    Args:
-        labels: Predicted label of each point, shape ``(N,)``, integers.
-        truth: True label of each point, shape ``(N,)``, integers.
-        min_size: Regions of fewer points count as unlabelled (the paper draws those of 50 and
-            more). Faces of any size count.
-        ignore: Points with this true label are left out of everything. Default: none is.
+    Arguments, errors, and how unlabelled points count are as in
+    :func:`torchrg.metrics.contingency_table`: a point of no face lowers the precision of its
+    region, a point of no region the recall of its face. The paper draws regions of 50 points and
+    more.
 
     Returns:
         The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
-        the counts tell it from a real 0. ``ari`` is 1 where neither side divides the points.
-
-    Raises:
-        ShapeError: If the labels are not integers, or differ in length or device.
-        ConfigError: If ``min_size`` is below 1.
+        the counts tell it from a real 0.
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
-        Normal Estimation, section III.B. :func:`adjusted_rand_index` and
-        :func:`segmentation_covering` name theirs.
+        Normal Estimation, section III.B.
 
     Example:
         >>> score = score_labels(torch.tensor([8, 8, 8, 3, -1]), torch.tensor([0, 0, 1, 1, 1]))
@@ -125,19 +105,10 @@ def score_labels(
 
 
 def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
-    """Return mean precision and recall of the pairs, in percent, and how many pairs there are [1].
+    """Return mean precision and recall of the pairs, in percent, and how many pairs there are.
 
-    ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` of each pair of :func:`match_regions`.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        Both in [0, 100]; 0 where there is no pair.
-
-    References:
-        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
-        Normal Estimation, section III.B.
+    ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` of each pair of :func:`match_regions`;
+    0 where there is no pair.
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
@@ -154,23 +125,12 @@ def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]
 
 
 def match_regions(table: ContingencyTable) -> Tensor:
-    """Pair each region with the face that it overlaps most and that it is overlapped most by [1].
+    """Pair each region with the face that it overlaps most and that it is overlapped most by.
 
-    Convention:
-        Equal overlaps, in points, are decided by the larger intersection over union, that is the
-        smaller partner; then by the lower label. The order of the points plays no part. (The paper
-        also says "the maximum or second maximum overlap", and not how the second enters.)
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        The rows of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64; no region
-        and no face occurs twice. Empty if nothing overlaps.
-
-    References:
-        [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
-        Normal Estimation, section III.B.
+    So the paper pairs them, see :func:`score_labels`. Equal overlaps, in points, are decided by the
+    larger intersection over union, that is the smaller partner; then by the lower label. (It also
+    says "the maximum or second maximum overlap", and not how the second enters.) Returns the rows
+    of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64.
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
@@ -199,18 +159,11 @@ def _is_first(groups: Tensor, *keys: Tensor) -> Tensor:
 
 
 def adjusted_rand_index(table: ContingencyTable) -> float:
-    r"""Return the Rand index corrected for chance [1].
+    """Return the Rand index corrected for chance [1].
 
-    Convention:
-        The unlabelled points of a side are one more part of it: the value is that of
-        scikit-learn's ``adjusted_rand_score`` for the same labels, -1 included.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        At most 1 (equal partitions), about 0 for independent ones, negative for worse. 1 for two
-        partitions without any pair of points to judge, one point or no point included.
+    The unlabelled points of a side are one more part of it: the value is that of scikit-learn's
+    ``adjusted_rand_score`` for the same labels, -1 included. At most 1 (equal partitions), about 0
+    for independent ones, negative for worse; 1 where there is no pair of points to judge.
 
     References:
         [1] L. Hubert, P. Arabie. Comparing partitions. Journal of Classification, 1985, eq. 5.
@@ -231,18 +184,9 @@ def adjusted_rand_index(table: ContingencyTable) -> float:
 
 
 def segmentation_covering(table: ContingencyTable) -> float:
-    r"""Return the covering of the faces by the regions [1].
+    r"""Return the covering of the faces by the regions [1], in [0, 1]; 0 where there is no face.
 
     ``sum_j |G_j| max_i IoU(C_i, G_j) / sum_j |G_j|``: the mean best IoU weighted by size.
-
-    Convention:
-        Unlabelled points are no region and no face: truth without a face has no weight.
-
-    Args:
-        table: Overlaps of regions and faces.
-
-    Returns:
-        In [0, 1]; 0 where there is no face.
 
     References:
         [1] P. Arbelaez et al. Contour detection and hierarchical image segmentation. TPAMI, 2011,

@@ -8,18 +8,11 @@ from torchrg.structures import Cloud
 
 
 def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
-    """Return the rows that hold another point in the other cloud.
+    """Return the rows, ascending, that hold another point in the other cloud of equal length.
 
     Numbers are compared in the narrower type of both clouds, so that a copy in float32 holds the
     points of an original in float64. Points that are not finite agree with each other. Points that
     other rounding has moved differ; :func:`match_points` takes them within a distance.
-
-    Args:
-        ours: A cloud of N points.
-        theirs: A cloud of as many.
-
-    Returns:
-        Rows, ascending, shape ``(n,)``.
 
     Example:
         >>> exact = np.array([[0.1, 2.0, 3.0], [0.5, 0.25, 0.125]])
@@ -37,15 +30,9 @@ def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
 
 
 def match_points(ours: Cloud, theirs: Cloud, max_distance: float) -> NDArray[np.int64]:
-    """Return the nearest point of ours for each of theirs.
+    """Return the nearest point of ours for each of theirs, rows of ours, shape ``(M,)``.
 
-    Args:
-        ours: A cloud of N points.
-        theirs: A cloud of M points, in the same coordinates.
-        max_distance: Points farther than this are no match, in the unit of the clouds.
-
-    Returns:
-        Rows of ours, shape ``(M,)``; -1 for no match, as for points that are not finite.
+    Points farther than ``max_distance``, in the unit of the clouds, or not finite, have none: -1.
 
     Example:
         >>> room = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

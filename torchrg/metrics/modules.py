@@ -43,18 +43,16 @@ class PlaneMetric(Metric):
     addition, and the metrics of one part in a ``MetricCollection`` score each scan once.
 
     Args:
-        index: A part of :data:`torchrg.metrics.METRICS` (``"labels"``,
-            ``"superpoints"``, ``"clusters"`` or ``"normals"``), for a dict of all its indices; or
-            an index of one, as in ``"f1"``.
-        **settings: Settings of :func:`torchrg.metrics.score_labels`, ``score_partition``,
-            ``score_clusters`` or ``score_normals``, as in ``min_size=50``, and those of
+        index: A part of :data:`torchrg.metrics.METRICS`, for a dict of all its indices; or an index
+            of one, as in ``"f1"``.
+        **settings: Settings of the function of the part, as in ``min_size=50``, and those of
             :class:`torchmetrics.Metric`.
 
     Attributes:
         part: The part of ``METRICS`` that the index is of.
-        index: The index; None for all.
-        unit: Its unit; None for all.
-        higher_is_better: Whether more of it is better; None for neither, and for all.
+        index: The index; None for all, and so are the others then.
+        unit: Its unit.
+        higher_is_better: Whether more of it is better; None for neither.
 
     Raises:
         ConfigError: If there is no such index, or several parts have one of that name.

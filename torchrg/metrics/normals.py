@@ -27,9 +27,7 @@ class NormalScore(NamedTuple):
         rms: Root mean square angle error, degrees.
         mean: Mean angle error, degrees.
         median: Median angle error, degrees.
-        under_5_deg: Share of points with an error below 5 degrees, in [0, 1].
-        under_10_deg: The same below 10 degrees.
-        under_20_deg: The same below 20 degrees.
+        under_5_deg: Share of points with an error below 5 degrees, in [0, 1]; and so on.
         points: Points that were scored.
         invalid: Points with a true normal and no estimated one; in none of the indices.
     """
@@ -51,20 +49,19 @@ def score_normals(
     *,
     valid: Tensor | NDArray[Any] | None = None,
 ) -> NormalScore:
-    r"""Score normals by their angle to the true ones, signs ignored.
+    """Score normals by their angle to the true ones, signs ignored.
 
     The error of a point is ``arccos |n . t|`` in [0, 90] degrees; MSAE is the mean of its square
     (the measure of the paper's Figure 4), RMS the root of that.
 
     Convention:
-        Normals need no unit length. A point without an estimated normal (zero, not finite, or
-        ``valid`` False) is in no index and counted in ``invalid``: look at that count before
-        comparing estimators that may abstain. A point without a true normal (zero or not finite)
-        counts nowhere. Angles are computed in float64 from chords, so that small ones are right.
+        A point without an estimated normal (zero, not finite, or not ``valid``) is in no index and
+        counted in ``invalid``: look at that count before comparing estimators that may abstain. A
+        point without a true normal counts nowhere.
 
     Args:
-        normals: Estimated normals, shape ``(*, 3)``, floating point.
-        truth: True normals, shape ``(*, 3)``, floating point.
+        normals: Estimated normals of any length, shape ``(*, 3)``, floating point.
+        truth: True normals, likewise.
         valid: Points whose normal counts as estimated, shape ``(*)``, bool. Default: all.
 
     Returns:

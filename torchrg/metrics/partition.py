@@ -25,10 +25,9 @@ class PartitionScore(NamedTuple):
             superpoint takes its most frequent part.
         oracle_miou: Mean IoU over the parts of that labelling.
         boundary_recall: Share of the points at a true border that have one at a border of
-            superpoints within ``boundary_distance``; None without coordinates.
-        boundary_precision: Share of the points at a border of superpoints that have one at a true
-            border within ``boundary_distance``; None without coordinates.
-        boundary_distance: That distance, in the unit of the cloud; None without coordinates.
+            superpoints within ``boundary_distance``. Without coordinates all three are None.
+        boundary_precision: The same share the other way round.
+        boundary_distance: That distance, in the unit of the cloud.
         count: Superpoints, those without a scored point included.
         points_per_superpoint: Mean number of points of a superpoint, all points counted.
         points: Scored points.
@@ -59,11 +58,10 @@ def score_partition(
     are never worse, so compare partitions of equally many.
 
     Convention:
-        * Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored;
-          their superpoints count in ``count``.
-        * A point whose superpoint is -1 belongs to none, and is wrong.
-        * Of equally frequent parts a superpoint takes that of the lowest label.
-        * A point is at a border when one of its 8 nearest scored points has another label.
+        Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored. A
+        point whose superpoint is -1 belongs to none, and is wrong. Of equally frequent parts a
+        superpoint takes that of the lowest label. A point is at a border when one of its 8 nearest
+        scored points has another label.
 
     Args:
         superpoints: Superpoint of each point, shape ``(N,)``, integers.

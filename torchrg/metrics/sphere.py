@@ -6,7 +6,6 @@ its angle ``arccos |a . b|`` (eq. 17), which chords give without loss where it i
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,13 +17,6 @@ _MAX_PAIRS = 2**17
 
 _ROUNDING = 1e-12
 """Relative error by which an angle may come out too large."""
-
-
-class Centers(NamedTuple):
-    """Centres ``(M, 3)`` of clusters, and the directions ``(N, 3)`` turned to their sides."""
-
-    centers: Tensor
-    directions: Tensor
 
 
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,8 +46,7 @@ def rows_at_once(length: int) -> int:
 def chord_table(a: Tensor, b: Tensor, *, aligned: bool = False) -> Tensor:
     """Return the chord between all directions of two sets, shape ``(A, B)``, in [0, sqrt(2)].
 
-    ``aligned`` promises that no angle between the vectors as given exceeds 90 degrees, and saves
-    half of the work.
+    If they are ``aligned``, no two more than 90 degrees apart, that is half of the work.
     """
     # A matrix product would be faster, and turn equal directions into chords of 1e-8.
     direct = "donot_use_mm_for_euclid_dist"
@@ -73,17 +64,18 @@ def chord_to_angle(chords: Tensor) -> Tensor:
     return chords.div_(2).asin_().mul_(2)
 
 
-def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> Centers:
+def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> tuple[Tensor, Tensor]:
     """Return the normalised mean direction of each cluster (eq. 16), after aligning the signs.
 
     Normals have no sign, so each is first turned to the side of the cluster's principal axis, the
     direction that the sum of ``(n . axis)^2`` is largest for. The mean of the turned vectors
     cannot vanish. The sign of a centre makes its largest entry positive. Each cluster of
-    ``clusters`` ``(N,)``, 0 to M-1, has one direction at least.
+    ``clusters`` ``(N,)``, 0 to M-1, has one direction at least. Centres are ``(M, 3)``; the turned
+    directions ``(N, 3)`` are the second result.
 
     Example:
         >>> directions = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]], dtype=torch.float64)
-        >>> find_centers(directions, torch.tensor([0, 0]), 1).centers.abs().tolist()
+        >>> find_centers(directions, torch.tensor([0, 0]), 1)[0].abs().tolist()
         [[0.0, 0.0, 1.0]]
     """
     columns = directions.unbind(dim=1)
@@ -99,7 +91,7 @@ def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> Cen
     aligned = torch.where(opposite[:, None], -directions, directions)
     sums = [torch.bincount(clusters, column, num_clusters) for column in aligned.unbind(dim=1)]
     centers, _ = unit_vectors(torch.stack(sums, dim=1))
-    return Centers(centers, aligned)
+    return centers, aligned
 
 
 def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
@@ -136,12 +128,6 @@ def measure_spreads(
     Larger clusters, and larger sets of possible ends of a diameter, are subsampled to
     ``sample_size``; third and fourth are the clusters whose mean is of a subsample, and whether no
     diameter is.
-
-    Example:
-        >>> axes = torch.eye(3, dtype=torch.float64)
-        >>> means, _, num_sampled, _ = measure_spreads([axes[:1], axes[1:]], axes[:2])
-        >>> means.rad2deg().round().tolist(), num_sampled
-        ([0.0, 90.0], 0)
     """
     means, diameters, num_sampled, exact = [], [], 0, True
     for part, center in zip(parts, centers, strict=True):
@@ -180,8 +166,8 @@ def _upper_angles(directions: Tensor) -> Iterator[Tensor]:
 def _rim(directions: Tensor, center: Tensor) -> Tensor:
     """Return the directions of a cluster that can be an end of its diameter.
 
-    By the triangle inequality a pair at least as far apart as ``d`` has both ends at least
-    ``d - r`` from the centre, with ``r`` the largest distance from it. ``d`` is a distance that
+    A pair at least as far apart as ``d`` has both ends at least ``d - r`` from the centre, with
+    ``r`` the largest distance from it (triangle inequality). ``d`` is a distance that
     occurs: from the farthest direction to the one farthest from that.
     """
     radii = chord_to_angle(chords_between(directions, center))

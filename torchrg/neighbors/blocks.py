@@ -39,10 +39,8 @@ _BOXES_AT_ONCE = 64
 class Boxes(NamedTuple):
     """The cells of an octree that hold few points each; in canonical order each is one run of rows.
 
-    Attributes:
-        starts: First row of each, and the number of points, shape ``(B + 1,)``.
-        low: Lower corner of the points, shape ``(B, 3)``, float64.
-        high: Upper corner, shape ``(B, 3)``, float64.
+    The first row of each, then the number of points, ``(B + 1,)``; lower and upper corners of the
+    points, ``(B, 3)``, float64.
     """
 
     starts: NDArray[np.int64]
@@ -54,10 +52,6 @@ def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxe
     """Return the boxes of at most so many points ``(N, 3)`` in canonical order.
 
     Only a cell of the finest level may hold more: nearly equal points.
-
-    Example:
-        >>> find_boxes(np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1]]), 2).starts.tolist()
-        [0, 2, 3]
     """
     codes = morton_codes(points)
     is_start = np.zeros(len(points) + 1, dtype=bool)
@@ -128,21 +122,10 @@ def _gaps(
 def search_blocks(
     points: NDArray[np.floating], k: int, search: SearchRows
 ) -> Iterator[tuple[slice, NDArray[np.int32]]]:
-    """Yield blocks of rows, and the rows of the ``k`` nearest points of theirs, shape ``(n, k)``.
+    """Yield blocks of rows, and their neighbours ``(n, k)`` as :func:`torchrg.search_knn` has them.
 
-    They are those of :func:`torchrg.search_knn` for the whole cloud, exactly.
-
-    Args:
-        points: Points in canonical order, shape ``(N, 3)``.
-        k: Number of neighbours, at most N.
-        search: What answers for some rows of a smaller cloud.
-
-    Example:
-        >>> from torchrg.neighbors.knn import search_rows
-        >>> points = np.arange(4.0)[:, None] * [1, 0, 0]
-        >>> for block, near in search_blocks(points, 2, search_rows):
-        ...     print(block, near.tolist())
-        slice(0, 4, None) [[0, 1], [1, 0], [2, 1], [3, 2]]
+    The points ``(N, 3)`` are in canonical order, k at most N; ``search`` answers for some rows of a
+    smaller cloud.
     """
     boxes = find_boxes(points)
     ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, len(points), BLOCK_SIZE))]

@@ -103,18 +103,10 @@ def search_knn(
 def search_nearest(
     points: NDArray[np.floating], queries: NDArray[np.floating], max_distance: float
 ) -> NDArray[np.int64]:
-    """Find the nearest point of each query, if there is one within a distance.
+    """Return the row of the nearest point of each query ``(M,)``, -1 where none is near enough.
 
-    Convention:
-        Of points at equal distances the one that comes first in :func:`canonical_order` is taken.
-
-    Args:
-        points: Finite points, shape ``(N, 3)``.
-        queries: Finite points, shape ``(M, 3)``, in the same coordinates.
-        max_distance: Points farther than this do not count.
-
-    Returns:
-        Rows of the points, shape ``(M,)``; -1 where none is near enough.
+    Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Of points at
+    equal distances the first in :func:`canonical_order` is taken.
 
     Example:
         >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
@@ -155,12 +147,7 @@ def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int
 
 @sequential_operations()
 def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np.int32]:
-    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``.
-
-    Example:
-        >>> search_rows(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), slice(1, 2), 2).tolist()
-        [[1, 0]]
-    """
+    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``."""
     indices = np.empty((len(points), k), dtype=np.int32)
     _search_cloud(points, rows, None, 0, math.inf, indices, None)
     return indices[rows]
@@ -177,9 +164,8 @@ def _search_cloud(
 ) -> None:
     """Search one cloud in canonical order and write results in the caller's order.
 
-    Rows that are not ``asked`` may be answered or not.
-    The tree holds each distinct place once, and duplicates are put back afterwards: a place with
-    many points costs no more than a place with one.
+    Rows that are not ``asked`` may be answered or not. The tree holds each distinct place once, so
+    that a place with many points costs no more than a place with one.
     """
     from scipy.spatial import cKDTree
 
@@ -263,15 +249,10 @@ def _restore_duplicates(
 
 
 def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
-    """Return the coordinates of neighbours about the point itself.
+    """Return the coordinates of neighbours about the point itself, shape ``(n, K, 3)``.
 
-    Args:
-        points: Points, shape ``(N, 3)``.
-        indices: Rows of the neighbours, shape ``(n, K)``; the first column is the point itself.
-
-    Returns:
-        Differences to the first neighbour, shape ``(n, K, 3)``. In memory each coordinate is
-        contiguous, so that ``patches.unbind(-1)`` gives fast columns.
+    ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. In memory each
+    coordinate is contiguous, so that ``patches.unbind(-1)`` gives fast columns.
 
     Example:
         >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])

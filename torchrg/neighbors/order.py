@@ -22,15 +22,12 @@ _SPREADS = (
 
 
 def canonical_order(points: Tensor | NDArray[np.floating]) -> Tensor:
-    """Return an order of the points that depends on their coordinates alone.
+    """Return an order of the points ``(N, 3)``, finite, that depends on their coordinates alone.
 
     Points are sorted along a Morton curve through the bounding box, within one cell of it
     lexicographically; only exact duplicates keep the order they came in. It breaks ties between
     equal distances, and points close in this order are close in space, which makes every later
     gather faster.
-
-    Args:
-        points: Finite points, shape ``(N, 3)``.
 
     Returns:
         Row numbers, shape ``(N,)``, int64: ``points[order]`` is in canonical order.

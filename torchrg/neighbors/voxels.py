@@ -33,17 +33,10 @@ class Voxels(NamedTuple):
 
 
 def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
-    """Choose one point of each occupied cell of a cubic grid.
+    """Choose one point of each occupied cell of a cubic grid of side ``size``.
 
     The point nearest to the middle of its cell is chosen, so the result is made of points of the
-    cloud and does not depend on their order. The grid begins at the least coordinates.
-
-    Args:
-        points: Points, shape ``(N, 3)``, float32 or float64.
-        size: Side of a cell, in the unit of the cloud.
-
-    Returns:
-        The chosen points, and the voxel of each point.
+    cloud ``(N, 3)`` and does not depend on their order. The grid begins at the least coordinates.
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
@@ -114,15 +107,10 @@ def cell_keys(cells: Sequence[Tensor]) -> Tensor:
 
 
 def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
-    """Give each point the value of its voxel.
+    """Give each point the value of its voxel, shape ``(N, ...)``.
 
-    Args:
-        values: A row for each voxel, shape ``(V, ...)``.
-        inverse: Voxel of each point, shape ``(N,)``; negative for none.
-        fill: Value of the points without a voxel; for labels :data:`torchrg.UNLABELED`.
-
-    Returns:
-        Shape ``(N, ...)``.
+    ``values`` has a row for each voxel, ``inverse`` ``(N,)`` the voxel of each point. Points of a
+    negative one, which have no voxel, get ``fill``; for labels :data:`torchrg.UNLABELED`.
 
     Example:
         >>> restore_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()

@@ -34,9 +34,8 @@ from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
-from torchrg.normals.paper import estimate_paper, find_sharp_points
+from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca
-from torchrg.normals.robust import fit_normals_robust
 from torchrg.normals.sides import orient_cloud
 from torchrg.precision import warn_of_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
@@ -97,8 +96,7 @@ def estimate_normals(
         what is chosen held fixed, that is neighbours, inliers, sharp points, and the noise that
         ``irls`` assumes. With the covariance ``C`` of the points of the fit, its eigenvalues ``l``
         and eigenvectors ``v``, ``dn = sum_j v_j (v_j . dC n) / (l_0 - l_j)``. ``jet`` adds the
-        gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none
-        and refuses points that require one.
+        gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none.
 
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
@@ -108,8 +106,7 @@ def estimate_normals(
         k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud
             with fewer points uses those it has.
         neighbors: Neighbours found before, for finite points. Default: searched.
-        max_distance: Neighbours farther than this do not count: a hybrid search. In the unit of the
-            cloud. Default: no limit.
+        max_distance: As of :func:`torchrg.search_knn`.
         chunk_size: Points handled at a time; bounds memory, changes no result.
 
     Returns:
@@ -121,8 +118,7 @@ def estimate_normals(
         ShapeError: If a shape or dtype is not as above.
 
     Warns:
-        PrecisionWarning: If the steps of float32 are more than a tenth of the spacing of the
-            points, as they are far from the origin.
+        PrecisionWarning: As :func:`torchrg.segment_planes` does.
 
     Example:
         >>> floor = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
@@ -132,7 +128,7 @@ def estimate_normals(
     """
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
-    warn_of_steps("estimate_normals", tensor, stacklevel=4)
+    warn_of_steps("estimate_normals", tensor)
     changes = {"method": method, "k": k}
     given = {name: value for name, value in changes.items() if value is not None}
     settings = settings_of("estimate_normals", NormalsConfig, config, given)

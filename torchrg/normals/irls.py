@@ -74,15 +74,7 @@ class _Offsets(NamedTuple):
 
 
 class _Plane(NamedTuple):
-    """Planes near points, and the scale of the weights.
-
-    Attributes:
-        normal: Unit normals, shape ``(n, 3)``.
-        center: Points of the planes, relative to the points themselves, shape ``(n, 3)``.
-        mu: Squared distance at which the weight is a quarter, shape ``(n, 1)``.
-        weighed_normal: Normals that the last weights were taken with, shape ``(n, 3)``.
-        weighed_mu: ``mu`` that the last weights were taken with, shape ``(n, 1)``.
-    """
+    """Unit normals and centers ``(n, 3)``, the scale of weights ``(n, 1)``, and those last used."""
 
     normal: Tensor
     center: Tensor
@@ -124,7 +116,7 @@ def fit_normals_irls(
     mu_decay: float = 1.05,
     resolution: Tensor | None = None,
 ) -> NormalFit:
-    r"""Fit a plane to each patch by iteratively weighted PCA [1], eqs. (3) and (5).
+    """Fit a plane to each patch by iteratively weighted PCA [1], eqs. (3) and (5).
 
     1. Where the plane of PCA fits within the noise, it is the answer.
     2. Elsewhere the normal is the smallest eigenvector of the covariance about the point itself
@@ -137,18 +129,15 @@ def fit_normals_irls(
     4. If that turned the normal by more than 5 degrees, there is an edge: a second solution starts
        across the first, and the one closer to the point with more than a tenth of the others wins.
 
-    Convention:
-        The point itself is the first of the patch that counts; it takes no part in the fit.
-        The authors' ``mu_decay`` is 1.01; 1.05 takes a fifth of the time, and its mean squared
-        errors on solids with edges are 4 to 11 % larger. (The paper prints eq. (5) without the
-        square of ``r``; the authors square it.) Their surface may be curved by a known radius;
-        here it is flat.
-        Gradients are those of the steps as taken, and are recomputed step by step to save memory.
+    The point itself is the first of the patch that counts; it takes no part in the fit. The
+    authors' ``mu_decay`` is 1.01; 1.05 takes a fifth of the time, and its mean squared errors on
+    solids with edges are 4 to 11 % larger. (The paper prints eq. (5) without the square of ``r``;
+    the authors square it.) Their surface may be curved by a known radius; here it is flat.
+    Gradients are those of the steps as taken.
 
-    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`, the point itself
-    first. ``noise`` is its standard deviation, shape ``(*)``, in the unit of the cloud; at
-    least 1e-4 of the distance to the farthest point is assumed. ``mu_decay``, above 1, is the
-    factor by which ``mu`` shrinks in a step.
+    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. ``noise`` is a
+    standard deviation, shape ``(*)``, in the unit of the cloud; at least 1e-4 of the distance to
+    the farthest point is assumed. ``mu_decay`` is above 1.
 
     Returns:
         The fit. Curvature and residual are those of PCA on it and the points of weight above
@@ -187,7 +176,7 @@ def fit_normals_irls(
 def estimate_irls(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
-    """Estimate normals by iteratively weighted PCA, with the noise found about each point.
+    """Estimate normals by iteratively weighted PCA.
 
     The authors ask the user for the noise; here it is estimated from the planes of PCA about each
     point.
@@ -308,8 +297,8 @@ def _fit_graduated(
     direction in which the weighted points are flattest about the center. With ``shift`` the center
     first moves along the normal to the weighted mean of the heavy points, their weights being those
     of the step before. ``mu`` ends at the first value at or below the limit, with ``shift`` at the
-    last one at or above. Patches leave the batch when they are done. If gradients are wanted, each
-    step keeps its input only and is run again for them.
+    last one at or above. Patches leave the batch when they are done. For gradients each step keeps
+    its input only and is run again.
     """
     differentiable = torch.is_grad_enabled() and plane.normal.requires_grad
     step = partial(checkpoint, _step, use_reentrant=False) if differentiable else _step

@@ -1,9 +1,8 @@
 """Quadratic height fields: normals and curvatures of curved surfaces.
 
-There are two solvers because there are two purposes. Jets serve all points of a cloud, with
-gradients, and are as exact as CGAL's in float64, so they are fitted by orthogonalisation. The
-paraboloids of the consensus need three digits and no gradient. Normal equations, which square the
-condition number, do them no harm and take half the time.
+Jets serve all points of a cloud, with gradients, and are as exact as CGAL's in float64, so they
+are fitted by orthogonalisation. The paraboloids of the consensus need three digits and no gradient:
+normal equations, which square the condition number, do them no harm and take half the time.
 """
 
 from collections.abc import Sequence
@@ -35,8 +34,7 @@ def fit_normals_jet(
     """Fit a quadratic surface to each patch and return its normal at the point itself.
 
     See :func:`fit_jet`, which gives the principal curvatures too. ``curvature`` is the surface
-    variation of PCA, so that regions grow in the same order; ``residual_rms`` belongs to the
-    quadratic surface.
+    variation of PCA; ``residual_rms`` belongs to the quadratic surface.
 
     Example:
         >>> x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
@@ -49,18 +47,17 @@ def fit_normals_jet(
 
 
 class JetFit(NamedTuple):
-    """A quadratic surface through each neighbourhood; see :func:`fit_jet`.
+    """A quadratic surface through each neighbourhood, zero if not valid; see :func:`fit_jet`.
 
     Attributes:
-        normals: Unit normals of the surface at the point itself, shape ``(*, 3)``; zero where not
-            ``valid``. The sign is arbitrary.
+        normals: Unit normals of the surface at the point itself, shape ``(*, 3)``, of any sign.
         foot: Point of the surface above or below it, shape ``(*, 3)``.
         principal_curvatures: The larger and the smaller one, shape ``(*, 2)``, in 1 / unit of the
             cloud; positive where the surface bends towards ``normals``.
         principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
             two orthogonal ones where the two curvatures are equal.
         curvature: Surface variation, as of :func:`torchrg.normals.fit_normals_pca`, shape ``(*)``.
-        valid: Whether there is a plane, shape ``(*)``, bool; all else is zero where not.
+        valid: Whether there is a plane, shape ``(*)``, bool.
         residual_rms: Root mean square distance of the points to the surface along the normal of
             their plane, shape ``(*)``.
     """
@@ -78,7 +75,7 @@ class JetFit(NamedTuple):
 def fit_jet(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
 ) -> JetFit:
-    r"""Fit a quadratic height field to each patch: a jet of degree 2 [1].
+    """Fit a quadratic height field to each patch: a jet of degree 2 [1].
 
     In the frame of the patch's PCA about the point itself, the first of the patch that counts, the
     height ``w`` is fitted by least squares as ``a0 + a1 u + a2 v + a3 u^2/2 + a4 u v + a5 v^2/2``.
@@ -86,12 +83,8 @@ def fit_jet(
     eigenvalues of the shape operator there. This is what CGAL's ``jet_estimate_normals`` does in
     degree 2.
 
-    Convention:
-        Gradients flow through everything but the principal directions, and are finite where two
-        eigenvalues are equal.
-
-    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`, the point itself
-    first in each patch.
+    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. Gradients flow
+    through everything but the principal directions, and are finite where two eigenvalues are equal.
 
     Returns:
         The fit. Terms that the points do not determine are left out, the last ones first: two
@@ -223,8 +216,8 @@ def least_squares(
 
     Modified Gram-Schmidt with the target as the last column: as accurate as Householder's QR, and
     made of sums of products only, so it runs batched on any device and gradients flow. Each column
-    comes with the share of its length that must be left after those before it are taken out.
-    Returns the coefficient of each, shape ``(*, 1)``, 0 where it is left out, and the residual.
+    comes with the share of its length that must be left. Returns the coefficient of each, shape
+    ``(*, 1)``, 0 where it is left out, and the residual.
     """
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
@@ -257,9 +250,9 @@ def _principal_curvatures(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit normals of height fields, principal curvatures and their directions.
 
-    From first and second derivatives: normals of positive height ``(*, 3)``, curvatures ``(*, 2)``,
-    larger first, and directions ``(*, 2, 3)``, these without gradient. They are the eigenvalues of
-    the shape operator, of entries aa, ab, bb in an orthonormal basis of tangents.
+    From first and second derivatives: normals of positive height ``(*, 3)``; curvatures ``(*, 2)``,
+    larger first, the eigenvalues of the shape operator, of entries aa, ab, bb in an orthonormal
+    basis of tangents; and directions ``(*, 2, 3)``, without gradient.
     """
     one = torch.ones_like(slope_u)
     gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()

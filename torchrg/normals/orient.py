@@ -106,7 +106,7 @@ def orient_normals(
     Convention:
         The result does not depend on the signs that came in, nor on the order of the points. A
         normal for which neither sign is right (at right angles to the axis, say) gets the one that
-        makes the first of z, y, x that is not zero positive. Region growing ignores signs.
+        makes the first of z, y, x that is not zero positive.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -180,8 +180,8 @@ def _follow(
 ) -> Tensor:
     """Return signs of rows ``(n,)`` that agree with oriented normals of points near to them.
 
-    Of the nearest of these ``(M, 3)`` that is followed over whose link the surface bends least, as
-    along the tree of :func:`propagate_signs`: the other face of a plate may be nearer.
+    That is followed over whose link the surface bends least, as along the tree of
+    :func:`propagate_signs`: the other face of a plate may be nearer.
     """
     from scipy.spatial import cKDTree
 
@@ -200,10 +200,7 @@ def _follow(
 
 
 def turn_towards(normals: Tensor, directions: Tensor) -> Tensor:
-    """Return normals that form no more than a right angle with a direction, ``(3,)`` or ``(N, 3)``.
-
-    Those at a right angle have a positive first of z, y, x that is not zero.
-    """
+    """Return normals at no more than a right angle to a direction, ``(3,)`` or ``(N, 3)``."""
     upright = _upright(normals)
     away = (upright * directions).sum(dim=-1, keepdim=True) < 0
     return torch.where(away, -upright, upright)
@@ -253,9 +250,9 @@ def _turn_inside(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Tenso
 def _decide_patches(votes: Tensor, patches: Tensor, signs: Tensor, links: "_Links") -> Tensor:
     """Return votes of patches by which small ones agree with those around them, shape ``(M,)``.
 
-    A few points far from others in direction say little on their own, and mostly it is noise that
-    tells them from the face that they are on. Links to patches that have decided tell more, those
-    of little bend most; patches that no link reaches decide for themselves.
+    Mostly it is noise that tells a few points from the face that they are on. Links to patches that
+    have decided tell more, those of little bend most; patches that no link reaches decide for
+    themselves.
     """
     decided = torch.where(torch.bincount(patches) < _LEAST_FACE, 0.0, votes.sign())
     first, second = patches[links.starts], patches[links.ends]
@@ -293,7 +290,7 @@ def propagate_signs(
     within_patches: bool = False,
     links: "_Links | None" = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Find signs by which neighbouring normals agree, along a minimum spanning tree [1].
+    """Find signs by which neighbouring normals agree, along a minimum spanning tree [1].
 
     Two normals agree if one and the mirror image of the other in the plane halfway between the two
     points form less than a right angle [2]: so they do on a sphere, on both sides of a sharp edge,
@@ -301,8 +298,7 @@ def propagate_signs(
     trusted is its bend ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle
     and ``u`` the direction of the link: 0 on a plane, 1 over a right-angled edge, 2 through a
     plate. The tree takes the links of least bend; within smooth patches those of more than 0.05 not
-    at all. Memory and time are those of a sparse graph. Points are in canonical order if ties are
-    to be independent of it.
+    at all. Points are in canonical order if ties are to be independent of it.
 
     Returns signs ``(N,)``, 1 or -1; the connected patch that each point belongs to, 0 to M-1, whose
     first point has sign 1; and its face within the patch, where no link of the tree bends by more
@@ -352,11 +348,7 @@ def propagate_signs(
 
 
 class _Links(NamedTuple):
-    """Links between neighbours, each of shape ``(L,)``.
-
-    Both ends, the one of lower row first, the bend, and the cosine between the normal of one end
-    and the mirrored normal of the other.
-    """
+    """Links of neighbours ``(L,)``, lower row first; cosines are of a normal and one mirrored."""
 
     starts: Tensor
     ends: Tensor
@@ -403,13 +395,12 @@ def _signs_to_root(points: Tensor, normals: Tensor, parents: Tensor) -> Tensor:
 
 
 def vote_free_side(points: Tensor, normals: Tensor, neighbors: Neighbors) -> Tensor:
-    r"""Return how much more free space lies in front of each point than behind it.
+    """Return how much more free space lies in front of each point than behind it.
 
     1. The cloud marks the cells of a grid, 1.5 point spacings wide (the 90th percentile of them,
        so that sparse walls have no holes).
     2. From each point, in each of the 26 directions to neighbouring cells, the free path is
-       measured to the next marked cell. A path that leaves the cloud's box without meeting anything
-       counts half.
+       measured to the next marked cell. A path that leaves the cloud's box counts half.
     3. If a neighbour lies straight in front, within 30 degrees of the normal, paths to the front
        end there, and paths to the back likewise; so they do at one with a parallel normal that
        rises by more than 17 degrees. The faces of thin plates are closer than cells.

@@ -32,7 +32,7 @@ _NARROW = 0.03
 def fit_normals_pca(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
 ) -> NormalFit:
-    r"""Fit a plane to each patch by least squares and return its normal.
+    """Fit a plane to each patch by least squares and return its normal.
 
     The normal is the eigenvector of the smallest eigenvalue ``l0`` of the covariance [1], eq. (1);
     the curvature is the surface variation ``l0 / (l0 + l1 + l2)`` [2], eq. (2).
@@ -40,8 +40,8 @@ def fit_normals_pca(
     Convention:
         The sign of a normal is arbitrary. Gradients flow through normals, curvature and residual,
         and are finite where two eigenvalues are equal: the turn between the two is left out.
-        ``torch.compile(fullgraph=True)`` works, and so does ``torch.vmap``, with
-        ``out_dims=NormalFit(0, 0, 0, 0, None)`` as the fit has no ``sharp``.
+        ``torch.vmap`` works with ``out_dims=NormalFit(0, 0, 0, 0, None)``, as there is no
+        ``sharp``.
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, 3)``.

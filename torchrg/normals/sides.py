@@ -46,9 +46,6 @@ def orient_cloud(
         towards: See above.
         viewpoint: Where the scanner stood, in the coordinates of the cloud, shape ``(3,)``.
 
-    Returns:
-        The normals, some of them reversed.
-
     Raises:
         ConfigError: If ``towards`` is unknown, or no place is known to look at.
 

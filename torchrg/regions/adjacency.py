@@ -50,9 +50,8 @@ def find_adjacency(
     :math:`\rho` and n edges from each point a curve of length L meets edges with
     :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy and Crofton) [1].
 
-    The planes have unit normals ``(M, 3)`` and a standard deviation of their points
-    (``thickness``, ``(M,)``); ``curved`` tells which regions are not flat. The pairs are in
-    float64; regions that touch in less than three edges do not meet.
+    The planes have unit normals ``(M, 3)`` and a standard deviation of their points (``thickness``,
+    ``(M,)``). Regions that touch in less than three edges do not meet.
 
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
@@ -120,10 +119,7 @@ class NearestPoints:
         return waiting[is_new[self.around(waiting)].any(dim=1)]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of regions that touch, and the number of contacts of each pair.
-
-        As :func:`find_contacts` gives them.
-        """
+        """Return what :func:`find_contacts` does, of the nearest points."""
         return find_contacts(labels, self.neighbors)
 
 
@@ -166,9 +162,8 @@ class _Totals:
 class _Border:
     """The edges between regions, found anew each time: all of them may outweigh the cloud.
 
-    Attributes:
-        pairs: Pairs of regions with an edge between them, ascending, shape ``(E, 2)``.
-        counts: Edges of each pair, shape ``(E,)``.
+    ``pairs`` ``(E, 2)`` are the regions with an edge between them, ascending, and ``counts``
+    ``(E,)`` the edges of each pair.
     """
 
     def __init__(self, labels: Tensor, neighbors: Neighbors) -> None:
@@ -229,11 +224,7 @@ def _edges(points: Tensor, contacts: _Contacts) -> Tensor:
 
 
 def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Tensor) -> Tensor:
-    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``.
-
-    ``along`` are directions of the lines, ``(E, 3)``, and ``spacing`` mean lengths of the edges,
-    NaN for pairs that do not meet on a line.
-    """
+    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
     origin = points[:1].double()
     cells = array("q"), array("q")
     for contacts in border.contacts():

@@ -53,7 +53,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
         ConfigError: If ``up`` is no direction, or no plane is level or upright.
 
     Warns:
-        UserWarning: If there are no walls, so that nothing is known of x and y, or no level plane.
+        UserWarning: If no walls say where x and y are.
 
     Example:
         >>> from torchrg import segment_planes
@@ -90,14 +90,9 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
 
 
 def move_planes(planes: Planes, motion: Tensor) -> Planes:
-    """Return a plane table in coordinates that a rigid motion leads to.
+    """Return a plane table in coordinates that a rigid motion ``(4, 4)`` leads to.
 
-    Args:
-        planes: A table of M planes.
-        motion: Shape ``(4, 4)``, as :func:`align_axes` gives it.
-
-    Returns:
-        The same planes. Normals have the sign that every table gives them.
+    Normals have the sign that every table gives them.
 
     Example:
         >>> from torchrg.regions import summarize_planes
@@ -141,8 +136,7 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
 def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     """Return a cloud after a rigid motion ``(4, 4)`` of its coordinates and normals.
 
-    What its file says about places, as a viewpoint or a coordinate system, is left out. Points that
-    are not finite stay as they are.
+    What its file says about places, as a viewpoint or a coordinate system, is left out.
 
     Example:
         >>> import numpy as np

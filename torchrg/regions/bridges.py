@@ -80,10 +80,7 @@ class MixedRegions(NamedTuple):
 
 
 class _InnerEdges(NamedTuple):
-    """Edges from some points to neighbours of the same region, and which pass all limits.
-
-    ``rows`` ``(n,)``, ``targets``, ``inside`` and ``passed`` ``(n, K)``.
-    """
+    """Edges from rows ``(n,)`` to neighbours: if of the same region, and if within all limits."""
 
     rows: Tensor
     targets: Tensor
@@ -151,9 +148,7 @@ def cut_bridges(
     whole limits, and where one plane explains both. Regions with cores that do not are split: the
     other points join the core of the nearest neighbour that they have an edge to, and no core grows
     through them. Where most points are in curved cores, all that is no large flat one is one core.
-
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
-    perhaps with gaps in their numbers.
+    The regions returned may have gaps in their numbers.
     """
     rows = mixed.rows[grown >= 0]
     if len(rows) == 0:
@@ -177,10 +172,7 @@ def cut_bridges(
 
 
 def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
-    """Make cores of the planes of regions that have other cores, too; number all without gaps.
-
-    Returns the cores ``(N,)``, and which points are in those of planes.
-    """
+    """Make cores of the planes of regions that have other cores; tell their points."""
     has_core = torch.zeros_like(mixed.on_plane)
     has_core[labels[cores >= 0]] = True
     on_plane = mixed.aligned & has_core[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)

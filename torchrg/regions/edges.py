@@ -31,9 +31,7 @@ moment, so it should come rarely."""
 
 
 class GrowingCloud(NamedTuple):
-    """What growth reads: a cloud in canonical order with everything known about its points.
-
-    Coordinates and normals are fast to gather when each column is contiguous.
+    """What growth reads: a cloud in canonical order, its columns contiguous as they gather fast.
 
     Attributes:
         points: Shape ``(N, 3)``.

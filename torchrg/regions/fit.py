@@ -66,16 +66,12 @@ class RegionPlanes(NamedTuple):
         center: A point of each plane, the weighted mean, shape ``(M, 3)``.
         covariance: Weighted covariance, shape ``(M, 3, 3)``.
         thickness: Robust standard deviation of the points from the plane, at least the floor, shape
-            ``(M,)``.
-        rms: Root mean square distance of the points from the plane, shape ``(M,)``.
-        num_points: Number of points, shape ``(M,)``, int64.
-        curved: Whether the points' normals are spread too much for a plane, shape ``(M,)``, bool.
-        floor: Least thickness that counts, shape ``(M,)``.
-        reach: Median distance within which the points take others for coplanar, shape ``(M,)``,
-            infinite where that is not known.
-        bent: Whether noise does not explain the thickness, shape ``(M,)``, bool.
-        radius: Median distance of the points to the last of their neighbours, shape ``(M,)``, 0
-            where there are none.
+            ``(M,)``, as all that follow.
+        rms: Root mean square distance of the points from the plane. num_points: Number of points,
+        int64. curved: Whether the points' normals are spread too much for a plane, bool. floor:
+        Least thickness that counts. reach: Median distance within which the points take others for
+        coplanar, infinite if unknown. bent: Whether noise does not explain the thickness, bool.
+        radius: Median distance of the points to the last of their neighbours, 0 without any.
     """
 
     normal: Tensor
@@ -123,14 +119,13 @@ class RegionPlanes(NamedTuple):
 
 
 def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
-    r"""Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
+    """Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
 
     The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
     (1.4826 times their median), so that points of another surface do not tilt the plane.
-
     ``normals`` of any sign decide where points do not, in regions of one or two points or along a
-    line. Of a plane's normal the component of largest magnitude, of equal ones the last, is
-    positive. Nothing is known of the noise: the floor is 0.
+    line; the sign is that of :func:`with_table_sign`. Nothing is known of the noise: the floor is
+    0.
 
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
@@ -141,7 +136,9 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPla
 
 def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
     """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
-    shares, directions = eigh3_of_few(_spread_of(segments, normals))
+    columns = segments.take_columns(normals)
+    spread_of_normals = _covariances(segments, columns, torch.ones_like(columns[0]))
+    shares, directions = eigh3_of_few(spread_of_normals)
     # The direction that the normals of a region share, signs aside, and their angle to it.
     usual = directions[:, :, 2]
     spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
@@ -184,14 +181,12 @@ def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> Region
 
 
 def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> RegionPlanes:
-    """Return the planes of the regions of a cloud in canonical order.
+    """Return the planes of the regions of a cloud in canonical order, of some points of each.
 
-    They are fitted to some thousand points of each, in even steps. The floor of the thickness is a
-    fraction of the median neighbourhood's radius, as in the test of coplanarity. Curved are regions
-    whose normals are spread and that noise alone does not make so thick: in faces a few centimetres
-    wide, noise spreads normals, too.
-
-    ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative.
+    The floor of the thickness is a fraction of the median neighbourhood's radius, as in the test of
+    coplanarity. Curved are regions whose normals are spread and that noise alone does not make so
+    thick: in faces a few centimetres wide, noise spreads normals, too. ``labels`` ``(N,)`` are 0 to
+    M-1, each at least once, or negative.
     """
     segments = Segments(labels, most=MOST_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
@@ -237,12 +232,6 @@ def coordinates_along(segments: Segments, columns: Sequence[Tensor], axes: Tenso
     for column, part in zip(columns, axes.unbind(dim=1), strict=True):
         total += column * segments.spread(part)
     return total
-
-
-def _spread_of(segments: Segments, normals: Tensor) -> Tensor:
-    """Return the second moments of the regions' normals, shape ``(M, 3, 3)``."""
-    columns = segments.take_columns(normals)
-    return _covariances(segments, columns, torch.ones_like(columns[0]))
 
 
 def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:

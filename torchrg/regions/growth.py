@@ -85,16 +85,16 @@ def grow_regions(
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
         config: Settings, a whole configuration, or the name of a preset. Default: that of
             :func:`torchrg.load_config`, which needs ``residual_rms``.
-        valid: Points that have a normal, shape ``(N,)``, bool; the others join no region, and no
-            region passes through them. Default: all. Points whose normal or curvature is not
-            finite never join.
+        valid: Points that have a normal, shape ``(N,)``, bool; no region passes through others, nor
+            through points whose normal or curvature is not finite. Default: all.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
             :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
         colors: Colours of the points, shape ``(N, C)``.
         max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
             unit of the colours) does not join. Default: colours play no part.
-        signed_normals: Whether opposite normals differ by 180 degrees instead of 0, so that the two
-            faces of a thin wall never join. For normals that are oriented.
+        signed_normals: Whether opposite normals, if oriented, differ by 180 degrees instead of 0,
+        so
+            that the two faces of a thin wall never join.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
 
@@ -139,10 +139,7 @@ def grow_regions(
 def label_regions(
     cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
-    """Return labels of regions that have grown, after all that the settings ask for.
-
-    ``roots`` ``(N,)`` are what :func:`grow` gives. This needs the whole cloud, too.
-    """
+    """Return labels of regions that have grown, after all steps that the settings ask for."""
     least = config.min_size
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
@@ -255,8 +252,8 @@ def by_column(vectors: Tensor) -> Tensor:
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, those of equal size by their first point.
 
-    ``regions`` ``(N,)`` holds any number below N that is the same in a region and another
-    elsewhere, -1 for none. Regions smaller than ``min_size`` become :data:`torchrg.UNLABELED`.
+    ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
+    ``min_size`` become :data:`torchrg.UNLABELED`.
     """
     old = regions.cpu().numpy()
     sizes = np.bincount(old[old >= 0], minlength=len(old))
@@ -308,8 +305,8 @@ def reach_from_seeds(
 ) -> tuple[NDArray[np.int32], EdgeLists]:
     """Return the first of the seeds that reaches each point, and the edges of all other points.
 
-    The edges of seeds are one graph, or on a disk the graphs of blocks, each without what reaches
-    one another in it, so that not all of them are in memory.
+    The edges of seeds are one graph, or on a disk the graphs of blocks that :func:`condense`
+    shrinks.
     """
     num_points = len(cloud.points)
     if not scratch.is_active():
@@ -348,10 +345,9 @@ def grow_first_in_first_out(
     the order of the queue does not matter: all edges given make seeds, and those ``neighbors``
     ``(N, K)`` that the seeds of a region merely ``claim`` join when the seeds are all known.
 
-    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue.
-    This claims exactly what one seed after the other does.
-
-    Returns the root of each point's region, -1 where not valid.
+    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue:
+    this claims exactly what one seed after the other does. Returns the root of each point's region,
+    -1 where not valid.
     """
     all_codes, starts = edges.targets, memoryview(edges.starts.data)
     free = bytearray(valid.tobytes())

@@ -2,7 +2,8 @@
 
 Where growth is free of order, the first seed that reaches a point has it. Points that reach one
 another have the same: within a block such components shrink to one node each, and what is left of
-the graph fits into memory.
+the graph fits into memory. One graph of all would not where a cloud has over 2^31 edges, some 40
+million points: SciPy searches it by copies of the edges in 64 bits.
 """
 
 from typing import NamedTuple
@@ -17,10 +18,8 @@ from torchrg.regions.edges import EdgeLists, chain_of, first_to_reach
 class Condensed(NamedTuple):
     """The edges of a block without those between points that reach one another.
 
-    Attributes:
-        components: Component of each point, 0 to C-1, shape ``(n,)``, int32.
-        sources: Component that each edge leaves, shape ``(E,)``, int32.
-        targets: Row in the whole cloud that it leads to, shape ``(E,)``, int32.
+    The component of each point ``(n,)``, 0 to C-1; the component that each edge ``(E,)`` leaves,
+    and the row in the whole cloud that it leads to; all int32.
     """
 
     components: NDArray[np.int32]
@@ -33,12 +32,6 @@ def condense(edges: EdgeLists, block: slice) -> Condensed:
 
     The edges are those of the points of the block, none of them twice (SciPy would search without
     end); those that leave it stay, one for all between two components.
-
-    Example:
-        >>> edges = EdgeLists(np.array([0, 1, 3]), np.array([11, 10, 17], dtype=np.int32))
-        >>> block = condense(edges, slice(10, 12))
-        >>> block.components.tolist(), block.sources.tolist(), block.targets.tolist()
-        ([0, 0], [0], [17])
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components

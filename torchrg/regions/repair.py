@@ -102,10 +102,7 @@ def refine_regions(
 def _drop_scattered(
     cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
 ) -> Tensor:
-    """Return labels without regions that are too small and whose normals do not agree.
-
-    Those that agree may be large enough with the points at their borders. Numbers have gaps then.
-    """
+    """Return labels without small regions whose normals do not agree, with gaps."""
     small = torch.bincount(labels + 1, minlength=1)[1:] < config.min_size
     small = torch.cat([small, small.new_zeros(1)])
     segments = Segments(torch.where(small[labels], labels, UNLABELED))
@@ -140,9 +137,9 @@ def absorb_points(
     the plane's. Of several regions it joins the one whose plane is nearest. Points that joined have
     the next beside them.
 
-    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud, or of the pixels of an image, as
-    ``beside`` is. Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all.
-    ``valid`` ``(N,)`` tells which points may join.
+    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud or an image, as ``beside`` is.
+    Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all; ``valid`` ``(N,)``
+    may join.
     """
     # Narrow numbers are gathered faster, and take half of the memory.
     labels = labels.to(torch.int32)
@@ -178,10 +175,10 @@ def _least(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
 def _contacts_to_merge(
     labels: Tensor, beside: NearestPoints, planes: RegionPlanes, neighbors: Neighbors
 ) -> tuple[Tensor, Tensor]:
-    """Return pairs of regions that touch, and their contacts; of two strips all neighbours count.
+    """Return pairs of regions that touch, perhaps twice; of two strips all neighbours count.
 
     Around the end of a strip that is narrower than a neighbourhood, such as the rim of a table top,
-    the nearest points are those of the faces beside it. A pair may be there twice.
+    the nearest points are those of the faces beside it.
     """
     strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
     parts = (
@@ -202,15 +199,13 @@ def merge_coplanar(
     """Merge regions that touch and lie on one plane, the pair that fits best first.
 
     Two regions are merged when one plane explains both: the root mean square distance of either to
-    the plane through both is at most ``tolerance`` times what it is to its own. Of the smaller one
-    the larger one's noise counts if that is more: what noise breaks off a face is thinner than the
-    face, or curved. Otherwise curved regions have no plane. What is merged is one region from then
-    on.
+    the plane through both is at most ``tolerance`` times what it is to its own, or the floor of the
+    planes. Of the smaller one the larger one's noise counts if that is more: what noise breaks off
+    a face is thinner than the face, or curved. Otherwise curved regions have no plane.
 
     ``contacts`` are pairs of regions that touch ``(E, 2)``, and how many contacts each has, as
-    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. A region's distance to its
-    own plane counts as at least the floor of the planes. A merged region has the smallest label of
-    its parts.
+    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. What is merged is one
+    region from then on, with the smallest label of its parts.
     """
     pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
@@ -231,10 +226,8 @@ def merge_facets(
     mean square distance of either to the plane through both is at most ``tolerance``, in the unit
     of the cloud, and that plane is turned against neither by more than 25 degrees: a strip narrower
     than the tolerance lies near any plane that it touches. Nor may the turn alone lift the points
-    of either by more than two thirds of the tolerance. What is merged is one region from then on,
-    so that the facets of a bend join only as far as one plane goes.
-
-    ``contacts`` and labels are those of :func:`merge_coplanar`.
+    of either by more than two thirds of the tolerance. So the facets of a bend join only as far as
+    one plane goes. ``contacts`` and labels are those of :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= LEAST_CONTACTS]
@@ -244,11 +237,7 @@ def merge_facets(
 
 
 class _Moments(NamedTuple):
-    """What merging reads of M regions, in float64.
-
-    Number of points, their mean, about an origin near them, and covariance, the distance from its
-    plane that counts as lying on it (none from that of a curved one), and the noise it lends.
-    """
+    """Moments of regions, the distance that counts as on their planes, and noise they lend."""
 
     weight: Tensor
     mean: Tensor
@@ -292,10 +281,7 @@ def _merge(
     *,
     max_tilt: float | None = None,
 ) -> Tensor:
-    """Return labels where each region has the smallest number of those that it is merged with.
-
-    With a largest tilt, pairs stay apart if the joint plane is turned too far against either.
-    """
+    """Return labels of merged regions, the smallest of each, within a largest tilt."""
     pairs, groups = pairs.cpu(), _Moments(*(values.cpu().clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(touching))), [0] * len(touching)
@@ -384,7 +370,7 @@ def _are_turned(a: _Moments, b: _Moments, max_tilt: float) -> Tensor:
 def refine_borders(
     cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    r"""Give points where regions touch to the one that explains them best.
+    """Give points where regions touch to the one that explains them best.
 
     Of the flat regions of a point's 8 nearest neighbours and its own, the two with the nearest
     planes, by their thickness, count if they are within reach. With the distances :math:`r` from a
@@ -394,9 +380,8 @@ def refine_borders(
     on one side of that. Points of nearly parallel planes stay where they are. Points that moved
     and their neighbours are decided again in the next pass.
 
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are those returned. ``reach``
-    ``(M,)`` is the distance up to which points may be on a plane, NaN for regions that are not flat
-    and keep what they have.
+    ``reach`` ``(M,)`` is the distance up to which points may be on a plane, NaN for regions that
+    are not flat and keep what they have.
     """
     beside = NearestPoints(cloud.neighbors)
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])

@@ -37,11 +37,8 @@ class SharedNeighbors:
     The lists of a block of points are held as bit sets over the points that occur in them, so that
     an edge costs a few AND and popcount instructions; lists of points outside the block lose only
     members that no list of the block has, so the counts are exact. Points should be in canonical
-    order: then a block is a patch of surface and its dictionary is small.
-
-    Args:
-        neighbors: Neighbours of all points, each with itself among them.
-        min_shared: Least number of common neighbours of connected points.
+    order: then a block is a patch of surface and its dictionary is small. Each is among its own
+    neighbours.
 
     Example:
         >>> lists = torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])

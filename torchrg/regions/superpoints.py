@@ -85,11 +85,10 @@ def partition_points(
     increase of the variance within regions. Divided by the length of the border that vanishes it is
     the strength of regularisation at which the energy of Mumford and Shah falls [3], the energy
     that cut pursuit minimises [4] and, with places and normals, the supervoxels of [5] and [6];
-    normals come first as in [7]. Pairs merge up to each strength of the configuration, or until
-    each of its numbers of superpoints is left.
-    Contacts are that length up to noise, hence their root. Regions that are each other's cheapest
-    partner merge at a time, and small ones with a much larger one that is theirs: this needs no
-    order of visits.
+    normals come first as in [7]. Contacts are that length up to noise, hence their root. Pairs
+    merge up to each strength of the configuration, or until each of its numbers of superpoints is
+    left. Regions that are each other's cheapest partner merge at a time, and small ones with a much
+    larger one that is theirs: this needs no order of visits.
 
     ``labels`` ``(N,)`` are those of planes, negative for none. Of a mesh with ``faces`` ``(F, 3)``
     contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the finite
@@ -190,10 +189,7 @@ def _mesh_edges(faces: Tensor, places: Tensor) -> Tensor:
 
 
 def _listed(edges: Tensor, num_places: int) -> Tensor:
-    """Return the places that edges lead to from each ``(n, K)``; itself where there are fewer.
-
-    Of a place with more than 64, those 64 that are first; the others list it.
-    """
+    """Return the first 64 places that edges lead to from each ``(n, K)``; itself where fewer."""
     counts = torch.bincount(edges[:, 0], minlength=num_places)
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
     kept = column < _MOST_EDGES
@@ -204,10 +200,7 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
 
 
 class _Regions(NamedTuple):
-    """Sums over the points of R regions, and the boxes around them, float64.
-
-    ``size`` ``(R,)``, ``features`` ``(F, R)``, ``low`` and ``high`` ``(3, R)``.
-    """
+    """Sums over the points of R regions along the last axis, and the boxes around them, float64."""
 
     size: Tensor
     features: Tensor
@@ -250,8 +243,7 @@ def _cut_planes(
 
     Pieces are what is in a cell of a cubic grid. Those whose colours vary, more than by the noise
     that neighbours show, or that have too many points for the number of superpoints, are cut at
-    half the side again and again, in the end into points. The side follows the median spacing, so
-    where points are dense, pieces have more of them.
+    half the side again and again, in the end into points.
     """
     side = _PIECE_SPACINGS * spacing
     if config.max_extent is not None:
@@ -372,10 +364,7 @@ def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, sq_chord: Tensor) ->
 def _merge_to_strength(
     strength: float, graph: _Graph, min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge pairs that cost at most ``strength``, then regions that are too small.
-
-    Returns the graph of what is left, and what each region has become, shape ``(R,)``.
-    """
+    """Merge pairs that cost at most ``strength``, then small regions; return what each became."""
     graph, become = _last(_merging(graph, bound, lambda cost, graph: cost <= strength))
     graph, merged = _last(_merging(graph, bound, partial(_joins_small, min_size)))
     return graph, merged[become]
@@ -423,11 +412,7 @@ def _merging(
     is_eligible: Callable[[Tensor, _Graph], Tensor],
     count: int = 1,
 ) -> Iterator[tuple[_Graph, Tensor]]:
-    """Merge eligible pairs, many at a time, while more than ``count`` regions are left.
-
-    Yields the graph and what each region has become, shape ``(R,)``: as they are, then after each
-    time.
-    """
+    """Yield the graph and what regions become while eligible pairs merge to ``count``."""
     # Two that fit into the box of a third one by one may not fit together.
     ratio = _MUCH_LARGER if bound == math.inf else math.inf
     become = torch.arange(len(graph.regions.size))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._optional import require
 from torchrg._parallel import run_beside
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, coordinates_along, fit_planes
-from torchrg.regions.outline import trace_outline
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 
 _TIE = 1e-9
@@ -70,6 +70,8 @@ _MOST_BEND = 0.02
 """A region whose points are off its plane by at most this share of its short side is flat enough to
 have a role: a wall with a bulge is a wall, and a pillar is none."""
 
+_Outlines = tuple[tuple[Tensor, ...], ...]
+
 
 def summarize_planes(
     points: Tensor | NDArray[np.floating],
@@ -91,9 +93,6 @@ def summarize_planes(
         up: The upward direction, to tell floors, ceilings and walls: three numbers, or an axis such
             as ``"z"`` or ``"-y"``.
         outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
-
-    Returns:
-        The table, M rows.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
@@ -118,7 +117,7 @@ def summarize_planes(
     fit = fit_planes(segments, points, normals)
     first, second = _plane_axes(fit)
 
-    def measure() -> list[_Measures]:
+    def measure() -> list[tuple[list[Tensor], _Outlines]]:
         parts, start = [], 0
         for some in segments.split(POINTS_AT_ONCE):
             rows = slice(start, start + len(some.counts))
@@ -135,9 +134,8 @@ def summarize_planes(
         )
 
     measures, meeting = run_beside(measure, meet, points.device)
-    mean, area, sides, directions, middle = (
-        torch.cat(parts) for parts in list(zip(*measures, strict=True))[:5]
-    )
+    numbers, outlines = zip(*measures, strict=True)
+    mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
 
     def own(values: Tensor) -> Tensor:
@@ -158,32 +156,17 @@ def summarize_planes(
     if up is not None:
         planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
     if outline:
-        planes = planes._replace(outline=sum((part.outline for part in measures), ()))
+        planes = planes._replace(outline=sum(outlines, ()))
     if meeting is not None:
         lengths, angles = own(meeting.boundary_length), own(meeting.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
 
 
-class _Measures(NamedTuple):
-    """What is measured in the planes of some regions.
-
-    The mean of the points about the center ``(M, 3)``, the area ``(M,)``, sides, directions and
-    middle of the rectangles as :class:`Rectangles` has them, and outlines if asked for.
-    """
-
-    mean: Tensor
-    area: Tensor
-    sides: Tensor
-    directions: Tensor
-    middle: Tensor
-    outline: tuple[tuple[Tensor, ...], ...]
-
-
 def _measure(
     points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor, Tensor], *, outline: bool
-) -> _Measures:
-    """Measure regions in their planes, given by centers and two directions, each ``(M, 3)``."""
+) -> tuple[list[Tensor], _Outlines]:
+    """Return mean, area, rectangle and outlines of regions, by centers and two axes ``(M, 3)``."""
     center, first, second = frame
     centered = segments.take_about(points, center)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)
@@ -192,7 +175,7 @@ def _measure(
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
     rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
-    return _Measures(mean, area, boxes.sides, boxes.directions, boxes.center, rings)
+    return [mean, area, *boxes], rings
 
 
 def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
@@ -229,13 +212,10 @@ def _direction(up: Sequence[float] | str, points: Tensor) -> Tensor:
 def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     """Return the role of each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
 
-    A plane within 15 degrees of horizontal is a floor in the lowest 15 % of the height that all
-    planes take up, a ceiling in the highest, if it has at least a tenth of the area of the largest
-    horizontal one; else it is "horizontal". A plane within 15 degrees of vertical is a wall if it
-    takes up half of that height, is a fifth of it wide, as sides of pillars are not, and, unlike
-    doors and cabinets, either reaches into the highest 10 % or has a quarter of the area of the
-    largest vertical one; else it is "vertical". Planes between are "oblique". What is curved by
-    more than 2 % of its short side is "other". A single horizontal plane is a floor.
+    By the constants above: a level plane is a floor or a ceiling if it is broad, and low or high
+    among all planes, else "horizontal"; an upright one is a wall if it is tall, wide, as sides of
+    pillars are not, and, unlike doors and cabinets, reaches the top or is large, else "vertical".
+    Planes between are "oblique", bent ones "other". A single horizontal plane is a floor.
     """
     kinds = {name: place for place, name in enumerate(PLANE_KINDS)}
     kind = torch.full_like(planes.count, kinds["other"])
@@ -274,7 +254,7 @@ def _outlines(
     width: Tensor,
     frame: tuple[Tensor, Tensor, Tensor],
     dtype: torch.dtype,
-) -> tuple[tuple[Tensor, ...], ...]:
+) -> _Outlines:
     """Trace the outline of each region, and lift it into space."""
     outlines = []
     counts = segments.counts.tolist()
@@ -286,6 +266,54 @@ def _outlines(
         lifted = (center + ring[:, :1] * first + ring[:, 1:] * second for ring in rings)
         outlines.append(tuple(ring.to(dtype) for ring in lifted))
     return tuple(outlines)
+
+
+def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
+    """Return the outline of points in a plane: rings through some of them.
+
+    The points near an edge, found with square cells, are triangulated. Triangles over cells without
+    points are left out, and the others united. Holes and dents narrower than ``width``, that of the
+    cells, are filled. Outer rings ``(V, 2)``, the first point not repeated, run counter-clockwise,
+    holes clockwise; points on one line have none.
+
+    Raises:
+        MissingDependencyError: If shapely is not installed.
+    """
+    from scipy.ndimage import binary_erosion
+    from scipy.spatial import Delaunay, QhullError
+
+    shapely = require("shapely", extra="outline", purpose="trace outlines")
+    if width <= 0:
+        return []
+    cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
+    occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
+    occupied[tuple(cells.T)] = True
+    inside = binary_erosion(occupied, np.ones((3, 3), dtype=bool))
+    corners = places[~inside[tuple(cells.T)]]
+    try:
+        triangles = corners[Delaunay(corners).simplices]
+    except (QhullError, ValueError):
+        return []
+    ends = np.roll(triangles, 1, axis=1)
+    tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
+    reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
+    covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
+    # Triangles that share whole edges are a coverage, which is united twenty times as fast.
+    shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
+    return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
+
+
+def _rings(shapely: Any, shape: Any, min_area: float) -> list[NDArray[np.float64]]:  # noqa: ANN401
+    """Return the rings of a polygon or of several, largest polygon first, without specks."""
+    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    largest = max((part.area for part in parts), default=0.0)
+    parts = [part for part in parts if part.area >= min(min_area, largest)]
+    rings: list[NDArray[np.float64]] = []
+    for part in sorted(parts, key=lambda part: -part.area):
+        turned = shapely.geometry.polygon.orient(part)
+        holes = [hole for hole in turned.interiors if shapely.Polygon(hole).area >= min_area]
+        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *holes)]
+    return rings
 
 
 class Rectangles(NamedTuple):
@@ -360,13 +388,10 @@ def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
 
 
 def _outer_places(places: NDArray[np.float64]) -> NDArray[np.integer]:
-    """Return the rows of points ``(n, 2)`` that may be corners of their convex hull.
+    """Return the points ``(n, 2)`` by row that may be corners of their convex hull.
 
-    Not those inside the octagon of the farthest points in eight directions [1].
-
-    References:
-        [1] S. Akl, G. Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5),
-        1978.
+    Not those inside the octagon of the farthest points in eight directions: S. Akl, G. Toussaint. A
+    fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
     along = _COMPASS @ places.T
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
@@ -398,11 +423,9 @@ def covered_areas(
 
     The plane is divided into square cells, at first three times as wide as the mean spacing of the
     points, then wider until the area hardly grows, so that parts of low density have no holes.
-    Cells along the outline are only partly covered: the expected excess is taken off. The area
-    never exceeds that of the rectangle about the region.
-
-    Returns areas ``(M,)``, 0 where the points are on one line, and the width of cells that leaves
-    no holes between points ``(M,)``.
+    Cells along the outline are only partly covered: the expected excess is taken off. Areas
+    ``(M,)`` are 0 where the points are on one line, and at most those of the rectangles; the width
+    ``(M,)`` of cells leaves no holes between points.
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()

@@ -30,10 +30,6 @@ def majority_difference(sorted_rows: Tensor) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row ``(B, n)``.
 
     The values are finite, and n at least 2. Only lags below h of a row can hold the difference.
-
-    Example:
-        >>> majority_difference(torch.tensor([[1.0, 2.0, 4.0, 8.0, 100.0]]))
-        tensor([3.])
     """
     chunks = chunks_of(len(sorted_rows), _ROWS_AT_ONCE)
     parts = [_of_chunk(sorted_rows[chunk]) for chunk in chunks]

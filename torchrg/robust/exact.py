@@ -89,10 +89,7 @@ def _majorities(
     reach: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor]:
-    """Count the points near the first few candidates of each lane, and keep one full one.
-
-    Returns the lanes ``(F,)`` that have one, and the points near it ``(K, F)``.
-    """
+    """Return the lanes ``(F,)`` where a candidate is full, and its points ``(K, F)``."""
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
     simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
@@ -115,10 +112,7 @@ def _majorities(
 
 
 def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimension: int) -> Tensor:
-    """Fit a flat to the chosen points of each lane, and mark the points that lie on it.
-
-    Points ``(K, M)`` within a tolerance ``(M,)`` of the flat of some dimension lie on it.
-    """
+    """Fit a flat to the chosen points of each lane, and mark those ``(K, M)`` that lie on it."""
     columns = [column.double() for column in columns]
     weights = chosen.double()
     count = sum_points(weights)

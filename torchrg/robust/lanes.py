@@ -1,8 +1,8 @@
 """Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches.
 
-Like the lanes of a vector unit, patches laid out so are called lanes. Every lane is computed by the
-same operations in the same order wherever it stands, so a result does not depend, to the last bit,
-on the chunk it was computed in.
+Patches laid out so are called lanes, as of a vector unit. Every lane is computed by the same
+operations in the same order wherever it stands, so a result does not depend, to the last bit, on
+the chunk it was computed in.
 """
 
 from collections.abc import Callable, Sequence
@@ -94,12 +94,9 @@ def map_values(
 class Ellipsoid(NamedTuple):
     """Weighted mean and scatter of each lane, in a factored form.
 
-    Attributes:
-        means: P means of shape ``(M,)``.
-        residuals: P columns ``(K, M)``: each centered coordinate less its regression on those
-            before it, so that they are uncorrelated under the weights.
-        squares: P weighted sums of squares of the residuals, shape ``(M,)``, at least the floor.
-        singular: Whether the floor was needed, shape ``(M,)``, bool.
+    P means ``(M,)``; P columns ``(K, M)`` of residuals, each centered coordinate less its
+    regression on those before it; P weighted sums of their squares ``(M,)``, at least the floor;
+    and whether the floor was needed, ``(M,)``, bool.
     """
 
     means: list[Tensor]
@@ -118,8 +115,7 @@ def fit_ellipsoid(
     with the ratio of extent to thickness, not with its square, which float32 could not bear.
 
     ``total`` is the sum of the weights ``(K, M)``. ``floor`` is the least variance in any
-    direction, shape ``(M,)``, above 0: what rounding leaves of an exact plane. It keeps distances
-    finite.
+    direction, shape ``(M,)``, above 0: what rounding leaves of an exact plane.
     """
     means = [sum_points(weights * column) / total for column in columns]
     residuals = [column - mean for column, mean in zip(columns, means, strict=True)]

@@ -65,7 +65,7 @@ class _Settings(NamedTuple):
 
 
 class _Concentrated(NamedTuple):
-    """The sets that concentration ended with, 1 for a point in it, 0 for another, ``(K, S, M)``.
+    """Sets that concentration ended with, ``(K, S, M)``, 1 for a point of one, 0 for another.
 
     The determinants ``(S, M)`` are those of their scatter over h - 1, float64; inf for a start that
     repeats an earlier one of its lane.
@@ -88,18 +88,15 @@ def fit_detmcd(
     inliers: Inliers = "raw",
     chunk_size: int = PATCHES_IN_CACHE,
 ) -> RobustFit:
-    r"""Fit location and scatter to the majority of each patch by the deterministic MCD.
+    """Fit location and scatter to the majority of each patch by the deterministic MCD.
 
     Six cheap robust scatter estimates each name an initial set of points; from each, concentration
     steps lead to a set of h points whose covariance has a small determinant; the smallest wins
     [1]. Points within the chi-square quantile of its scatter are then taken together.
 
     Convention:
-        Points within the cut-off of the raw fit are inliers: squared distances, with the raw
-        scatter's consistency factor. The defaults are those of the publication. The size of the
-        initial sets is a choice of its own, because it alone changes the final set of every third
-        small patch. The factors for small samples are off, because a normal does not depend on
-        them: they only widen the cut-off (by 19 % at K = 50).
+        The defaults are those of the publication. The factors for small samples are off, because a
+        normal does not depend on them: they only widen the cut-off (by 19 % at K = 50).
 
         What else is called DetMCD differs in four settings. R's robustbase [2]:
         ``starts="robustbase"``, ``small_sample=True``, and ``inliers="reweighted"`` for its
@@ -110,9 +107,7 @@ def fit_detmcd(
         The published starts use the coordinate axes: turning a patch changes the final set of
         every second one, and a compact minority can draw all six. On made patches near edges of 90
         degrees, the share of normals more than 10 degrees off is 21 % from them, 4.6 % from
-        ``"planes"`` and 4.8 % from ``"more"``; with 30 % of outliers in one cluster 54 %, 0 and 0;
-        they reach the best objective known in 23, 58 and 72 % of the former and take 1, 0.35 and
-        1.3 of the time.
+        ``"planes"`` and 4.8 % from ``"more"``; with 30 % of outliers in one cluster 54 %, 0 and 0.
 
     Args:
         patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
@@ -123,12 +118,12 @@ def fit_detmcd(
             of h points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes
             through P points; a third of the cost, no rotation changes it, and it withstands
             clusters. ``"more"``: these, and the published six in the patch's own axes.
-        small_sample: Apply the factors for small samples (P = 3 only). They widen the cut-off.
+        small_sample: Apply the factors for small samples (P = 3 only).
         scaling: What the scatters are multiplied by. ``"consistency"``: the factors that make them
             consistent for normal points. ``"quantile"``: the raw one by ``d2_(h) / chi2inv(h/n)``,
             the h-th smallest squared distance to it over the quantile that it should be, the final
-            one by nothing. This follows the patch: the cut-off is wider the less the h points
-            look like the inner part of normal ones. Nothing where h is all points.
+            one by nothing. The cut-off is wider the less the h points look like the inner part of
+            normal ones. Nothing where h is all points.
         inliers: Which distances are cut. ``"raw"``: those to the raw fit. ``"reweighted"``: these
             first, then those to location and covariance of what is left, which become
             ``sq_distances``; location and covariance stay.
@@ -319,10 +314,8 @@ def _concentrate(
 
     A step takes mean and scatter of the set and keeps the ``size`` points nearest to them; the
     determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Starts that have arrived
-    leave the batch, and so do those whose set another one has.
-
-    Starts are sets of ``initial_size`` points, 1 for a point in the set and 0 for another, shape
-    ``(K, S, M)``; ``floor`` is the least variance ``(M,)`` in any direction.
+    leave the batch, and so do those whose set another one has. Starts are sets of ``initial_size``
+    points, as :class:`_Concentrated` has them.
     """
     num_points, num_starts, num_lanes = initial.shape
     shape = (num_starts, num_lanes)

@@ -51,8 +51,7 @@ class RobustFit(NamedTuple):
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
         covariance: Their covariance with its consistency factor, shape ``(*, P, P)``. Of an exact
-            fit: that of the points on the plane, singular, so that its eigenvector of the
-            smallest eigenvalue is the plane's normal.
+            fit: that of the points on the plane, singular.
         support: Points that are not outliers, shape ``(*, K)``, bool.
         sq_distances: Squared Mahalanobis distances to the raw fit, shape ``(*, K)``; these decide
             ``support``. Of an exact fit: 0 on the plane and inf off it. Points that do not count,
@@ -121,9 +120,9 @@ def fit_patchwise(
 ) -> RobustFit:
     """Apply an estimator to every patch, and answer the degenerate ones.
 
-    Patches are grouped by their number of points that count, so that every group is dense. The
-    points on one plane are an exact fit where they are ``majority(n)`` of n, by default h. Only
-    gradients ask ``weigh`` for the weights ``(*, K)`` of the points that a fit is the mean of.
+    Patches are grouped by their number of points that count. Those on one plane are an exact fit if
+    they are ``majority(n)`` of n, by default h. Only gradients ask ``weigh`` for the weights
+    ``(*, K)`` of the points that a fit is the mean of.
     """
     patches = as_tensor(caller, "patches", patches)
     check_floating(caller, patches=patches)

@@ -52,8 +52,7 @@ def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         mask: Which values count, same shape as ``x``, bool. Default: all.
 
     Returns:
-        Medians, the shape of ``x`` without ``dim``; NaN where no value counts or one that counts
-        is NaN.
+        The shape of ``x`` without ``dim``; NaN where no value counts or one that counts is NaN.
 
     Raises:
         ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
@@ -68,11 +67,7 @@ def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
 def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Return the median absolute deviation from the median, times 1.4826.
 
-    Arguments and errors are those of :func:`median`.
-
-    Returns:
-        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
-        NaN where no value counts or one that counts is NaN.
+    The rest is as for :func:`median`. It is 0 where more than half of the values are equal.
 
     Example:
         >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
@@ -88,20 +83,9 @@ def qn(
 
     :math:`Q_n = 2.2219 \{|x_i - x_j|;\ i < j\}_{(\kappa)}` with :math:`\kappa = \binom{h}{2}` and
     :math:`h = \lfloor n/2 \rfloor + 1` [1]. The order statistic is exact, without interpolation.
-
-    Args:
-        x: Values, floating point, any shape.
-        dim: Axis to reduce.
-        finite_sample: Multiply by the revised factor 2.21914 and by :func:`qn_sample_factor`
-            instead of 2.2219, as R's robustbase does by default.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
-
-    Returns:
-        Scales, the shape of ``x`` without ``dim``; 0 where h values or more are equal or only one
-        counts, NaN where none counts or one that counts is NaN.
-
-    Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
+    With ``finite_sample`` it is multiplied by the revised factor 2.21914 and by
+    :func:`qn_sample_factor` instead of 2.2219, as R's robustbase does by default. The rest is as
+    for :func:`median`. It is 0 where h values or more are equal or only one counts.
 
     References:
         [1] P. J. Rousseeuw, C. Croux. Alternatives to the median absolute deviation. Journal of
@@ -117,10 +101,8 @@ def qn(
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
 
-    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`.
-
-    Returns:
-        The same as ``qn(x, dim=dim, mask=mask) > threshold``, bool; False where Qn is NaN.
+    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`. False
+    where Qn is NaN.
 
     Example:
         >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
@@ -140,16 +122,13 @@ def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | Non
 
 
 def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    r"""Return the tau scale of Maronna and Zamar: a truncated standard deviation.
+    """Return the tau scale of Maronna and Zamar: a truncated standard deviation.
 
     With :math:`s_0` the median of the deviations from the median: the centre is the mean with
     bisquare weights that vanish at :math:`4.5 s_0`, and the scale the root of the mean square
     about it, each deviation cut at :math:`3 s_0` [1]. Cheaper than Qn for long rows, linear but
-    for a sort. Arguments and errors are those of :func:`median`.
-
-    Returns:
-        Scales, the shape of ``x`` without ``dim``; 0 where more than half of the values are equal,
-        NaN where no value counts or one that counts is NaN.
+    for a sort. The rest is as for :func:`median`. It is 0 where more than half of the values are
+    equal.
 
     References:
         [1] R. A. Maronna, R. H. Zamar. Robust estimates of location and dispersion for

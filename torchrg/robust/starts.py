@@ -48,10 +48,7 @@ _PLANES_AT_ONCE = 8
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:
-    """Initial sets ``(K, S, M)`` of the chosen starts, each with the size of its sets.
-
-    1 stands for a point in the set, 0 for another; ``size`` is h.
-    """
+    """Initial sets ``(K, S, M)``, as 0 and 1, of the chosen starts, each with its size."""
     half = -(-len(columns[0]) // 2)
     if starts == "paper":
         return [(_deterministic_starts(columns, half), half)]
@@ -137,10 +134,7 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
 
 
 def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
-    """Squared distances of the points after sphering by each start's scatter, ``(K, S, M)``.
-
-    ``loadings`` are the eigenvectors of the scatters, as columns, shape ``(S, M, P, P)``.
-    """
+    """Squared distances ``(K, S, M)`` of points sphered by the eigenvectors ``(S, M, P, P)``."""
     shape = (len(columns[0]), *loadings.shape[:2])
     sphered: list[Tensor] = []
     for directions in loadings.unbind(dim=3):
@@ -219,8 +213,7 @@ def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
 
     The best planes are those with the smallest ``size``-th distance (least median of squares).
     With a minority of outliers some of the planes pass through clean points only, wherever the
-    outliers are; six scatter estimates may all be drawn to one cluster of them. There are only
-    sums and one sort a plane, against 27 Qn for the published starts.
+    outliers are. There are only sums and one sort a plane, against 27 Qn for the published starts.
     """
     num_points, num_lanes = columns[0].shape
     sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
@@ -287,9 +280,9 @@ def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
 def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tensor:
     """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
 
-    The same sets serve every patch, so a patch's result depends on the seed and on nothing else
-    in its batch. Returns point indices ``(S, size)``: all sets in lexicographic order where there
-    are at most ``5 * num_sets``, otherwise ``num_sets`` of them.
+    The same sets serve every patch, so a patch's result depends on the seed and on nothing else in
+    its batch. Returns point indices ``(S, size)``: all sets where there are at most
+    ``5 * num_sets``, otherwise ``num_sets`` of them.
     """
     if comb(num_points, size) <= 5 * num_sets:
         return torch.tensor(list(combinations(range(num_points), size)), device="cpu")

@@ -88,9 +88,8 @@ def small_sample_factor(
 class Estimate(NamedTuple):
     """A fit of each of M lanes; the fields of :class:`torchrg.robust.RobustFit`, points on axis 0.
 
-    Attributes:
-        objective: What was minimised, a determinant, shape ``(M,)``, float64.
-        singular: Whether ``raw_support`` lies on a hyperplane, shape ``(M,)``, bool.
+    ``objective`` ``(M,)`` is the determinant that was minimised, float64; ``singular`` ``(M,)``
+    tells whether ``raw_support`` lies on a hyperplane.
     """
 
     location: Tensor
@@ -105,10 +104,9 @@ class Estimate(NamedTuple):
 
 
 def quantile_factor(distances: Tensor, size: int, num_coordinates: int) -> Tensor:
-    """Factor ``(M,)`` of a scatter that brings the h-th smallest distance to its quantile.
+    """Factor ``(M,)`` of a scatter, ``d2_(h) / chi2inv(h / n)`` of squared distances ``(K, M)``.
 
-    ``d2_(h) / chi2inv(h / n)`` of squared distances ``(K, M)``, h below n: of n normal points the
-    h-th smallest is about the quantile of level h / n.
+    Of n normal points the h-th smallest, h below n, is about the quantile of level h / n.
     """
     reach = sorted_points(distances)[:, size - 1]
     return reach / chi2_quantile(size / len(distances), num_coordinates)
@@ -122,10 +120,9 @@ def within_quantile(distances: Tensor, quantile: float, num_coordinates: int) ->
 def reweight(
     columns: list[Tensor], distances: Tensor, quantile: float, factor: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Take mean and covariance of the points within a chi-square quantile of a raw fit.
+    """Return location, covariance and support of points within a quantile of a raw fit.
 
-    The covariance is multiplied by the factor except where no point is left out. Returns location,
-    covariance and support, as in :class:`Estimate`.
+    The covariance is multiplied by the factor except where no point is left out.
     """
     weights = within_quantile(distances, quantile, len(columns))
     count = sum_points(weights)

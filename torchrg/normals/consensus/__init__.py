@@ -27,7 +27,7 @@ from torchrg.structures import Neighbors, NormalFit
 def estimate_consensus(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
-    r"""Estimate normals that are right up to the edges and stay smooth on curved surfaces.
+    """Estimate normals that are right up to the edges and stay smooth on curved surfaces.
 
     Every point gets the simplest surface that explains its neighbours, given their noise:
 
@@ -49,14 +49,7 @@ def estimate_consensus(
 
     With ``config.adaptive_k`` the neighbourhoods grow with the noise before all this. If ``u`` is
     the median of noise by radius, they grow by the factor ``(u / 0.15)^2``, up to that many
-    neighbours.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        config: ``adaptive_k`` and ``noise_scope`` are used; the estimator finds all other scales
-            itself.
-        chunk_size: Points handled at a time.
+    neighbours. That and ``noise_scope`` are all that is used of the settings.
 
     Returns:
         The fit, with ``sharp``. At sharp points curvature and residual are those of the neighbours
@@ -110,10 +103,8 @@ def _share_of_noise(survey: Survey) -> Tensor:
 def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
     """Return the number of neighbours with which noise is a small share of the radius.
 
-    Args:
-        shares: Noise by radius of all points with ``count`` neighbours, NaN where unknown.
-        count: Number of neighbours.
-        config: ``adaptive_k`` is the most there may be.
+    ``shares`` are noise by radius of all points with ``count`` neighbours, NaN where unknown;
+    ``config.adaptive_k`` is the most there may be.
 
     Example:
         >>> shares = torch.full((500,), 0.3)

@@ -39,25 +39,9 @@ def vote_planes(
     of a corner and of a plate has. The best candidate is fitted anew to the neighbours within reach
     of it, first closely, then with the bisquare weights that use nearly all the points of a face.
 
-    Args:
-        columns: Coordinates of the neighbours about each point.
-        noise: Standard deviation of the noise, shape ``(n,)``, positive.
-        start: Normals to try first, shape ``(n, 3)``.
-        counted: Weights 0 or 1, shape ``(n, K)``.
-
-    Returns:
-        Unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes ``normal . q = offset``.
-
-    Example:
-        >>> from torchrg.linalg.moments import split_columns
-        >>> x, y = torch.arange(-2.0, 3), torch.arange(0.0, 4)
-        >>> floor = torch.cartesian_prod(x, y, torch.zeros(1))
-        >>> wall = floor[:, [0, 2, 1]]
-        >>> corner = torch.cat([floor, wall]).sub_(torch.tensor([0.0, 1.0, 0.0]))[None]
-        >>> up = torch.tensor([[0.0, 0.7071, 0.7071]])
-        >>> columns, noise = split_columns(corner), torch.tensor([0.01])
-        >>> vote_planes(columns, noise, up, torch.ones(1, 40))[0].abs()
-        tensor([[0., 0., 1.]])
+    The noise ``(n,)`` is positive, and ``counted`` ``(n, K)`` are weights 0 or 1 of the neighbours,
+    by columns about each point. Returns unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes
+    ``normal . q = offset``.
     """
     sq_distances = sq_lengths(columns)
     farthest = (sq_distances * counted).amax(dim=1, keepdim=True)
@@ -128,10 +112,7 @@ def _refitted(
 
 
 def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
-    """Return planes through the points and two neighbours of ranks ``(P, 2)``, where they span one.
-
-    Unit normals ``(n, P, 3)`` and flags ``(n, P)``.
-    """
+    """Return normals ``(n, P, 3)`` of planes through neighbours, and if these span one."""
     a, b, c = (column.index_select(1, ranks[:, 0]) for column in columns)
     d, e, f = (column.index_select(1, ranks[:, 1]) for column in columns)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
@@ -157,11 +138,9 @@ def _pairs(num_neighbors: int, num_pairs: int, power: float) -> tuple[tuple[int,
 class MeetingPlanes(NamedTuple):
     """The plane of each point, one of several that explain its neighbourhood.
 
-    Attributes:
-        normals: Unit normals, shape ``(n, 3)``.
-        offsets: Of the planes ``normal . q = offset`` about the point, shape ``(n,)``.
-        deviations: Standard deviation of all neighbours from the planes, three degrees of freedom
-            less for each, shape ``(n,)``; infinite where a plane has fewer than five points.
+    Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset`` about the point,
+    and the standard deviation of all neighbours ``(n,)``, three degrees of freedom less for each
+    plane; infinite where one has fewer than five points.
     """
 
     normals: Tensor
@@ -170,13 +149,10 @@ class MeetingPlanes(NamedTuple):
 
 
 class Wedge(NamedTuple):
-    """Two planes that meet.
+    """Two planes that meet, and their plane of each point.
 
-    Attributes:
-        planes: The plane of each point.
-        first: Points of the first plane, weights 0 or 1, shape ``(n, K)``; the others are of the
-            second.
-        outer: Signed distance of the neighbours from the surface, shape ``(n, K)``.
+    ``first`` are the points of the first plane, weights 0 or 1; ``outer`` signed distances of the
+    neighbours from the surface, both ``(n, K)``.
     """
 
     planes: MeetingPlanes
@@ -231,17 +207,6 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     beyond twice the noise on its fuller side. The point itself belongs to a plane by the same rule,
     which, unlike the nearest of two unbounded planes, is right for points that noise has moved out
     of the solid. Arguments as for :func:`fit_meeting_planes`.
-
-    Example:
-        >>> from torchrg.linalg.moments import split_columns
-        >>> x, y = torch.arange(-2.0, 3), torch.arange(0.0, 4)
-        >>> floor = torch.cartesian_prod(x, y, torch.zeros(1))
-        >>> corner = torch.cat([torch.tensor([[0.0, 1, 0]]), floor, floor[:, [0, 2, 1]]])
-        >>> columns = split_columns((corner - corner[:1])[None])
-        >>> start, zero, noise = torch.tensor([[0.0, 1, 0]]), torch.zeros(1), torch.tensor([0.1])
-        >>> planes = fit_wedges(columns, start, zero - 1, noise).planes
-        >>> planes.normals.abs(), bool(planes.deviations < 0.01)
-        (tensor([[0., 0., 1.]]), True)
     """
     rests = residuals(columns, normals, offsets)
     second, first = _beyond(rests, noise), _near(rests, noise)

@@ -26,14 +26,11 @@ _LAYER_PARAMETERS = 4
 
 
 class Survey(NamedTuple):
-    """What the plane of each neighbourhood leaves unexplained.
+    """What the plane of each neighbourhood leaves unexplained, each of shape ``(N,)``.
 
-    Attributes:
-        offsets: Distance of the fitted plane from the point along the normal, shape ``(N,)``.
-        deviations: Standard deviation of the residuals (3 degrees of freedom less), ``(N,)``.
-        noise: Standard deviation of the noise, positive, shape ``(N,)``; infinite where too few
-            neighbours have a plane.
-        radius: Distance of the farthest neighbour, shape ``(N,)``.
+    Distance of the plane from the point along the normal; standard deviation of the residuals (3
+    degrees of freedom less) and of the noise, infinite where too few neighbours have a plane; and
+    the distance of the farthest neighbour.
     """
 
     offsets: Tensor
@@ -45,7 +42,7 @@ class Survey(NamedTuple):
 def survey_noise(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = CHUNK_SIZE
 ) -> Survey:
-    r"""Estimate the noise about each point, at edges and on curved surfaces too.
+    """Estimate the noise about each point, at edges and on curved surfaces too.
 
     The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
     points lie on one smooth face, and more elsewhere. Small neighbourhoods lie on one face more
@@ -59,27 +56,8 @@ def survey_noise(
     line, as on scan lines, do not count. At corners, where none of the three finds a face, the
     noise is at most 3 times the 15th percentile of the noise of the neighbours. Where points are so
     few that even the nearest are of both faces of a plate, two parallel planes take the place of
-    the one of all neighbours, if they leave 0.35 of its deviation or less.
-
-    Args:
-        points: Points, shape ``(N, 3)``.
-        neighbors: Neighbours of all points.
-        fit: Planes of all neighbours.
-        chunk_size: Points handled at a time.
-
-    Returns:
-        Offsets, deviations, noise and radius. Noise is at least the rounding of the coordinates.
-
-    Example:
-        >>> from torchrg.neighbors import search_knn
-        >>> from torchrg.normals import estimate_normals
-        >>> floor = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
-        >>> floor[:, 2] = 0.01 * torch.randn(500, generator=torch.Generator().manual_seed(1))
-        >>> neighbors = search_knn(floor, 50)
-        >>> fit = estimate_normals(floor, method="paper", neighbors=neighbors)
-        >>> survey = survey_noise(floor, neighbors, fit)
-        >>> bool((survey.noise.median() - 0.01).abs() < 0.001)
-        True
+    the one of all neighbours, if they leave 0.35 of its deviation or less. ``fit`` are the planes
+    of all neighbours; noise is at least the rounding of the coordinates.
     """
     offsets, radius, whole, layered = (torch.empty_like(points[:, 0]) for _ in range(4))
     small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
@@ -130,7 +108,7 @@ def survey_noise(
 
 
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return the noise of the region around each point from the noise about single ones.
+    """Return the noise ``(N,)`` of the region around each point from the noise about single ones.
 
     Where a reconstruction has rounded the step between two parallel faces into a ramp, no
     neighbourhood on it is of one face, not even the smallest, and all of them find the step to be
@@ -139,16 +117,6 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 
     Where the noise of each point is its own, as scanners have it, estimates scatter, and this is
     about three quarters of it.
-
-    Nothing else than steps from neighbour to neighbour is asked, so that a part of a cloud with the
-    points around it gives what the whole gives.
-
-    Args:
-        noise: Noise about each point, shape ``(N,)``.
-        neighbors: Neighbours of all points.
-
-    Returns:
-        Noise of the region, shape ``(N,)``.
 
     Example:
         >>> line = torch.arange(8)
@@ -166,11 +134,7 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 def _deviations(
     points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return offsets, deviations and radius of planes of all neighbours, and what to look at again.
-
-    That is where the residuals have the low kurtosis of two parallel planes, and where several
-    neighbours are at one place.
-    """
+    """Return parts of a survey, where residuals are layered, and where places repeat."""
     columns = gather_columns(points, indices)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
     count = counted.sum(dim=1)
@@ -188,10 +152,7 @@ def _deviations(
 
 
 def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole: Tensor) -> Tensor:
-    """Return deviations from two parallel planes, the faces of a plate; inf where there are none.
-
-    ``normals`` are those of one plane and ``whole`` are the deviations from it.
-    """
+    """Return deviations from two parallel planes, the faces of a plate; inf without any."""
     columns = gather_columns(points, near.indices)
     counted = near.counted().to(points.dtype)
     count = counted.sum(dim=1)

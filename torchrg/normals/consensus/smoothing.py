@@ -102,13 +102,12 @@ def choose_planes(
     *,
     chunk_size: int,
 ) -> TangentPlanes:
-    r"""Give points the plane, among those of their neighbours, that their neighbourhood supports.
+    """Give points the plane, among those of their neighbours, that their neighbourhood supports.
 
-    The score of a plane is that of
-    :func:`torchrg.normals.consensus.hypotheses.vote_planes` per weight, less a
-    tenth of the square of the point's own residual in units of the noise; planes from which the
-    point is farther than three times the noise do not qualify. ``rows`` are the points to treat,
-    shape ``(n,)``. Returns the planes of all points.
+    The score of a plane is that of :func:`torchrg.normals.consensus.hypotheses.vote_planes` per
+    weight, less a tenth of the square of the point's own residual in units of the noise; planes
+    from which the point is farther than three times the noise do not qualify. ``rows`` ``(n,)`` are
+    the points to treat; planes of all are returned.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)

@@ -19,34 +19,15 @@ _PARABOLOID_PARAMETERS = 6
 
 
 class TangentPlanes(NamedTuple):
-    """A plane at each point.
-
-    Attributes:
-        normals: Unit normals of any sign, shape ``(N, 3)``; zero where there is no plane.
-        offsets: Signed distance of the plane from its point along the normal, shape ``(N,)``.
-    """
+    """A plane at each point: unit normals ``(N, 3)``, zero for none, and distances along them."""
 
     normals: Tensor
     offsets: Tensor
 
 
-class Surfaces(NamedTuple):
-    """The surfaces of all points.
-
-    Attributes:
-        planes: Tangent planes at the points.
-        sharp: Points whose neighbourhood is broken, shape ``(N,)``, bool.
-        voted: Sharp points that took the plane of the votes, shape ``(N,)``, bool.
-    """
-
-    planes: TangentPlanes
-    sharp: Tensor
-    voted: Tensor
-
-
 def fit_surfaces(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, survey: Survey, *, chunk_size: int
-) -> Surfaces:
+) -> tuple[TangentPlanes, Tensor, Tensor]:
     r"""Give each point the plane, the paraboloid or the one of several planes that explains most.
 
     With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. The others get a
@@ -61,7 +42,8 @@ def fit_surfaces(
     is above 8, and above 20 on average over the point's 16 nearest, where a neighbourhood that is
     not broken counts as 0. Noise makes single points look broken; an edge does so to all of them.
     Points that are left with ``J > 2 s`` take the plane of the votes. ``fit`` and ``survey`` are
-    those of all neighbours by PCA.
+    those of all neighbours by PCA. Returns the tangent planes of all points, which points are
+    sharp, as their neighbourhood is broken, and which of them took the plane of the votes.
     """
     noise = survey.noise
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
@@ -103,7 +85,7 @@ def fit_surfaces(
     for chosen, planes in ((voted, by_votes), (meets, meeting)):
         normals = torch.where(chosen[:, None], planes.normals, normals)
         offsets = torch.where(chosen, planes.offsets, offsets)
-    return Surfaces(TangentPlanes(normals, offsets), voted | meets, voted)
+    return TangentPlanes(normals, offsets), voted | meets, voted
 
 
 @kernel("N 3", "N K", "N K", "N 3", "n")
@@ -135,10 +117,7 @@ def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Colum
 
 
 def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
-    """Return the points whose gain can make that of some point large enough on average.
-
-    Most of the points that look broken by noise alone are spared the fits.
-    """
+    """Return the points whose gain can make an average large enough, which spares most the fits."""
     most = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
     open_points = broken & (most > constants.MIN_POOLED_GAIN)
     pooled = neighbors.indices[open_points, : constants.NUM_POOLED].reshape(-1)

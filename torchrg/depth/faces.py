@@ -1,0 +1,165 @@
+"""Which regions of a depth image are one face.
+
+Strips along rounded edges go to the face beside them; regions of one plane that only something
+nearer parts count as touching.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.regions.fit import RegionPlanes
+from torchrg.structures import UNLABELED
+
+_MOST_WIDTH = 10.0
+"""Pixels; a wider strip is a face of its own."""
+_MOST_SHARE = 0.4
+"""Width of a strip as a share of that of the face beside it."""
+_MOST_TURN_DEG = 35.0
+"""Either half of a rounded edge of a right angle is turned by less against its face."""
+_LEAST_BESIDE = 0.5
+"""Share of the length of a strip along which it meets the face without a step."""
+_MOST_NOISE = 3.0
+"""A gap of less than this many standard deviations of the noise of a pixel is no step."""
+_LEAST_REACH = 2.0
+"""Regions meet without a step if their planes cross within so many pixels of the border, or within
+half the width of the strip if that is more."""
+
+_EVERY = 4
+"""Every fourth row and column is looked at."""
+_LEAST_LINES = 2
+"""Rows and columns, of those looked at, that must lead from one region to the other."""
+_MOST_OFFSET = 0.5
+"""The middle of the smaller region may be off the plane of the larger by this many of its
+thicknesses."""
+_LEAST_NEARER = 0.5
+"""Least share, of the pixels between two regions, in front of their plane. The others may lie on it
+or have no depth, as in the shadow of something nearer."""
+
+
+def join_strips(
+    labels: Tensor, rays: Tensor, noise: Tensor, planes: Tensor, normals: Tensor
+) -> Tensor:
+    """Give narrow regions to the face that they bend away from, and return the labels ``(H, W)``.
+
+    A region is a strip of the face beside it if it is less than 10 pixels wide and at most 0.4 of
+    the face, if its plane is turned by at most 35 degrees against the face's, and if along half of
+    its length or more the two meet without a step: their planes cross near the border, or are one
+    within the noise there. Of several faces it goes to the one that it meets at most pixels, of
+    equal ones to the larger. Strips of strips stay. The width of a region is twice its pixels over
+    its circumference in sides of pixels.
+
+    ``labels`` ``(H, W)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; ``rays``
+    ``(H, W, 3)`` are ``(x, y, 1)``, so that those times ``planes`` ``(M, 3)`` are inverse depths,
+    of standard deviation ``noise`` ``(H, W)``; ``normals`` ``(M, 3)`` are in space.
+    """
+    num_regions = len(normals)
+    edges, meetings = labels.new_zeros(num_regions + 1), []
+    for image, turned_rays, deviation in (
+        (labels, rays, noise),
+        (labels.T, rays.transpose(0, 1), noise.T),
+    ):
+        row, column = (image[:-1] != image[1:]).nonzero().unbind(dim=1)
+        first, second = image[row, column], image[row + 1, column]
+        for some in (first, second, image[0], image[-1]):
+            edges += torch.bincount(some + 1, minlength=num_regions + 1)
+        meets = (first >= 0) & (second >= 0)
+        row, column = row[meets], column[meets]
+        pairs = torch.stack([first[meets], second[meets]], dim=1)
+        apart = planes[pairs[:, 0]] - planes[pairs[:, 1]]
+        gap = (apart * turned_rays[row, column]).sum(dim=1).abs()
+        meetings.append((pairs, apart, gap - _MOST_NOISE * deviation[row, column]))
+    pairs, apart, gap = (torch.cat(part) for part in zip(*meetings, strict=True))
+    count = torch.bincount(labels.flatten() + 1, minlength=num_regions + 1)[1:]
+    width = 2 * count / edges[1:]
+    pitch = (rays[-1, -1] - rays[0, 0])[:2] / (rays.new_tensor(labels.T.shape) - 1).clamp(min=1)
+    slope = (apart[:, :2] * pitch).norm(dim=1)
+    smooth = [
+        pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_LEAST_REACH)],
+        pairs.flip(1)[gap <= slope * (width[pairs[:, 1]] / 2).clamp(min=_LEAST_REACH)],
+    ]
+    pairs, contacts = torch.unique(torch.cat(smooth), dim=0, return_counts=True)
+    strip, face = pairs.unbind(dim=1)
+    own, theirs = (normals[part][:, :, None].unbind(dim=1) for part in (strip, face))
+    joins = (width[strip] < _MOST_WIDTH) & (width[strip] <= _MOST_SHARE * width[face])
+    joins &= sq_chords(own, theirs).squeeze(1) <= deg_to_sq_chord(_MOST_TURN_DEG)
+    joins &= contacts >= _LEAST_BESIDE * (count / width)[strip]
+    joins &= ~torch.isin(face, strip[joins])
+    most = contacts.new_zeros(num_regions).scatter_reduce(0, strip[joins], contacts[joins], "amax")
+    joins &= contacts == most[strip]
+    unchanged = torch.arange(num_regions, device=labels.device)
+    target = torch.where(most > 0, num_regions, unchanged)
+    target = target.scatter_reduce(0, strip[joins], face[joins], "amin")
+    return torch.cat([target, target.new_tensor([UNLABELED])])[labels]
+
+
+class _Lines(NamedTuple):
+    """Pixels of rows or of columns, ``(n, L)``, and their coordinates ``(n, L, 3)``."""
+
+    points: Tensor
+    seen: Tensor
+    labels: Tensor
+
+
+def hidden_contacts(
+    points: Tensor, seen: Tensor, labels: Tensor, planes: RegionPlanes, reach: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the pairs of regions of one plane that only what is nearer parts, and their contacts.
+
+    The middle of the smaller of two regions is on the plane of the larger, and along some rows or
+    columns nothing between the two is behind that plane, and half of it or more is in front.
+    Whatever is seen behind a plane shows that it ends there, as the floor between two tables of one
+    height does.
+
+    ``points`` ``(H * W, 3)`` and ``seen`` ``(H, W)`` are those of
+    :class:`torchrg.depth.growth.InverseCloud`; ``reach`` ``(M,)`` is the distance from a plane that
+    counts as on it, NaN for a curved region. The pairs are as
+    :func:`torchrg.regions.repair.merge_coplanar` takes them.
+    """
+    pixels = _Lines(points.view(*seen.shape, 3), seen, labels.view(seen.shape))
+    rows = _Lines(*(part[::_EVERY] for part in pixels))
+    columns = _Lines(*(part[:, ::_EVERY].transpose(0, 1).contiguous() for part in pixels))
+    pairs, contacts = [], []
+    for larger, smaller in _aligned_pairs(planes):
+        plane = planes.normal[larger], planes.center[larger], reach[larger]
+        lines = sum(_count_lines(part, (larger, smaller), *plane) for part in (rows, columns))
+        if lines >= _LEAST_LINES:
+            pairs.append((min(larger, smaller), max(larger, smaller)))
+            contacts.append(lines * _EVERY)
+    return labels.new_tensor(pairs).view(-1, 2), labels.new_tensor(contacts)
+
+
+def _aligned_pairs(planes: RegionPlanes) -> list[tuple[int, int]]:
+    """Return the pairs of a larger region and a smaller one whose middle is on its plane."""
+    normal, center, count = planes.normal, planes.center, planes.num_points
+    away = normal @ center.T - (normal * center).sum(dim=1, keepdim=True)
+    aligned = away.abs() <= _MOST_OFFSET * planes.thickness[:, None]
+    place = torch.arange(len(count), device=count.device)
+    is_larger = (count[:, None] > count) | ((count[:, None] == count) & (place[:, None] < place))
+    both_flat = ~(planes.curved[:, None] | planes.curved)
+    return [(a, b) for a, b in (aligned & is_larger & both_flat).nonzero().tolist()]
+
+
+def _count_lines(
+    lines: _Lines, pair: tuple[int, int], normal: Tensor, center: Tensor, reach: Tensor
+) -> int:
+    """Return how many lines lead from one region of a pair to the other past what is nearer."""
+    first, second = ((lines.labels == region) for region in pair)
+    both = first.any(dim=1) & second.any(dim=1)
+    if not bool(both.any()):
+        return 0
+    points, seen, first, second = lines.points[both], lines.seen[both], first[both], second[both]
+    height = (points - center) @ normal
+    in_front = seen & (height > reach)
+    ends = first | second | (seen & (height < -reach))
+    place = torch.arange(ends.shape[1], device=ends.device).expand_as(height)
+    previous = torch.where(ends, place, -1).cummax(dim=1).values[:, :-1]
+    passed = in_front.cumsum(dim=1)
+    here, before = ends[:, 1:], previous.clamp(min=0)
+    gap = place[:, 1:] - previous - 1
+    nearer = passed[:, :-1] - passed.gather(1, before)
+    other = (first[:, 1:] & second.gather(1, before)) | (second[:, 1:] & first.gather(1, before))
+    leads = here & other & (previous >= 0) & (gap > 0) & (nearer >= _LEAST_NEARER * gap)
+    return int(leads.any(dim=1).sum())
