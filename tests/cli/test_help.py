@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import pytest
 
-from torchrg.cli import COMMANDS, console, convert, main
+from torchrg.cli import COMMANDS, convert, flags, main
 from torchrg.cli.arguments import Argument, example_lines, list_flags, parse
 from torchrg.errors import ConfigError
 
@@ -146,7 +146,7 @@ def test_examples_are_understood(prog, capsys):
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
         for flag in ("--superpoints", "--superpoint"):
-            arguments = console.spell_counts(arguments, flag)
+            arguments = flags.spell_counts(arguments, flag)
         parse(kind, arguments, prog=prog)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from torchrg.cli import console, main
+from torchrg.cli import loop, main
 from torchrg.io import read_cloud
 from torchrg.normals import estimate_normals
 
@@ -36,7 +36,7 @@ def test_stages_are_shown_on_a_terminal_and_not_in_a_pipe(room, tmp_path, monkey
         def set_postfix_str(self, stage, **_):
             shown.append((stage, bool(self.disable)))
 
-    monkeypatch.setattr(console, "tqdm", Bar)
+    monkeypatch.setattr(loop, "tqdm", Bar)
     flags = ("--method", "pca", "--orient", "consistent")
     for is_terminal in (True, False):
         monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)

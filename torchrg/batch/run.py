@@ -105,6 +105,7 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
             f"{out}: expected a directory outside {source.root}, so that no result is read as a "
             "scan; choose another."
         )
+    source.check_results(scans, out)
     _check_names(source.root, scans)
     chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
     if not chosen:

@@ -277,6 +277,8 @@ def list_flags(
     """
     texts, hints = _texts(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
+        if not field.metadata.get("is_flag", True):
+            continue
         hint, argument = hints[field.name], Argument()
         if typing.get_origin(hint) is typing.Annotated:
             hint, argument = typing.get_args(hint)
