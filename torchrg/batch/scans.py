@@ -354,8 +354,9 @@ def write_scan(
     folder: Path,
     reading: Reading,
     seg: Segmentation,
-    superpoint: NDArray[np.int32] | None,
+    superpoints: Superpoints | None,
     *,
+    level: int = 0,
     place: str | None = None,
 ) -> list[str]:
     """Write a cloud, its planes and its superpoints into the folder of its name, in a layout.
@@ -367,13 +368,17 @@ def write_scan(
         folder: The folder of that name in the output directory.
         reading: The cloud.
         seg: Its planes.
-        superpoint: Superpoint of each point, shape ``(N,)``.
+        superpoints: Its superpoints.
+        level: Which of their levels is written.
         place: Where the scan is in its data set, which some layouts keep. Default: its name.
 
     Returns:
         Names of the files, as paths from the folder.
     """
     cloud, arrays = reading.cloud, reading.arrays
+    superpoint = None
+    if superpoints is not None:
+        superpoint = [*superpoints.by_level().values()][level]
     if layout == "pointcept" or superpoint is None:
         origin = cloud.origin.tolist()
         if "coord" in arrays:

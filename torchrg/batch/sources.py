@@ -102,11 +102,9 @@ class CloudSource(Source):
         seg, superpoints = segment_cloud(
             cloud, self.settings, orient=self.orient, partition=partition, begin=begin
         )
-        level = None if superpoints is None else [*superpoints.by_level().values()][self.level]
         begin("write")
-        files = write_scan(
-            self.layout, scan.name, folder, reading, seg, level, place=_place_of(scan)
-        )
+        what, place = (reading, seg, superpoints), _place_of(scan)
+        files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)
         return TaskReport(
             scan.name,
             "converted",

@@ -369,7 +369,7 @@ def _memory_limit(arguments: Arguments) -> int:
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     """Write picture and page of each scan that is done, and the index of all of them."""
-    done = {scan.name: scan for scan in report.scans if scan.status in ("converted", "kept")}
+    done = {scan.name: scan for scan in report.complete}
     jobs = [job for job in plan.jobs if job.name in done]
     entries = []
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):

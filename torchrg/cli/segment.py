@@ -308,13 +308,12 @@ def _write_layout(
     superpoints: Superpoints | None,
 ) -> None:
     """Write a result in a layout, its folder ``target``."""
-    layout, level = arguments.layout or "pointcept", None
-    if superpoints is not None:
-        level = [*superpoints.by_level().values()][arguments.level]
+    layout, level = arguments.layout or "pointcept", arguments.level
     for note in note_on_origin(layout, cloud):
         warn(f"{cloud.source}: {note}.")
     arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
-    write_scan(layout, target.name, target, Reading(cloud, arrays, _DATASET), seg, level)
+    reading = Reading(cloud, arrays, _DATASET)
+    write_scan(layout, target.name, target, reading, seg, superpoints, level=level)
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
