@@ -49,12 +49,8 @@ def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
     report = run(jobs)
     write_report(tmp_path, report)
     written = json.loads((tmp_path / "report.json").read_text())
-    assert written["scans_by_status"] == {
-        "converted": 1,
-        "kept": 0,
-        "failed": 1,
-        "not started": 0,
-    }
+    statuses = {"converted": 1, "kept": 0, "failed": 1, "not started": 0}
+    assert written["scans_by_status"] == statuses
     assert written["points"] == 9
     assert set(written["stage_seconds"]) == {"hash", "read", "write", "record"}
     assert "line 7" in next(s["reason"] for s in written["scans"] if s["name"] == "8_b")
