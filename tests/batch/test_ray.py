@@ -101,12 +101,3 @@ def test_ray_is_asked_for_by_name(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[ray\]'"):
         next(run_ray([], memory_limit=1))
-
-
-@needs_ray
-@pytest.mark.slow
-def test_twenty_four_rooms_of_s3dis_are_the_same_bytes_by_one_two_and_ray():
-    script = Path(__file__).parents[2] / "scripts" / "bench.py"
-    sizes = ("--rooms", "24", "--smallest", "2000", "--largest", "20000")
-    shown = run_python(script, "convert", *sizes, "--preset", "classic")
-    assert "all runs wrote the same bytes" in shown
