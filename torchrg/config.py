@@ -18,6 +18,8 @@ NormalMethod = Literal[
     "pca", "jet", "irls", "fastmcd", "mve", "detmcd", "detmm", "paper", "consensus"
 ]
 DEFAULT_PRESET = "consensus"
+NO_FLAG = {"is_flag": False}
+"""Metadata of a setting that files and Python change, and no flag of the command line."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class NormalsConfig:
     inlier_quantile: float = 0.975
     """A neighbour is an inlier of a robust fit when its squared distance is within this quantile of
     the chi-square distribution."""
-    irls_decay: float = 1.05
+    irls_decay: float = field(default=1.05, metadata=NO_FLAG)
     """Factor, above 1, by which the scale of irls shrinks in each step. The authors of irls use
     1.01, which takes five times as long as 1.05."""
     adaptive_k: int | None = None
@@ -105,7 +107,7 @@ class GrowingConfig:
     coplanarity_scope: Literal["all", "connected"] = "all"
     """Neighbours over which the median and Qn of the coplanarity test are taken: all of them (all),
     or those that are connected (connected, Algorithm 2)."""
-    coplanarity_floor: float = 0.005
+    coplanarity_floor: float = field(default=0.005, metadata=NO_FLAG)
     """Least value of Qn in the coplanarity test, as a fraction of the distance to the farthest
     neighbour. On exact and quantised surfaces most residuals are equal, and Qn alone is 0."""
     plane_reach: float | None = 4.0
@@ -132,10 +134,10 @@ class GrowingConfig:
     absorb: bool = True
     """Whether points without a region, and those of regions that are too small, join a flat region
     that they touch and whose plane they are on."""
-    absorb_reach: float = 3.0
+    absorb_reach: float = field(default=3.0, metadata=NO_FLAG)
     """With absorb, a point is on the plane of a region when it is within this many times the
     thickness of the region."""
-    absorb_angle_deg: float = 45.0
+    absorb_angle_deg: float = field(default=45.0, metadata=NO_FLAG)
     """With absorb, a point joins only if its normal is within this angle of the normal of the
     plane."""
     refine_borders: bool = True
@@ -145,7 +147,7 @@ class GrowingConfig:
     merge_coplanar: bool = True
     """Whether regions that touch and lie on one plane become one. A region within the noise of a
     larger one, as the residuals of the normals tell it, is included."""
-    merge_tolerance: float = 1.2
+    merge_tolerance: float = field(default=1.2, metadata=NO_FLAG)
     """With merge_coplanar, two regions lie on one plane when neither is thicker about it than this
     many times its thickness about its own plane."""
 

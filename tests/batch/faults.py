@@ -5,9 +5,8 @@ import os
 import signal
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from torchrg.batch.scans import Job, Scan
+from torchrg.batch.scans import Job, Scan, Source
 from torchrg.batch.task import TaskReport
 from torchrg.config import PipelineConfig
 from torchrg.errors import FormatError
@@ -15,13 +14,11 @@ from torchrg.io import atomic_path
 
 
 @dataclass(frozen=True)
-class FaultySource:
+class FaultySource(Source):
     """Text files, named ``<points>_<anything>``; the text is a behaviour and becomes the result."""
 
-    root: Path
     settings: PipelineConfig = field(default_factory=PipelineConfig)
-    in_place: bool = False
-    bytes_per_point: int = 1
+    bytes_per_point = 1
 
     def describe(self):
         return {"kind": "faulty"}

@@ -4,7 +4,6 @@ import io
 import json
 import shutil
 from dataclasses import asdict
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,17 +14,18 @@ from torchrg.batch.records import RECORD
 from torchrg.batch.run import BatchReport, lock_folder
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
-from torchrg.cli.convert import format_report
 from torchrg.cli.loop import Progress
+from torchrg.cli.report import format_report
 from torchrg.config import load_config
+from torchrg.io import read_cloud
 from torchrg.normals import orient_normals
 from torchrg.pipeline import segment_planes
-from torchrg.scenes import make_room
 
 
-def convert(*arguments):
-    """Run the command on small rooms."""
-    return main(["convert", *map(str, arguments), "--preset", "classic"])
+@pytest.fixture
+def convert(run):
+    """``convert(kind, root, out, ...)``: the command on small rooms."""
+    return lambda *arguments: run("convert", *arguments, "--preset", "classic")
 
 
 def contents(folder):
@@ -38,16 +38,12 @@ def contents(folder):
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
+def rooms(folder_of_clouds):
     """A folder of two rooms, one of them below another folder."""
-    folder = tmp_path_factory.mktemp("rooms")
-    (folder / "east").mkdir()
-    for name, num_points in (("hall.npz", 3000), ("east/office.npy", 2000)):
-        points = make_room(num_points=num_points, seed=num_points).points
-        if name.endswith("npy"):
-            np.save(folder / name, points)
-        else:
-            np.savez(folder / name, points=points)
+    folder = folder_of_clouds("hall.npz", "east/office.ply")
+    points = read_cloud(folder / "east" / "office.ply").coordinates
+    (folder / "east" / "office.ply").unlink()
+    np.save(folder / "east" / "office.npy", points)
     return folder
 
 
@@ -55,7 +51,8 @@ def rooms(tmp_path_factory):
 def converted(rooms, tmp_path_factory):
     """The rooms converted by two workers."""
     out = tmp_path_factory.mktemp("converted") / "out"
-    assert convert("folder", rooms, out, "--workers", 2) == 0
+    flags = ["--preset", "classic", "--workers", "2"]
+    assert main(["convert", "folder", str(rooms), str(out), *flags]) == 0
     return out
 
 
@@ -76,38 +73,35 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
     assert [row["count"] for row in table["planes"]] == seg.planes.count.tolist()
 
 
-def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, capsys):
-    options = ("--workers", 1, "--limit-memory", 0.1)
-    assert convert("folder", rooms, tmp_path / "out", *options) == 0
-    assert capsys.readouterr().err.count("may need more memory than 0.1 GB; it runs alone") == 2
+def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, convert):
+    done = convert("folder", rooms, tmp_path / "out", "--workers", 1, "--limit-memory", 0.1)
+    assert done.err.count("may need more memory than 0.1 GB; it runs alone") == 2
     assert contents(tmp_path / "out") == contents(converted)
 
 
-def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tmp_path, capsys):
+def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tmp_path, convert):
     shutil.copytree(rooms, tmp_path / "in")
     shutil.copytree(converted, tmp_path / "out")
     (tmp_path / "in" / "bad.ply").write_text("ply\nformat")
     (tmp_path / "out" / "hall" / "plane.npy").write_bytes(b"")
     command = ("folder", tmp_path / "in", tmp_path / "out")
-    assert convert(*command, "--dry-run") == 0
-    shown = capsys.readouterr().out
+    shown = convert(*command, "--dry-run").out
     assert "plane.npy changed" in shown
     assert "2 scans to convert, 1 done" in shown
-    assert convert(*command, "--workers", 1) == 3
-    captured = capsys.readouterr()
-    first, last = captured.err.splitlines()
+    done = convert(*command, "--workers", 1)
+    assert done.code == 3
+    first, last = done.err.splitlines()
     assert first.startswith(f"torchrg: bad: {tmp_path / 'in' / 'bad.ply'}: line 2: ")
     assert "2 of 3 scans are complete" in last
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     status = {scan["name"]: scan["status"] for scan in report["scans"]}
     assert status == {"bad": "failed", "hall": "converted", "east/office": "kept"}
-    assert all(name in captured.out for name in status)
+    assert all(name in done.out for name in status)
     assert contents(tmp_path / "out") == contents(converted)
 
 
-def test_a_dry_run_writes_nothing(rooms, tmp_path, capsys):
-    assert convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*") == 0
-    shown = capsys.readouterr().out
+def test_a_dry_run_writes_nothing(rooms, tmp_path, convert):
+    shown = convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*").out
     assert "1 scans to convert" in shown
     assert "disk: about 0.000 GB of " in shown
     assert "memory: about 0.5 GB for 1 at a time" in shown
@@ -115,24 +109,24 @@ def test_a_dry_run_writes_nothing(rooms, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dry_run_looks_at_the_disk(rooms, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("flags", [[], ["--dry-run"]])
+def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, convert, monkeypatch, flags):
     monkeypatch.setattr("torchrg.io.files.free_space", lambda _: 1000)
-    assert convert("folder", rooms, tmp_path / "out", "--dry-run") == 2
-    error = capsys.readouterr().err
-    assert "MB of free disk for 2 scans, got 0.0 MB; make room" in error
+    done = convert("folder", rooms, tmp_path / "out", *flags)
+    assert done.code == 2
+    assert "MB of free disk for 2 scans, got 0.0 MB; make room" in done.err
 
 
-def test_a_finished_set_has_nothing_to_do(rooms, converted, capsys):
+def test_a_finished_set_has_nothing_to_do(rooms, converted, convert):
     for flags in ([], ["--dry-run"]):
-        assert convert("folder", rooms, converted, *flags) == 0
-        assert "nothing to do\n" in capsys.readouterr().out
+        assert "nothing to do\n" in convert("folder", rooms, converted, *flags).out
 
 
-def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, capsys, monkeypatch):
+def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, convert, monkeypatch):
     monkeypatch.setattr("torchrg.batch.run.PATIENCE_SECONDS", 0)
     with lock_folder(tmp_path):
-        assert convert("folder", rooms, tmp_path) == 2
-    assert f"{tmp_path}: another torchrg command writes here; " in capsys.readouterr().err
+        error = convert("folder", rooms, tmp_path).error
+    assert f"{tmp_path}: another torchrg command writes here; " in error
     assert not contents(tmp_path)
 
 
@@ -154,25 +148,17 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, cap
         (["folder", "IN", "FILE/out"], "cannot be made: Not a directory"),
     ],
 )
-def test_mistakes_are_one_line_before_any_work(rooms, tmp_path, capsys, arguments, message):
+def test_mistakes_are_one_line_before_any_work(rooms, tmp_path, convert, arguments, message):
     (tmp_path / "f").touch()
     places = {"IN": rooms, "OUT": tmp_path / "out", "NONE": tmp_path / "no", "FILE": tmp_path / "f"}
     words = []
     for word in arguments:
         first, slash, rest = word.partition("/")
         words.append(f"{places[first]}{slash}{rest}" if first in places else word)
-    assert convert(*words) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert message in captured.err
-    assert captured.out == ""
+    done = convert(*words)
+    assert (done.code, done.out) == (2, "")
+    assert message in done.error
     assert not (tmp_path / "out").exists()
-
-
-def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
-    assert convert("folder", rooms, tmp_path / "out") == 2
-    assert "MB of free disk for 2 scans" in capsys.readouterr().err
 
 
 def test_progress_is_scans_points_a_second_and_time_left():
@@ -186,13 +172,6 @@ def test_progress_is_scans_points_a_second_and_time_left():
     assert "1/2 scans, 1 failed:  90%" in last
     assert "900/1000" in last
     assert "pt/s]" in last
-
-
-def test_help_lists_the_kinds(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["convert", "--help"])
-    assert stop.value.code == 0
-    assert "s3dis" in capsys.readouterr().out
 
 
 def test_depth_frames_are_counted_by_the_second():
@@ -211,15 +190,13 @@ def test_depth_frames_are_counted_by_the_second():
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")
-def test_s3dis_has_the_settings_made_for_it_unless_told_otherwise(tmp_path, capsys):
+def test_s3dis_has_the_settings_made_for_it_unless_told_otherwise(tmp_path, run):
     write_clean_room(tmp_path / "in" / "Area_1" / "office_1", 1, {"wall_1": 300, "floor_1": 300})
-    command = ["convert", "s3dis", str(tmp_path / "in"), str(tmp_path / "out"), "--workers", "1"]
-    main(command)
+    command = ("convert", "s3dis", tmp_path / "in", tmp_path / "out", "--workers", "1")
+    run(*command)
     (record,) = (tmp_path / "out").rglob(RECORD)
     used, expected = json.loads(record.read_text())["config"], asdict(load_config("s3dis"))
     for section in ("normals", "growing", "planes"):
         assert used[section] == expected[section]
     for preset, told in (("s3dis", "nothing to do"), ("classic", "settings changed")):
-        capsys.readouterr()
-        assert main([*command, "--preset", preset, "--dry-run"]) == 0
-        assert told in capsys.readouterr().out
+        assert told in run(*command, "--preset", preset, "--dry-run").out

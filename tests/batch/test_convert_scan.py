@@ -12,7 +12,6 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
-from torchrg.scenes import make_room
 
 
 def test_the_record_tells_what_was_made_from_what(faults, tmp_path):
@@ -83,13 +82,17 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     assert (tmp_path / "elsewhere.npy").exists()
 
 
-def save_room(tmp_path, **settings):
-    """Return a job for a small room whose results go to ``out/room``."""
-    (tmp_path / "in").mkdir()
-    np.save(tmp_path / "in" / "room.npy", make_room(num_points=500, seed=1).points)
-    source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path / "out", **settings)
-    (job,) = list_jobs(source, tmp_path / "out")
-    return job
+@pytest.fixture
+def job_of_a_room(room, tmp_path):
+    """``job_of_a_room(...)``: a job for a small room whose results go to ``out/room``."""
+
+    def make(**settings):
+        (tmp_path / "in").mkdir()
+        np.save(tmp_path / "in" / "room.npy", room(500).points)
+        source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path / "out", **settings)
+        return list_jobs(source, tmp_path / "out")[0]
+
+    return make
 
 
 @pytest.mark.parametrize(
@@ -102,8 +105,8 @@ def save_room(tmp_path, **settings):
         ("provenance.json", b'["of another program"]'),
     ],
 )
-def test_files_of_others_are_never_replaced(tmp_path, name, content):
-    job = save_room(tmp_path)
+def test_files_of_others_are_never_replaced(job_of_a_room, name, content):
+    job = job_of_a_room()
     job.folder.mkdir(parents=True)
     (job.folder / name).write_bytes(content)
     report = convert_scan(job)
@@ -113,8 +116,8 @@ def test_files_of_others_are_never_replaced(tmp_path, name, content):
     assert {path.name: path.read_bytes() for path in job.folder.iterdir()} == {name: content}
 
 
-def test_results_are_replaced_by_those_of_other_settings_and_no_others(tmp_path):
-    job = save_room(tmp_path, superpoint=True)
+def test_results_are_replaced_by_those_of_other_settings_and_no_others(job_of_a_room):
+    job = job_of_a_room(superpoint=True)
     assert convert_scan(job).status == "converted"
     (job.folder / "notes.npy").write_bytes(b"of a user")
     other = dataclasses.replace(job, source=dataclasses.replace(job.source, superpoint=False))
@@ -134,8 +137,8 @@ def test_results_are_replaced_by_those_of_other_settings_and_no_others(tmp_path)
     assert (job.folder / "superpoint.npy").exists()
 
 
-def test_a_folder_that_was_there_stays(tmp_path):
-    job = save_room(tmp_path)
+def test_a_folder_that_was_there_stays(job_of_a_room, tmp_path):
+    job = job_of_a_room()
     (tmp_path / "in" / "room.npy").write_bytes(b"damaged")
     assert convert_scan(job).status == "failed"
     assert not job.folder.exists()

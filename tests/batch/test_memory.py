@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from torchrg.batch.memory import memory_of_scan, memory_on_disk
+from torchrg.batch.memory import available_memory, memory_of_scan, memory_on_disk, peak_memory
 
 MEASURE = """
 import sys
@@ -58,3 +58,13 @@ def test_what_a_cloud_on_a_disk_takes_is_what_the_model_says(tmp_path, preset):
     num_points = 1_000_000
     (peak,) = peaks(tmp_path, "disk", preset, num_points)
     assert 0.5 * memory_on_disk(num_points) < peak < memory_on_disk(num_points)
+
+
+def test_memory_is_measured():
+    assert 1e7 < peak_memory() < 1e12
+    assert 1e7 < available_memory() < 1e14
+
+
+@pytest.mark.parametrize("num_points", [0, 10**5, 10**7])
+def test_the_estimate_stays_within_what_is_promised(num_points):
+    assert memory_of_scan(num_points) <= 2e9 + 1200 * num_points

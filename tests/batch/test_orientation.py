@@ -15,11 +15,9 @@ from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource, ScanNetSource
-from torchrg.cli import main
 from torchrg.config import DepthConfig, load_config
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
-from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
 CLASSIC = load_config("classic")
@@ -27,16 +25,13 @@ CAMERA = ("--intrinsics", "50,50,19.5,14.5", "--depth-scale", "1000")
 
 
 @pytest.fixture(scope="module")
-def room():
+def mesh(room):
     """Points of a made room, normals into it, and triangles of each face, wound to be seen."""
-    scene = make_room(8000, noise=0.002, seed=2)
+    scene = room(noise=0.002, seed=2)
     labels = scene.labels.numpy()
     kept = np.isin(labels, np.flatnonzero(np.bincount(labels[labels >= 0]) >= 50))
-    points, normals, labels = (
-        scene.points[kept].float().numpy(),
-        scene.normals[kept].float().numpy(),
-        labels[kept],
-    )
+    points, normals = (part[kept].float().numpy() for part in (scene.points, scene.normals))
+    labels = labels[kept]
     faces = []
     for label in np.unique(labels):
         own = np.flatnonzero(labels == label)
@@ -50,9 +45,9 @@ def room():
 
 
 @pytest.fixture(scope="module")
-def files(room, tmp_path_factory):
+def files(mesh, tmp_path_factory):
     """The room as points, as two meshes, and as a mesh of two faces."""
-    points, _, faces = room
+    points, _, faces = mesh
     folder = tmp_path_factory.mktemp("rooms")
     write_cloud(folder / "points.ply", Cloud(points))
     write_mesh(folder / "inwards.ply", points, faces=faces)
@@ -97,10 +92,10 @@ def folder_source(tmp_path, orient="auto"):
     return FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", orient=orient)
 
 
-def test_normals_point_into_rooms_to_the_front_of_faces_and_to_scanners(room, files, tmp_path):
-    _, truth, _ = room
+def test_normals_point_into_rooms_to_the_front_of_faces_and_to_scanners(mesh, files, tmp_path):
+    _, truth, _ = mesh
     shutil.copytree(files, tmp_path / "in")
-    truths = {"stations": write_stations(tmp_path / "in" / "stations.e57", *room[:2])}
+    truths = {"stations": write_stations(tmp_path / "in" / "stations.e57", *mesh[:2])}
     found = convert(folder_source(tmp_path), tmp_path / "out")
     shares = {name: share(normals, truths.get(name, truth)) for name, normals in found.items()}
     assert shares.pop("outwards") < 0.05
@@ -110,8 +105,8 @@ def test_normals_point_into_rooms_to_the_front_of_faces_and_to_scanners(room, fi
     assert record["source"]["orient"] == "auto"
 
 
-def test_other_sides_are_other_results(room, files, tmp_path):
-    _, truth, _ = room
+def test_other_sides_are_other_results(mesh, files, tmp_path):
+    _, truth, _ = mesh
     (tmp_path / "in").mkdir()
     shutil.copy(files / "outwards.ply", tmp_path / "in")
     found = {}
@@ -130,13 +125,13 @@ def test_other_sides_are_other_results(room, files, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["s3dis", "scannet"])
-def test_data_sets_without_scanners_refuse_to_look_at_them(tmp_path, capsys, kind):
-    assert main(["convert", kind, str(tmp_path), str(tmp_path / "x"), "--orient", "viewpoint"]) == 2
-    assert "expected --orient auto, interior, up or none" in capsys.readouterr().err
+def test_data_sets_without_scanners_refuse_to_look_at_them(tmp_path, run, kind):
+    error = run("convert", kind, tmp_path, tmp_path / "x", "--orient", "viewpoint").error
+    assert "expected --orient auto, interior, up or none" in error
 
 
-def test_meshes_of_scannet_say_which_side_is_seen(room, tmp_path):
-    points, truth, faces = room
+def test_meshes_of_scannet_say_which_side_is_seen(mesh, tmp_path):
+    points, truth, faces = mesh
     color = np.zeros((len(points), 3), np.uint8)
     write_scan(tmp_path / "in" / "scans", "scene0000_00", points, color, None, None)
     name = "scene0000_00/scene0000_00_vh_clean_2.ply"
@@ -148,12 +143,11 @@ def test_meshes_of_scannet_say_which_side_is_seen(room, tmp_path):
 
 
 @pytest.mark.parametrize("flags", [(), ("--voxel", "0.05"), ("--merge",)])
-def test_segment_writes_what_convert_writes(room, files, tmp_path, flags):
-    _, truth, _ = room
+def test_segment_writes_what_convert_writes(mesh, files, tmp_path, run, flags):
+    _, truth, _ = mesh
     inputs = [files / "outwards.ply", *[files / "points.ply"] * ("--merge" in flags)]
     out = tmp_path / "a.npz"
-    command = ["segment", *inputs, "--out", out, "--preset", "classic", *flags]
-    assert main([*map(str, command)]) == 0
+    assert run("segment", *inputs, "--out", out, "--preset", "classic", *flags).code == 0
     with np.load(out) as result:
         normals, provenance = result["normals"], json.loads(str(result["provenance"]))
     assert share(normals[: len(truth)], -truth) > 0.93
@@ -162,13 +156,12 @@ def test_segment_writes_what_convert_writes(room, files, tmp_path, flags):
     assert provenance["orient"] == "auto"
 
 
-def test_normals_by_viewpoint_look_to_the_scanners_of_the_file(room, tmp_path):
-    truth = write_stations(tmp_path / "a.e57", *room[:2])
-    command = ["normals", tmp_path / "a.e57", "--out", tmp_path / "a.npz", "--orient", "viewpoint"]
-    assert main([*map(str, command), "--method", "pca"]) == 0
-    assert share(np.load(tmp_path / "a.npz")["normals"], truth) > 0.97
-    assert main(["segment", *map(str, command[1:]), "--preset", "classic"]) == 0
-    assert share(np.load(tmp_path / "a.npz")["normals"], truth) > 0.97
+def test_normals_by_viewpoint_look_to_the_scanners_of_the_file(mesh, tmp_path, run):
+    truth = write_stations(tmp_path / "a.e57", *mesh[:2])
+    for command in (("normals", "--method", "pca"), ("segment", "--preset", "classic")):
+        places = (tmp_path / "a.e57", "--out", tmp_path / "a.npz")
+        assert run(*command, *places, "--orient", "viewpoint").code == 0
+        assert share(np.load(tmp_path / "a.npz")["normals"], truth) > 0.97
 
 
 def corner(path):
@@ -180,12 +173,12 @@ def corner(path):
     return stored
 
 
-def test_normals_of_frames_look_at_the_camera_unless_told_otherwise(tmp_path):
+def test_normals_of_frames_look_at_the_camera_unless_told_otherwise(tmp_path, run):
     corner(tmp_path / "a.npy")
     for orient, turned in (("auto", False), ("viewpoint", False), ("none", False), ("up", True)):
         out = tmp_path / f"{orient}.npz"
-        command = ["depth", str(tmp_path / "a.npy"), *CAMERA, "--out", str(out), "--orient", orient]
-        assert main(command) == 0
+        places = (tmp_path / "a.npy", "--out", out)
+        assert run("depth", *places, *CAMERA, "--orient", orient).code == 0
         with np.load(out) as result:
             normals, points = result["normals"], result["points"]
             known = normals.any(axis=1)
@@ -216,13 +209,12 @@ def test_converted_frames_look_at_the_camera_in_the_world(tmp_path):
         assert (turned[..., 2] >= least).all()
 
 
-def test_damaged_faces_are_noted_and_the_room_decides(room, files, tmp_path, capsys):
-    _, truth, _ = room
+def test_damaged_faces_are_noted_and_the_room_decides(mesh, files, tmp_path, run):
+    _, truth, _ = mesh
     data = (files / "inwards.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data[:-8] + struct.pack("<ii", 9_000_000, 1))
-    command = ["segment", tmp_path / "a.ply", "--out", tmp_path / "a.npz", "--preset", "classic"]
-    assert main([*map(str, command)]) == 0
-    words = capsys.readouterr().err
-    assert re.search(r"its faces left out: expected faces of .* got vertex 9,000,000", words)
+    places = (tmp_path / "a.ply", "--out", tmp_path / "a.npz")
+    done = run("segment", *places, "--preset", "classic")
+    assert re.search(r"its faces left out: expected faces of .* got vertex 9,000,000", done.err)
     assert share(np.load(tmp_path / "a.npz")["normals"], truth) > 0.95
     assert read_cloud(tmp_path / "a.ply").front is None

@@ -8,7 +8,6 @@ import pytest
 from torchrg.batch.run import list_jobs, lock_folder
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource
-from torchrg.cli import main
 from torchrg.config import load_config
 from torchrg.depth import DepthConfig
 from torchrg.errors import ConfigError, FormatError
@@ -34,21 +33,32 @@ def save(folder, *names, num_points=500):
             np.save(stream, points)
 
 
-def convert(root, out, *flags):
-    command = ["convert", "folder", str(root), str(out), "--preset", "classic", "--workers", "1"]
-    return main([*command, *flags])
+@pytest.fixture
+def convert(run, root, tmp_path):
+    """``convert(...)``: the command over the root."""
+    command = ("convert", "folder", root, tmp_path / "out", "--preset", "classic", "--workers", "1")
+    return lambda *flags: run(*command, *flags)
 
 
-def test_scans_that_differ_in_the_suffix_alone_are_refused(root, tmp_path, capsys):
+@pytest.fixture
+def refused(convert, tmp_path):
+    """``refused(...)``: the one line of a command that is refused before any work."""
+
+    def call(*flags):
+        done = convert(*flags)
+        assert (done.code, done.out) == (2, "")
+        assert not (tmp_path / "out").exists()
+        return done.error
+
+    return call
+
+
+def test_scans_that_differ_in_the_suffix_alone_are_refused(root, convert, refused):
     save(root, "x.ply", "x.pcd", "x.ply.npz", "y.npy")
     for flags in ([], ["--dry-run"], ["--only", "y"]):
-        assert convert(root, tmp_path / "out", *flags) == 2
-        captured = capsys.readouterr()
-        assert "expected one file for each scan, got x.pcd and x.ply; " in captured.err
-        assert (captured.err.count("\n"), captured.out) == (1, "")
-    assert not (tmp_path / "out").exists()
-    assert convert(root, tmp_path / "out", "--suffixes", ".npy", ".npz", "--dry-run") == 0
-    assert "2 scans to convert" in capsys.readouterr().out
+        assert "expected one file for each scan, got x.pcd and x.ply; " in refused(*flags)
+    shown = convert("--suffixes", ".npy", ".npz", "--dry-run").out
+    assert "2 scans to convert" in shown
 
 
 @pytest.mark.parametrize(
@@ -65,15 +75,11 @@ def test_scans_that_differ_in_the_suffix_alone_are_refused(root, tmp_path, capsy
         (["Report.JSON/x.npy"], "no scan called Report.JSON/x, as OUT/report.json is a file"),
     ],
 )
-def test_names_that_lead_to_one_place_are_refused(root, tmp_path, capsys, names, message):
+def test_names_that_lead_to_one_place_are_refused(root, refused, names, message):
     save(root, *names)
     if len({path.name for path in root.rglob("*.npy")}) < len(names):
         pytest.skip("this file system takes them for the same")
-    assert convert(root, tmp_path / "out") == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert (captured.err.count("\n"), captured.out) == (1, "")
-    assert not (tmp_path / "out").exists()
+    assert message in refused()
 
 
 FLAT = ("mmdet3d", "spformer", "isbnet", "mask3d", "npy")
@@ -95,44 +101,37 @@ def test_files_of_two_scans_in_one_folder_are_refused(root, tmp_path, names):
         assert len(list_jobs(source, tmp_path / "out")) == 2
 
 
-def test_the_command_refuses_them_before_any_work(root, tmp_path, capsys):
+def test_the_command_refuses_them_before_any_work(root, refused):
     save(root, "a/b_c.npy", "a_b/c.npy", "other.npy")
     for flags in (["--dry-run"], ["--only", "other"], []):
-        assert convert(root, tmp_path / "out", "--layout", "npy", *flags) == 2
-        captured = capsys.readouterr()
-        assert "got a_b_c for a/b_c and a_b/c in layout npy; rename one" in captured.err
-        assert (captured.err.count("\n"), captured.out) == (1, "")
-        assert not (tmp_path / "out").exists()
+        error = refused("--layout", "npy", *flags)
+        assert "got a_b_c for a/b_c and a_b/c in layout npy; rename one" in error
 
 
-def test_short_names_of_mask3d_are_compared_too(root, tmp_path, capsys):
+def test_short_names_of_mask3d_are_compared_too(root, tmp_path, convert, refused, run):
     save(root, "scene0011_00.npy", "0011_00.npy")
+    error = refused("--layout", "mask3d")
+    assert "got 0011_00 for 0011_00 and scene0011_00 in layout mask3d" in error
+    assert convert("--layout", "npy", "--dry-run").code == 0
     out = tmp_path / "out"
-    assert convert(root, out, "--layout", "mask3d") == 2
-    assert "got 0011_00 for 0011_00 and scene0011_00 in layout mask3d" in capsys.readouterr().err
-    assert convert(root, out, "--layout", "npy", "--dry-run") == 0
-    capsys.readouterr()
-    scans = [str(path) for path in root.iterdir()]
-    assert main(["segment", *scans, "--out", str(out), "--layout", "mask3d"]) == 2
-    captured = capsys.readouterr()
-    assert "expected files of its own for each scan, got 0011_00 for " in captured.err
-    assert (captured.err.count("\n"), captured.out) == (1, "")
+    done = run("segment", *root.iterdir(), "--out", out, "--layout", "mask3d")
+    assert (done.code, done.out) == (2, "")
+    assert "expected files of its own for each scan, got 0011_00 for " in done.error
     assert not [*out.iterdir()]
 
 
 def test_a_second_command_does_not_write_into_the_files_of_a_layout(
-    root, tmp_path, capsys, monkeypatch
+    root, tmp_path, run, monkeypatch
 ):
     save(root, "hall.npy")
     monkeypatch.setattr("torchrg.batch.run.PATIENCE_SECONDS", 0)
-    command = ["segment", str(root / "hall.npy"), "--out", str(tmp_path), "--preset", "classic"]
+    command = ("segment", root / "hall.npy", "--out", tmp_path, "--preset", "classic")
     with lock_folder(tmp_path):
-        assert main([*command, "--layout", "npy"]) == 2
-        assert "another torchrg command" in capsys.readouterr().err
+        assert "another torchrg command" in run(*command, "--layout", "npy").error
         assert not (tmp_path / "superpoints").exists()
         # A folder for each scan is no place of others.
-        assert main([*command, "--layout", "pointcept"]) == 0
-    assert main([*command, "--layout", "npy"]) == 0
+        assert run(*command, "--layout", "pointcept").code == 0
+    assert run(*command, "--layout", "npy").code == 0
 
 
 def test_a_scan_of_another_command_with_the_same_files_is_refused(root, tmp_path):
@@ -199,15 +198,14 @@ def test_results_are_never_read_as_scans_through_a_link_or_from_above(root, tmp_
         list_jobs(FolderSource(root, CLASSIC, tmp_path), tmp_path)
 
 
-def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, capsys):
+def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, convert):
     save(root, "in/a.npy")
     (root / "in" / "loop").symlink_to("..")
     (root / "in" / "second").symlink_to("..")
-    assert convert(root, tmp_path / "out", "--dry-run") == 0
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"torchrg: warning: {root}: passed over in/loop and 1 more")
-    assert captured.err.count("\n") == 1
-    assert "1 scans to convert" in captured.out
+    done = convert("--dry-run")
+    assert done.err.startswith(f"torchrg: warning: {root}: passed over in/loop and 1 more")
+    assert done.err.count("\n") == 1
+    assert "1 scans to convert" in done.out
     with pytest.warns(UserWarning, match="passed over in/loop"):
         jobs = list_jobs(FolderSource(root, CLASSIC, tmp_path / "out"), tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["in/a"]

@@ -8,7 +8,6 @@ from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from torchrg.batch.run import list_jobs
@@ -16,7 +15,6 @@ from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.config import load_config
 from torchrg.errors import MissingDependencyError
-from torchrg.scenes import make_room
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 
@@ -44,15 +42,16 @@ def results_of(out):
 
 @needs_ray
 @pytest.mark.slow
-def test_ray_gives_the_bytes_of_one_process(tmp_path):
-    (tmp_path / "in").mkdir()
-    for seed in range(3):
-        np.save(tmp_path / "in" / f"{seed}.npy", make_room(num_points=3000, seed=seed).points)
-    out, here = tmp_path / "out", tmp_path / "here"
+def test_ray_gives_the_bytes_of_one_process(folder_of_clouds, tmp_path):
+    rooms, out, here = (
+        folder_of_clouds("a.npz", "b.npz", "c.ply"),
+        tmp_path / "out",
+        tmp_path / "here",
+    )
     options = ("--preset", "classic", "--engine", "ray", "--workers", "2")
-    shown = run_python("-m", "torchrg", "convert", "folder", tmp_path / "in", out, *options)
+    shown = run_python("-m", "torchrg", "convert", "folder", rooms, out, *options)
     assert "3 of 3 scans are complete" in shown
-    for job in list_jobs(FolderSource(tmp_path / "in", load_config("classic"), here), here):
+    for job in list_jobs(FolderSource(rooms, load_config("classic"), here), here):
         convert_scan(job)
     assert results_of(out) == results_of(here)
     assert json.loads((out / "report.json").read_text())["engine"] == "ray"
@@ -102,12 +101,3 @@ def test_ray_is_asked_for_by_name(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[ray\]'"):
         next(run_ray([], memory_limit=1))
-
-
-@needs_ray
-@pytest.mark.slow
-def test_twenty_four_rooms_of_s3dis_are_the_same_bytes_by_one_two_and_ray():
-    script = Path(__file__).parents[2] / "scripts" / "bench.py"
-    sizes = ("--rooms", "24", "--smallest", "2000", "--largest", "20000")
-    shown = run_python(script, "convert", *sizes, "--preset", "classic")
-    assert "all runs wrote the same bytes" in shown

@@ -4,8 +4,7 @@ import json
 
 from torchrg.batch.run import make_plan, run_plan, write_report
 from torchrg.batch.scans import convert_scan
-from torchrg.cli.console import format_table
-from torchrg.cli.convert import format_report
+from torchrg.cli.report import format_report, format_table
 
 
 def run(jobs, on_report=lambda report: None):
@@ -50,12 +49,8 @@ def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
     report = run(jobs)
     write_report(tmp_path, report)
     written = json.loads((tmp_path / "report.json").read_text())
-    assert written["scans_by_status"] == {
-        "converted": 1,
-        "kept": 0,
-        "failed": 1,
-        "not started": 0,
-    }
+    statuses = {"converted": 1, "kept": 0, "failed": 1, "not started": 0}
+    assert written["scans_by_status"] == statuses
     assert written["points"] == 9
     assert set(written["stage_seconds"]) == {"hash", "read", "write", "record"}
     assert "line 7" in next(s["reason"] for s in written["scans"] if s["name"] == "8_b")
@@ -68,7 +63,7 @@ def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
 
 
 def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchrg.cli.convert.MOST_ROWS", 1)
+    monkeypatch.setattr("torchrg.cli.report.MOST_ROWS", 1)
     report = run(faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"}))
     table = format_report(report)
     assert "8_b" in table

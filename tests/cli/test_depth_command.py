@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from torchrg import _compile
-from torchrg.cli import main
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
@@ -37,9 +36,9 @@ def frame(tmp_path, depth):
     return path
 
 
-def test_a_depth_image_becomes_labels_and_a_picture(tmp_path, frame, depth, capsys):
+def test_a_depth_image_becomes_labels_and_a_picture(tmp_path, frame, depth, run):
     out = tmp_path / "labels.png"
-    assert main(["depth", str(frame), *CAMERA, "--out", str(out)]) == 0
+    done = run("depth", frame, *CAMERA, "--out", out)
     labels = kornia_rs.io.read_image_png_u16(str(out), "mono")[..., 0].astype(int) - 1
     expected = segment_depth(depth, INTRINSICS).labels.numpy()
     np.testing.assert_array_equal(labels, expected)
@@ -47,13 +46,13 @@ def test_a_depth_image_becomes_labels_and_a_picture(tmp_path, frame, depth, caps
     picture = kornia_rs.io.read_image_png_u8(str(tmp_path / "labels_planes.png"), "rgb")
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 3
     assert not picture[0, 0].any()
-    assert "80 x 60 pixels, 4,780 with depth, 2 planes, 100.0 %" in capsys.readouterr().out
+    assert "80 x 60 pixels, 4,780 with depth, 2 planes, 100.0 %" in done.out
 
 
-def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth):
+def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth, run):
     for suffix in (".npz", ".pcd"):
         out = tmp_path / f"cloud{suffix}"
-        assert main(["depth", str(frame), *CAMERA, "--out", str(out)]) == 0
+        assert run("depth", frame, *CAMERA, "--out", out).code == 0
         cloud = read_cloud(out)
         points = depth_to_points(depth[None].double(), INTRINSICS[None])[0].view(-1, 3)
         np.testing.assert_allclose(cloud.coordinates, points.float(), rtol=1e-6)
@@ -68,40 +67,40 @@ def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth):
 
 
 def test_without_a_place_for_kernels_a_line_says_so_and_all_runs_as_written(
-    tmp_path, frame, monkeypatch, capsys
+    tmp_path, frame, monkeypatch, run
 ):
     (tmp_path / "file").touch()
     monkeypatch.setenv("TORCHRG_CACHE_DIR", str(tmp_path / "file" / "below"))
     monkeypatch.setattr(_compile, "_prepared", {})
     out = tmp_path / "planes.npz"
-    assert main(["depth", str(frame), *CAMERA, "--compile", "--out", str(out)]) == 0
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "kernels are not compiled" in line
+    done = run("depth", frame, *CAMERA, "--compile", "--out", out)
+    assert "kernels are not compiled" in done.err
+    assert done.err.count("\n") == 1
     with np.load(out) as result:
         assert json.loads(str(result["provenance"]))["compile"] is False
 
 
 @pytest.mark.parametrize("focal", [50.0, 500.0])
-def test_organised_clouds_keep_their_grid(tmp_path, depth, focal):
+def test_organised_clouds_keep_their_grid(tmp_path, depth, run, focal):
     camera = make_intrinsics(focal, focal, 39.5, 29.5)
     points = depth_to_points(depth[None], camera[None])[0].view(-1, 3)
     source, out = tmp_path / "scan.pcd", tmp_path / "out.pcd"
     write_cloud(source, Cloud(points.numpy(), grid_shape=(60, 80)))
     # A narrow cloud is moved to an origin of its own; its planes stay where they are.
     assert read_cloud(source).origin.any() == (focal == 500)
-    assert main(["depth", str(source), "--threads", "1", "--out", str(out)]) == 0
+    assert run("depth", source, "--threads", "1", "--out", out).code == 0
     cloud = read_cloud(out)
     assert cloud.grid_shape == (60, 80)
     np.testing.assert_array_equal(cloud.coordinates, points)
     expected = segment_depth(depth, camera).labels.flatten()
     np.testing.assert_array_equal(cloud.fields["labels"], expected)
     result = tmp_path / "out.npz"
-    assert main(["depth", str(source), "--threads", "1", "--out", str(result)]) == 0
+    assert run("depth", source, "--threads", "1", "--out", result).code == 0
     with np.load(result) as arrays:
         np.testing.assert_allclose(arrays["plane_offset"], [2.0, 2.5], rtol=1e-5)
 
 
-def test_segment_says_that_a_cloud_is_a_depth_image(tmp_path, capsys, depth):
+def test_segment_says_that_a_cloud_is_a_depth_image(tmp_path, run, depth):
     points = depth_to_points(depth[None], INTRINSICS[None])[0].view(-1, 3).numpy()
     turned = points[:, [2, 0, 1]]
     for name, coordinates, grid in (
@@ -111,51 +110,38 @@ def test_segment_says_that_a_cloud_is_a_depth_image(tmp_path, capsys, depth):
     ):
         source = tmp_path / f"{name}.pcd"
         write_cloud(source, Cloud(coordinates, grid_shape=grid))
-        flags = ["--preset", "classic", "--out", str(tmp_path / "out.npz")]
-        assert main(["segment", str(source), *flags]) == 0
-        assert ("taken by a depth camera; torchrg depth" in capsys.readouterr().err) == (
-            name == "image"
-        )
-
-
-def test_several_images_go_into_a_folder(tmp_path, frame):
-    other, out = tmp_path / "other.png", tmp_path / "out"
-    other.write_bytes(frame.read_bytes())
-    inputs = [str(frame), str(other)]
-    assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 0
-    names = ["frame.png", "frame_planes.png", "other.png", "other_planes.png"]
-    assert sorted(path.name for path in out.iterdir()) == names
-
-
-def test_a_damaged_image_stops_no_other(tmp_path, frame, depth, capsys):
-    folder, out = tmp_path / "images", tmp_path / "out"
-    folder.mkdir()
-    for name in ("1.png", "3.png"):
-        (folder / name).write_bytes(frame.read_bytes())
-    (folder / "2.png").write_bytes(frame.read_bytes()[:90])
-    inputs = [str(folder / f"{number}.png") for number in (1, 2, 3)]
-    assert main(["depth", *inputs, *CAMERA, "--out", str(out)]) == 3
-    told = capsys.readouterr()
-    damaged, sums = told.err.splitlines()
-    assert damaged.startswith(f"torchrg: {inputs[1]}: ")
-    assert damaged.count("2.png") == 1
-    assert sums == "torchrg: 1 of 3 inputs failed, the others are written."
-    assert told.out.count(" 2 planes, ") == 2
-    assert len(contents(out)) == 4
+        done = run("segment", source, "--preset", "classic", "--out", tmp_path / "out.npz")
+        assert ("taken by a depth camera; torchrg depth" in done.err) == (name == "image")
 
 
 def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_folder_is_refused_with_the_command_for_it(tmp_path, frame, capsys):
-    assert main(["depth", str(tmp_path), *CAMERA, "--out", str(tmp_path / "out")]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"got a folder; use: torchrg convert rgbd {tmp_path} OUT --intrinsics" in line
+def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_path, frame, run):
+    folder, out = tmp_path / "images", tmp_path / "out"
+    folder.mkdir()
+    for name in ("1.png", "3.png"):
+        (folder / name).write_bytes(frame.read_bytes())
+    (folder / "2.png").write_bytes(frame.read_bytes()[:90])
+    inputs = [folder / f"{number}.png" for number in (1, 2, 3)]
+    told = run("depth", *inputs, *CAMERA, "--out", out)
+    assert told.code == 3
+    damaged, sums = told.err.splitlines()
+    assert damaged.startswith(f"torchrg: {inputs[1]}: ")
+    assert damaged.count("2.png") == 1
+    assert sums == "torchrg: 1 of 3 inputs failed, the others are written."
+    assert told.out.count(" 2 planes, ") == 2
+    assert sorted(contents(out)) == ["1.png", "1_planes.png", "3.png", "3_planes.png"]
+
+
+def test_a_folder_is_refused_with_the_command_for_it(tmp_path, frame, run):
+    error = run("depth", tmp_path, *CAMERA, "--out", tmp_path / "out").error
+    assert f"got a folder; use: torchrg convert rgbd {tmp_path} OUT --intrinsics" in error
     assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]
 
 
-def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, capsys):
+def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, run):
     other = tmp_path / "frame_planes.png"
     other.write_bytes(frame.read_bytes())
     before = contents(tmp_path)
@@ -164,87 +150,59 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, capsys
         ([frame], frame, "frame.png: expected a place of its own"),
         ([frame, other], tmp_path / "out", "frame_planes.png: expected a place of its own"),
     ):
-        assert main(["depth", *map(str, inputs), *CAMERA, "--out", str(out)]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
+        assert message in run("depth", *inputs, *CAMERA, "--out", out).error
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
     assert contents(tmp_path) == before
 
 
-def test_wrong_use_is_one_line(tmp_path, frame, depth, capsys):
-    points = depth_to_points(depth[None], INTRINSICS[None])[0]
-    write_cloud(tmp_path / "list.pcd", Cloud(points.view(-1, 3).numpy()))
-    turned = (points + 1).view(-1, 3).numpy()
-    write_cloud(tmp_path / "turned.pcd", Cloud(turned, grid_shape=(60, 80)))
-    out = ["--out", str(tmp_path / "a.png")]
-    for arguments, message in (
-        ([str(frame), *out], "frame.png: expected --intrinsics fx,fy,cx,cy, which depth images"),
-        ([str(frame), *CAMERA[:2], *out], "frame.png: expected --depth-scale, which depth images"),
-        ([str(frame), "--intrinsics", "1,2,3", *CAMERA[2:], *out], "four numbers without blanks"),
-        ([str(frame), str(frame), *CAMERA, *out], "expected a directory for 2 inputs"),
-        (
-            [str(frame), *CAMERA[:4], "--threads", "0", *out],
-            "expected --threads from 1 to 1,024, got 0",
-        ),
-        ([str(tmp_path / "list.pcd"), *out], "expected an organised cloud"),
-        ([str(tmp_path / "turned.pcd"), *out], "expected points of a pinhole camera"),
-    ):
-        assert main(["depth", *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-    assert not (tmp_path / "a.png").exists()
-
-
-def test_two_files_of_one_name_are_refused(tmp_path, frame, capsys):
-    (tmp_path / "more").mkdir()
-    twin = tmp_path / "more" / frame.name
-    twin.write_bytes(frame.read_bytes())
-    assert main(["depth", str(frame), str(twin), *CAMERA, "--out", str(tmp_path / "out")]) == 2
-    assert "another input has the same name" in capsys.readouterr().err
-
-
-def test_segment_says_where_depth_images_went(tmp_path, frame, capsys):
-    cloud, out = str(tmp_path / "scan.pcd"), ["--out", str(tmp_path / "out.npz")]
-    depth = "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
-    image = f"got the image {frame}; use: torchrg depth {frame} {depth}"
-    for arguments, message in (
-        ([str(frame), *out], image),
-        ([cloud, str(frame), *CAMERA, *out], image),
-        ([*out, "--preset=classic", str(frame)], image),
-        ([cloud, "--image", *out], f"got --image; use: torchrg depth IMAGES... {depth}"),
-        ([cloud, *CAMERA, *out], f"got --intrinsics; use: torchrg depth IMAGES... {depth}"),
-        ([cloud, "--depth-scale=1000", *out], "got --depth-scale=1000; use: torchrg depth IMAGES"),
-    ):
-        assert main(["segment", *arguments]) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("torchrg: segment: expected point clouds, got ")
-        assert message in error
-        assert error.count("\n") == 1
-
-
-def test_pictures_of_segment_are_no_images(tmp_path, capsys):
-    for picture in (["--picture", "a.png"], ["--picture=a.png"]):
-        assert main(["segment", str(tmp_path / "no.pcd"), "--out", str(tmp_path), *picture]) == 2
-        assert "no.pcd: no such file" in capsys.readouterr().err
-
-
-def test_an_image_that_memory_has_no_room_for_is_refused_before_it_is_read(tmp_path, capsys):
-    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 300_000, 300_000)
-    (tmp_path / "huge.png").write_bytes(head + b"\x10\0\0\0\0")
-    out = ["--out", str(tmp_path / "labels.png")]
-    assert main(["depth", str(tmp_path / "huge.png"), *CAMERA, *out]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "huge.png: expected an image that memory has room for, got 90,000,000,000 pix" in line
-
-
-def test_an_array_whose_header_does_not_end_is_one_line(tmp_path, depth, capsys):
+def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
+    points = depth_to_points(depth[None], INTRINSICS[None])[0].view(-1, 3).numpy()
+    write_cloud(tmp_path / "list.pcd", Cloud(points))
+    write_cloud(tmp_path / "turned.pcd", Cloud(points + 1, grid_shape=(60, 80)))
     np.save(tmp_path / "bad.npy", depth.numpy())
     content = (tmp_path / "bad.npy").read_bytes()
     assert content.count(b"}") == 1
     (tmp_path / "bad.npy").write_bytes(content.replace(b"}", b"("))
-    out = ["--out", str(tmp_path / "labels.png")]
-    assert main(["depth", str(tmp_path / "bad.npy"), *CAMERA, *out]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "bad.npy: expected an array of numbers, got: " in line
+    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 300_000, 300_000)
+    (tmp_path / "huge.png").write_bytes(head + b"\x10\0\0\0\0")
+    (tmp_path / "more").mkdir()
+    twin = tmp_path / "more" / frame.name
+    twin.write_bytes(frame.read_bytes())
+    for arguments, message in (
+        ([frame], "frame.png: expected --intrinsics fx,fy,cx,cy, which depth images"),
+        ([frame, *CAMERA[:2]], "frame.png: expected --depth-scale, which depth images"),
+        ([frame, "--intrinsics", "1,2,3", *CAMERA[2:]], "four numbers without blanks"),
+        ([frame, frame, *CAMERA], "expected a directory for 2 inputs"),
+        ([frame, *CAMERA[:4], "--threads", "0"], "expected --threads from 1 to 1,024, got 0"),
+        ([tmp_path / "list.pcd"], "expected an organised cloud"),
+        ([tmp_path / "turned.pcd"], "expected points of a pinhole camera"),
+        ([tmp_path / "bad.npy", *CAMERA], "bad.npy: expected an array of numbers, got: "),
+        (
+            [tmp_path / "huge.png", *CAMERA],
+            "huge.png: expected an image that memory has room for, got 90,000,000,000 pix",
+        ),
+        ([frame, twin, *CAMERA, "--out", tmp_path / "out"], "another input has the same name"),
+    ):
+        assert message in run("depth", "--out", tmp_path / "a.png", *arguments).error
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_segment_says_where_depth_images_went(tmp_path, frame, run):
+    cloud, out = tmp_path / "scan.pcd", ["--out", tmp_path / "out.npz"]
+    depth = "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
+    image = f"got the image {frame}; use: torchrg depth {frame} {depth}"
+    for arguments, message in (
+        ([frame, *out], image),
+        ([cloud, frame, *CAMERA, *out], image),
+        ([*out, "--preset=classic", frame], image),
+        ([cloud, "--image", *out], f"got --image; use: torchrg depth IMAGES... {depth}"),
+        ([cloud, *CAMERA, *out], f"got --intrinsics; use: torchrg depth IMAGES... {depth}"),
+        ([cloud, "--depth-scale=1000", *out], "got --depth-scale=1000; use: torchrg depth IMAGES"),
+    ):
+        error = run("segment", *arguments).error
+        assert error.startswith("torchrg: segment: expected point clouds, got ")
+        assert message in error
+    # Pictures of segment are no images.
+    for picture in (["--picture", "a.png"], ["--picture=a.png"]):
+        error = run("segment", tmp_path / "no.pcd", "--out", tmp_path, *picture).error
+        assert "no.pcd: no such file" in error

@@ -8,8 +8,6 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from torchrg.scenes import make_room
-
 MODULES = ("json", "numpy", "pickle", "random", "select", "torch")
 """Of the standard library and of others, loaded by interpreters, libraries or Ray as they start."""
 SEGMENT = ("segment", "a.npy", "--out", "../o.npz", "--preset", "classic")
@@ -25,14 +23,12 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, room):
     """A folder of two scans, with modules that say when they are run."""
     for name in ("in", "here"):
         (tmp_path / name).mkdir()
-    for seed, name in enumerate("ab"):
-        points = make_room(num_points=2_000, noise=0.003, seed=seed).points
-        for folder in ("in", "here"):
-            np.save(tmp_path / folder / f"{name}.npy", points)
+        for seed, scan in enumerate("ab"):
+            np.save(tmp_path / name / f"{scan}.npy", room(2_000, seed=seed).points)
     for name in MODULES:
         text = f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})"
         (tmp_path / "here" / f"{name}.py").write_text(text)

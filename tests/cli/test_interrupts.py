@@ -8,8 +8,6 @@ import time
 
 import pytest
 
-from torchrg.cli import main
-
 LINE = "torchrg: interrupted; every file written is complete.\n"
 RUN = """
 import os, runpy, signal, sys
@@ -52,10 +50,8 @@ def check_interrupted(process, told):
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    path = tmp_path_factory.mktemp("room") / "room.npz"
-    assert main(["sample", str(path), "--num-points", "3000"]) == 0
-    return path
+def room(folder_of_clouds):
+    return folder_of_clouds("room.npz", num_points=3000) / "room.npz"
 
 
 @pytest.mark.parametrize(

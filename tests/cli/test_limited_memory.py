@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from torchrg import scratch
-from torchrg.cli import main, segment
+from torchrg.cli import segment
 from torchrg.config import load_config
 from torchrg.io import read_cloud
 from torchrg.neighbors import blocks
 from torchrg.pipeline import segment_planes
-from torchrg.scenes import make_room
 
 LIMIT = "0.515"
 """Gigabytes: what some thousand points take on a disk, and not in memory."""
@@ -20,10 +19,9 @@ ROOM = 40_000
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
+def rooms(room, tmp_path_factory):
     """Two files, with points that are not finite in one."""
-    folder = tmp_path_factory.mktemp("rooms")
-    room = make_room(num_points=ROOM, noise=0.003, seed=1)
+    folder, room = tmp_path_factory.mktemp("rooms"), room(ROOM)
     points = room.points.numpy()
     points[8] = np.nan
     np.savez(folder / "a.npz", points=points[::2], labels=room.labels[::2], other=points[::2, 0])
@@ -31,14 +29,10 @@ def rooms(tmp_path_factory):
     return folder
 
 
-def run(*arguments):
-    return main(["segment", *map(str, arguments)])
-
-
 @pytest.mark.parametrize(
     "flags", [(), ("--voxel", "0.1"), ("--superpoints", "300,50"), ("--layout", "npy")]
 )
-def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, monkeypatch, flags):
+def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, run, monkeypatch, flags):
     monkeypatch.setattr(scratch, "_LEAST_BYTES", 1)
     monkeypatch.setattr(blocks, "BLOCK_SIZE", 10_000)
     name = "out" if "--layout" in flags else "out.npz"
@@ -47,8 +41,8 @@ def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, monke
         files = (rooms / "b.npz", *files[1:])  # without missing points, which layouts refuse
     for folder, limit, said in (("whole", "9", False), ("disk", LIMIT, True)):
         (tmp_path / folder).mkdir()
-        assert run(*files, "--out", tmp_path / folder / name, "--limit-memory", limit) == 0
-        assert ("the largest arrays are on the disk" in capsys.readouterr().out) == said
+        done = run("segment", *files, "--out", tmp_path / folder / name, "--limit-memory", limit)
+        assert ("the largest arrays are on the disk" in done.out) == said
     whole, disk = (
         {path.relative_to(tmp_path / folder): path.read_bytes() for path in files}
         for folder in ("whole", "disk")
@@ -57,9 +51,9 @@ def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, capsys, monke
     assert whole == disk
 
 
-def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
+def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path, run):
     files = (rooms / "a.npz", rooms / "b.npz", "--merge", "--preset", "classic")
-    assert run(*files, "--out", tmp_path / "both.ply") == 0
+    assert run("segment", *files, "--out", tmp_path / "both.ply").code == 0
     both = read_cloud(tmp_path / "both.ply")
     parts = [read_cloud(rooms / name) for name in ("a.npz", "b.npz")]
     points = np.concatenate([part.coordinates for part in parts])
@@ -70,28 +64,20 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("limit", "message"),
     [
-        (
-            ("--limit-memory", "0.1"),
-            r"a.npz: expected --limit-memory of at least 0.50 GB for about 20,000",
-        ),
-        (
-            ("--limit-memory", "-1"),
-            "expected --limit-memory above 0 and at most 1,000,000 GB, got -1",
-        ),
+        ("0.1", r"a.npz: expected --limit-memory of at least 0.50 GB for about 20,000"),
+        ("-1", "expected --limit-memory above 0 and at most 1,000,000 GB, got -1"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(rooms, tmp_path, capsys, flags, message):
-    assert run(rooms / "a.npz", "--out", tmp_path / "x.npz", *flags) == 2
-    assert re.search(message, capsys.readouterr().err)
+def test_what_cannot_be_done_is_one_line(rooms, tmp_path, run, limit, message):
+    done = run("segment", rooms / "a.npz", "--out", tmp_path / "x.npz", "--limit-memory", limit)
+    assert re.search(message, done.error)
     assert not any(tmp_path.iterdir())
 
 
-def test_a_full_disk_is_said_before_the_work(rooms, tmp_path, capsys, monkeypatch):
+def test_a_full_disk_is_said_before_the_work(rooms, tmp_path, run, monkeypatch):
     monkeypatch.setattr("torchrg.io.files.free_space", lambda folder: 1000)
     monkeypatch.setattr(segment, "segment_cloud", None)
-    assert run(rooms / "b.npz", "--out", tmp_path / "x.npz", "--limit-memory", LIMIT) == 2
-    error = capsys.readouterr().err
-    assert re.search(r"expected [\d.]+ MB of free disk for the work, got 0\.0 MB", error)
-    assert error.count("\n") == 1
+    done = run("segment", rooms / "b.npz", "--out", tmp_path / "x.npz", "--limit-memory", LIMIT)
+    assert re.search(r"expected [\d.]+ MB of free disk for the work, got 0\.0 MB", done.error)

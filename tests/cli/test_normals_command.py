@@ -1,5 +1,6 @@
 """``torchrg normals``: what it writes, its settings, and one line for every mistake."""
 
+import functools
 import json
 import sys
 
@@ -7,50 +8,44 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from torchrg.cli import console, main
+from torchrg.cli import loop
 from torchrg.io import read_cloud
 from torchrg.normals import estimate_normals
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    path = tmp_path_factory.mktemp("normals") / "room.npz"
-    assert main(["sample", str(path), "--num-points", "3000"]) == 0
-    return path
+def room_file(folder_of_clouds):
+    return folder_of_clouds("room.npz", num_points=3000) / "room.npz"
 
 
-def run(*arguments):
-    return main(["normals", *map(str, arguments)])
+@pytest.fixture
+def normals(run):
+    """``normals(...)``: the command."""
+    return functools.partial(run, "normals")
 
 
-def error_line(capsys):
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    return captured.err
-
-
-def test_stages_are_shown_on_a_terminal_and_not_in_a_pipe(room, tmp_path, monkeypatch, capsys):
+def test_stages_are_shown_on_a_terminal_alone(room_file, tmp_path, monkeypatch, normals):
     shown = []
 
     class Bar(tqdm):
         def set_postfix_str(self, stage, **_):
             shown.append((stage, bool(self.disable)))
 
-    monkeypatch.setattr(console, "tqdm", Bar)
+    monkeypatch.setattr(loop, "tqdm", Bar)
     flags = ("--method", "pca", "--orient", "consistent")
     for is_terminal in (True, False):
         monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
-        assert run(room, "--out", tmp_path / "normals.npz", *flags) == 0
+        assert normals(room_file, "--out", tmp_path / "normals.npz", *flags).code == 0
     expected = [(stage, off) for off in (False, True) for stage in ("normals", "orientation")]
     assert shown == expected
 
 
-def test_result_holds_what_the_contract_says(room, tmp_path, capsys):
+def test_result_holds_what_the_contract_says(room_file, tmp_path, normals):
     out = tmp_path / "normals.npz"
-    assert run(room, "--out", out, "--method", "paper", "--normals.k", 20) == 0
-    assert "3,000 points" in capsys.readouterr().out
-    fit = estimate_normals(read_cloud(room).points, method="paper", k=20)
-    with np.load(out, allow_pickle=False) as result, np.load(room) as source:
+    done = normals(room_file, "--out", out, "--method", "paper", "--normals.k", 20)
+    assert "3,000 points" in done.out
+    fit = estimate_normals(read_cloud(room_file).points, method="paper", k=20)
+    with np.load(out, allow_pickle=False) as result, np.load(room_file) as source:
         names = {"points", "normals", "curvature", "sharp", "valid", "provenance"}
         assert set(result.files) == names
         assert np.array_equal(result["points"], source["points"])
@@ -61,61 +56,54 @@ def test_result_holds_what_the_contract_says(room, tmp_path, capsys):
     assert provenance["config"]["k"] == 20
 
 
-def test_methods_of_one_stage_have_no_sharp_points(room, tmp_path):
+def test_methods_of_one_stage_have_no_sharp_points(room_file, tmp_path, normals):
     out = tmp_path / "normals.npz"
-    run(room, "--out", out, "--method", "pca")
+    normals(room_file, "--out", out, "--method", "pca")
     with np.load(out) as result:
         assert result["sharp"].dtype == bool
         assert not result["sharp"].any()
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las"])
-def test_other_formats_keep_the_fields_of_the_cloud(room, tmp_path, suffix):
+def test_other_formats_keep_the_fields_of_the_cloud(room_file, tmp_path, suffix, normals):
     out = tmp_path / f"normals{suffix}"
-    assert run(room, "--out", out, "--method", "pca") == 0
+    assert normals(room_file, "--out", out, "--method", "pca").code == 0
     cloud = read_cloud(out)
     assert {"labels", "normals", "curvature"} <= set(cloud.fields)
     assert len(cloud) == 3000
 
 
-def test_orientation_turns_the_normals(room, tmp_path):
+def test_orientation_turns_the_normals(room_file, tmp_path, normals):
     out = tmp_path / "normals.npz"
-    assert run(room, "--out", out, "--method", "pca", "--orient", "+z") == 0
+    assert normals(room_file, "--out", out, "--method", "pca", "--orient", "+z").code == 0
     assert (np.load(out)["normals"][:, 2] >= 0).all()
-    assert run(room, "--out", out, "--method", "pca", "--orient", "interior") == 0
-    with np.load(out) as result, np.load(room) as truth:
+    assert normals(room_file, "--out", out, "--method", "pca", "--orient", "interior").code == 0
+    with np.load(out) as result, np.load(room_file) as truth:
         agreement = (result["normals"] * truth["normals"]).sum(axis=1)
     assert (agreement > 0)[np.abs(agreement) > 0.7].mean() > 0.9
 
 
-def test_viewpoint_is_in_the_coordinates_of_the_input(room, tmp_path):
+def test_viewpoint_is_in_the_coordinates_of_the_input(room_file, tmp_path, normals):
     far = np.array([500_000.0, 4_000_000.0, 100.0])
     place = far + np.array([2.0, 2.0, 1.5])
     moved, out = tmp_path / "moved.npz", tmp_path / "normals.npz"
-    np.savez(moved, points=np.load(room)["points"] + far)
+    np.savez(moved, points=np.load(room_file)["points"] + far)
     viewpoint = ["--orient", "viewpoint", "--viewpoint", *place]
-    assert run(moved, "--out", out, "--method", "pca", *viewpoint) == 0
+    assert normals(moved, "--out", out, "--method", "pca", *viewpoint).code == 0
     with np.load(out) as result:
         towards = ((place - result["points"]) * result["normals"]).sum(axis=1)
     assert (towards > -1e-3).all()
 
 
-def test_several_inputs_go_into_a_directory(room, tmp_path, capsys):
-    bad = tmp_path / "bad.npz"
-    np.savez(bad, other=np.zeros(3))
-    assert run(room, bad, "--out", tmp_path / "out", "--method", "pca") == 3
-    assert "1 of 2 inputs failed" in capsys.readouterr().err
-    assert (tmp_path / "out" / "room.npz").exists()
-
-
-def test_bad_points_stay_in_place(tmp_path, capsys):
+def test_bad_points_stay_in_place(tmp_path, normals):
     points = np.random.default_rng(0).random((60, 3))
     points[:, 2] = 0
     points[7] = np.nan
     np.save(tmp_path / "points.npy", points)
     out = tmp_path / "normals.npz"
-    assert run(tmp_path / "points.npy", "--out", out, "--method", "pca") == 0
-    assert "1 of 60 points have no normal" in error_line(capsys)
+    done = normals(tmp_path / "points.npy", "--out", out, "--method", "pca")
+    assert "1 of 60 points have no normal" in done.err
+    assert done.err.count("\n") == 1
     with np.load(out) as result:
         assert result["valid"].sum() == 59
         assert not result["valid"][7]
@@ -126,10 +114,7 @@ def test_bad_points_stay_in_place(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["--method", "best"],
-            "consensus, got 'best'",
-        ),
+        (["--method", "best"], "consensus, got 'best'"),
         (["--normals.k", "2"], "expected k >= 3, got 2"),
         (
             ["--orient", "viewpoint"],
@@ -140,13 +125,12 @@ def test_bad_points_stay_in_place(tmp_path, capsys):
         (["--chunk-size", "0"], "expected --chunk-size >= 1, got 0"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_two(room, tmp_path, capsys, arguments, message):
-    assert run(room, "--out", tmp_path / "x.npz", *arguments) == 2
-    assert message in error_line(capsys)
+def test_a_mistake_is_one_line_and_exit_code_two(room_file, tmp_path, normals, arguments, message):
+    assert message in normals(room_file, "--out", tmp_path / "x.npz", *arguments).error
     assert not (tmp_path / "x.npz").exists()
 
 
-def test_a_cloud_without_finite_points_is_refused(tmp_path, capsys):
+def test_a_cloud_without_finite_points_is_refused(tmp_path, normals):
     np.save(tmp_path / "points.npy", np.full((5, 3), np.nan))
-    assert run(tmp_path / "points.npy", "--out", tmp_path / "x.npz") == 2
-    assert "expected finite points" in error_line(capsys)
+    done = normals(tmp_path / "points.npy", "--out", tmp_path / "x.npz")
+    assert "expected finite points" in done.error

@@ -14,35 +14,35 @@ from torchrg.pipeline import make_superpoints, segment_planes
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(folder_of_clouds):
     """A room, and its superpoints of all points and of voxels."""
-    place = tmp_path_factory.mktemp("superpoints")
-    room, flags = str(place / "room.npz"), ["--superpoints", "--partition.strengths", "0.3", "3"]
-    assert main(["sample", room, "--num-points", "6000", "--seed", "2"]) == 0
-    assert main(["segment", room, "--out", str(place / "all.npz"), *flags]) == 0
-    assert main(["segment", room, "--out", str(place / "voxel.ply"), *flags, "--voxel", "0.3"]) == 0
+    place = folder_of_clouds("room.npz", num_points=6000)
+    command = ["segment", str(place / "room.npz"), "--superpoints"]
+    command += ["--partition.strengths", "0.3", "3", "--out"]
+    assert main([*command, str(place / "all.npz")]) == 0
+    assert main([*command, str(place / "voxel.ply"), "--voxel", "0.3"]) == 0
     return place
 
 
 def test_the_result_holds_every_level(folder):
     cloud = read_cloud(folder / "room.npz")
     config = SuperpointsConfig(strengths=(0.3, 3.0))
-    found = make_superpoints(cloud.points, segment_planes(cloud.points), config)
+    expected = make_superpoints(cloud.points, segment_planes(cloud.points), config)
     with np.load(folder / "all.npz", allow_pickle=False) as result:
-        assert np.array_equal(result["superpoints"], found.labels)
-        assert np.array_equal(result["superpoints_1"], found.levels[0])
-        assert np.array_equal(result["plane_of_superpoint"], found.plane)
+        assert np.array_equal(result["superpoints"], expected.labels)
+        assert np.array_equal(result["superpoints_1"], expected.levels[0])
+        assert np.array_equal(result["plane_of_superpoint"], expected.plane)
         provenance = json.loads(str(result["provenance"]))
     assert provenance["superpoints"]["strengths"] == [0.3, 3.0]
 
 
 @pytest.mark.parametrize("flags", [["--superpoints", "300,40"], ["--superpoints=300,40"]])
-def test_numbers_of_superpoints_are_asked_for_in_a_word(folder, tmp_path, flags):
-    result = tmp_path / "parts.npz"
-    assert main(["segment", str(folder / "room.npz"), "--out", str(result), *flags]) == 0
-    with np.load(result, allow_pickle=False) as found:
-        numbers = [len(np.unique(found[name])) for name in ("superpoints", "superpoints_1")]
-        provenance = json.loads(str(found["provenance"]))
+def test_numbers_of_superpoints_are_asked_for_in_a_word(folder, tmp_path, run, flags):
+    path = tmp_path / "parts.npz"
+    assert run("segment", folder / "room.npz", "--out", path, *flags).code == 0
+    with np.load(path, allow_pickle=False) as result:
+        numbers = [len(np.unique(result[name])) for name in ("superpoints", "superpoints_1")]
+        provenance = json.loads(str(result["provenance"]))
     assert numbers == [300, 40]
     assert provenance["superpoints"]["counts"] == [300, 40]
 
@@ -56,36 +56,34 @@ def test_every_point_has_the_superpoint_of_its_voxel(folder):
     assert pairs.shape[1] == inverse.max() + 1
 
 
-def test_superpoints_are_scored_when_asked(folder, capsys):
+def test_superpoints_are_scored_when_asked(folder, run):
     result, truth = folder / "all.npz", folder / "room.npz"
-    capsys.readouterr()
     flags = ["--superpoints", "--ignore", "0", "--boundary-distance", "0.2", "--json"]
-    assert main(["score", str(result), str(truth), *flags]) == 0
-    scores = json.loads(capsys.readouterr().out)
+    scores = json.loads(run("score", result, truth, *flags).out)
     ours, theirs = read_cloud(result), read_cloud(truth)
     arrays = ours.fields["superpoints"], theirs.fields["labels"], ours.points
     expected = score_partition(*arrays, ignore=0, boundary_distance=0.2)
     assert scores["superpoints"] == expected._asdict()
-    assert main(["score", str(result), str(truth), "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)) == {"labels", "normals"}
-    assert main(["score", str(truth), str(result), "--superpoints"]) == 2
-    assert "expected superpoints for --superpoints" in capsys.readouterr().err
+    assert set(json.loads(run("score", result, truth, "--json").out)) == {"labels", "normals"}
+    error = run("score", truth, result, "--superpoints").error
+    assert "expected superpoints for --superpoints" in error
 
 
-def test_superpoints_are_drawn(folder, tmp_path):
-    picture = tmp_path / "parts.png"
-    command = ["view", str(folder / "all.npz"), "--out", str(picture), "--width", "200"]
-    assert main([*command, "--color", "superpoint"]) == 0
-    assert picture.stat().st_size > 1000
+def test_superpoints_are_drawn(folder, tmp_path, run):
+    picture = ("--out", tmp_path / "parts.png", "--width", "200")
+    assert run("view", folder / "all.npz", *picture, "--color", "superpoint").code == 0
+    assert (tmp_path / "parts.png").stat().st_size > 1000
 
 
-def test_a_wrong_setting_is_told_in_one_line(folder, tmp_path, capsys):
-    command = ["segment", str(folder / "room.npz"), "--out", str(tmp_path / "x.npz")]
-    assert main([*command, "--superpoints", "--partition.strengths", "3", "1"]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "strengths" in error
-    assert main([*command, "--superpoints", "40,300"]) == 2
-    assert "expected counts" in capsys.readouterr().err
-    assert main([*command, "--partition.min-size", "3"]) == 2
-    assert "expected --superpoints" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--superpoints", "--partition.strengths", "3", "1"], "strengths"),
+        (["--superpoints", "40,300"], "expected counts"),
+        (["--partition.min-size", "3"], "expected --superpoints"),
+    ],
+)
+def test_a_wrong_setting_is_told_in_one_line(folder, tmp_path, run, flags, message):
+    done = run("segment", folder / "room.npz", "--out", tmp_path / "x.npz", *flags)
+    assert done.code == 2
+    assert message in done.error

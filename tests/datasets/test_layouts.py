@@ -19,7 +19,8 @@ from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import ScanNetSource
-from torchrg.cli import console, main
+from torchrg.cli import main
+from torchrg.cli.flags import Layout
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.datasets.scannet import NYU_IDS
@@ -286,7 +287,7 @@ def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path
 
 
 def test_the_command_knows_kind_and_layouts(root, room, tmp_path, capsys):
-    assert set(get_args(console.Layout)) == {"pointcept", *LAYOUTS}
+    assert set(get_args(Layout)) == {"pointcept", *LAYOUTS}
     command = ["convert", "scannet", str(root), str(tmp_path), "--preset", "classic"]
     command += ["--only", f"*{SCAN}", "--layout", "npy", "--superpoint", str(NUM_PARTS)]
     assert main(command) == 0

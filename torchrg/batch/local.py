@@ -33,7 +33,7 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
     Args:
         jobs: The scans to convert.
         workers: Most processes at a time.
-        memory_limit: Bytes that the scans that run may take together.
+        memory_limit: Bytes that all scans at a time may take.
 
     Yields:
         A report of each scan when it ends, and None while there is none, so that progress can be
@@ -186,16 +186,14 @@ def _end_with_parent() -> None:
 @contextlib.contextmanager
 def _environment() -> Iterator[None]:
     """Start processes in the environment for them."""
-    before = {name: os.environ.get(name) for name in CHILD_ENVIRONMENT}
+    before = dict(os.environ)
     os.environ.update(CHILD_ENVIRONMENT)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in CHILD_ENVIRONMENT.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,8 @@ import contextlib
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+
 from torchrg._optional import require
 from torchrg._parallel import CHILD_ENVIRONMENT
 from torchrg.batch.local import BEAT_SECONDS
@@ -26,8 +28,7 @@ def run_ray(
     """Convert scans on Ray, those that take most memory first.
 
     Each asks for one CPU and the memory that it takes, at most what the largest node has, and Ray
-    finds it a place. Inputs and outputs are files that every node sees
-    under the same path, and torchrg is installed on each.
+    finds it a place. Every node sees inputs and outputs under the same path, and has torchrg.
 
     Args:
         jobs: The scans to convert.
@@ -82,8 +83,6 @@ def run_ray(
 
 def _run(job: Job) -> TaskReport:
     """Convert a scan in one thread."""
-    import torch
-
     torch.set_num_threads(1)
     return convert_scan(job)
 

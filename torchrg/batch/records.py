@@ -37,10 +37,7 @@ class Recorded(Protocol):
 
 
 def describe_run(source: Path, settings: Settings) -> Record:
-    """Return what is needed to make a result of one file again, ready for JSON.
-
-    Versions, settings, name and SHA-256 of the input, device.
-    """
+    """Return what is needed to make a result of one file again, as JSON holds it."""
     return {
         "versions": describe_versions(),
         "config": dataclasses.asdict(settings),
@@ -68,11 +65,14 @@ def hash_file(path: Path) -> str:
 def describe_work(
     settings: Settings, options: Record, inputs: Sequence[Path], root: Path
 ) -> Record:
-    """Return what decides the results of inputs below a folder, ready for JSON.
+    """Return what decides the results of inputs below a folder, as JSON holds it.
 
-    Versions, settings, options, and name, size and SHA-256 of each input; raises OSError if one
-    cannot be read.
+    Raises OSError if an input cannot be read.
     """
+    names = (
+        path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+        for path in inputs
+    )
     config = dataclasses.asdict(settings)
     # It never changes a result, and lowering it after running out of memory must cost nothing.
     config.pop("chunk_size", None)
@@ -80,7 +80,9 @@ def describe_work(
         "versions": describe_versions(),
         "config": config,
         "source": options,
-        "inputs": [{"name": _name_below(root, path), **_fingerprint(path)} for path in inputs],
+        "inputs": [
+            {"name": name} | _fingerprint(path) for name, path in zip(names, inputs, strict=True)
+        ],
         "device": "cpu",
     }
 
@@ -165,8 +167,3 @@ def reason_to_convert(job: Recorded) -> str:
 def _fingerprint(path: Path) -> Record:
     """Return the size and the hash of a file."""
     return {"bytes": path.stat().st_size, "sha256": hash_file(path)}
-
-
-def _name_below(root: Path, path: Path) -> str:
-    """Return a path below the root with forward slashes, or the last part of one elsewhere."""
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name

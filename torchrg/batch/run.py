@@ -15,7 +15,7 @@ import filelock
 
 from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
 from torchrg.batch.scans import Job, Scan, Source
-from torchrg.batch.task import Reports, TaskReport
+from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
@@ -31,14 +31,11 @@ PATIENCE_SECONDS = 5.0
 
 @contextlib.contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Have the right to write into a directory, which one command has at a time.
+    """Have the right to write into an existing directory, which one command has at a time.
 
-    The lock is the operating system's own, which goes with the process however that ends; the
-    workers of a command end with it. Over a network it holds where the file system passes it on:
-    see the package filelock.
-
-    Args:
-        folder: The directory; it exists.
+    The lock is the operating system's, which goes with the process however that ends; the workers
+    of a command end with it. Over a network it holds where the file system passes it on: see the
+    package filelock.
 
     Raises:
         FormatError: If another command has the right, or the file of the lock cannot be written.
@@ -67,10 +64,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 class Plan(NamedTuple):
-    """The scans of a batch in natural order, and why each is to be converted, by name.
-
-    A scan that is done is not among the reasons.
-    """
+    """The scans of a batch in natural order, and why each that is not done is to be converted."""
 
     jobs: tuple[Job, ...]
     reasons: dict[str, str]
@@ -87,12 +81,9 @@ class Plan(NamedTuple):
 
 
 def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
-    """Return a job for each scan of a source, in natural order.
+    """Return a job for each scan of a source whose results go to ``out``, in natural order.
 
-    Args:
-        source: The data set.
-        out: Where results go.
-        only: Pattern of the names to convert, as in a shell; ``*`` matches slashes too.
+    With ``only``, for those whose names match a pattern as in a shell; ``*`` matches slashes too.
 
     Raises:
         ConfigError: If no name matches the pattern, or results would go in among the scans.
@@ -105,6 +96,7 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
             f"{out}: expected a directory outside {source.root}, so that no result is read as a "
             "scan; choose another."
         )
+    source.check_results(scans, out)
     _check_names(source.root, scans)
     chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
     if not chosen:
@@ -125,10 +117,7 @@ def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
 
 
 def _check_names(root: Path, scans: Sequence[Scan]) -> None:
-    """Refuse scans whose results would share a folder, or take the place of the batch's own files.
-
-    See :func:`torchrg.datasets.folder.folded_name`.
-    """
+    """Refuse scans whose results would share a folder, or replace files of the batch."""
     batch_files = {folded_name(name): name for name in (REPORT, LOCK)}
     taken: dict[str, str] = {}
     for name in (scan.name for scan in scans):
@@ -155,10 +144,7 @@ def make_plan(
     threads: int = 1,
     on_scan: Callable[[], object] = lambda: None,
 ) -> Plan:
-    """Find out which scans are to be converted.
-
-    A scan is done if its record says what would be done now, from the same bytes, and its results
-    have not changed since: files are read to see, those of scans without a record are not.
+    """Find out which scans are to be converted, by :func:`reason_to_convert`.
 
     So many ``threads`` look at a scan each; ``on_scan`` is called when one has been looked at. With
     ``force``, those that are done are converted too.
@@ -192,8 +178,8 @@ class BatchReport:
         scans: A report of each, in natural order.
         started: When, in seconds since 1970.
         seconds: How long it took.
-        engine: Which one.
-        workers: How many scans at a time at most, None without a bound of ours.
+        engine: The name of the engine.
+        workers: Most scans at a time; None if the engine decides.
         interrupted: Whether it was stopped by Ctrl-C or SIGTERM.
     """
 
@@ -216,7 +202,7 @@ class BatchReport:
     @property
     def complete(self) -> list[TaskReport]:
         """The scans whose results are there."""
-        return [*self.with_status("converted"), *self.with_status("kept")]
+        return [scan for scan in self.scans if scan.status in ("converted", "kept")]
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -241,10 +227,7 @@ class BatchReport:
             "engine": self.engine,
             "workers": self.workers,
             "versions": describe_versions(),
-            "scans_by_status": {
-                status: len(self.with_status(status))
-                for status in ("converted", "kept", "failed", "not started")
-            },
+            "scans_by_status": {name: len(self.with_status(name)) for name in STATUSES},
             "points": points,
             "points_per_second": points / self.seconds if self.seconds else 0.0,
             "points_per_second_of_a_worker": {
@@ -279,17 +262,11 @@ def run_plan(
     workers: int | None,
     on_report: Callable[[TaskReport | None], None] = lambda report: None,
 ) -> BatchReport:
-    """Convert the scans of a plan that are not done on an engine.
+    """Take the reports of an engine that converts a plan, until all are there.
 
     A full disk ends it, as every further scan would fail after its work; so does an interrupt. What
-    is complete then stays, and the next run goes on from there.
-
-    Args:
-        plan: The plan.
-        reports: Those of the engine at work, as scans end, None in between.
-        engine: The name of the engine, to be noted in the report.
-        workers: How many scans it converts at a time.
-        on_report: Called with each report.
+    is complete then stays, and the next run goes on from there. ``engine`` and ``workers`` are
+    noted; ``on_report`` is called with each report.
     """
     started, begin = time.time(), time.perf_counter()
     by_name = {job.name: _kept_report(job) for job in plan.done}

@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,47 +87,53 @@ class Reading:
     notes: tuple[str, ...] = ()
 
 
-class Source(Protocol):
+@dataclass(frozen=True)
+class Source:
     """A data set that can be converted: it lists its scans, and converts one of them.
 
     Sources travel to other processes, so they hold settings and paths but no open files. Those of
     clouds only list and read: see :class:`torchrg.batch.sources.CloudSource`.
+
+    Args:
+        root: The directory of the data set.
+        settings: How to segment.
     """
 
-    @property
-    def root(self) -> Path:
-        """The directory of the data set."""
+    root: Path
+    settings: PipelineConfig | DepthConfig
+    bytes_per_point: ClassVar[int]
+    """Space that the results of one point take, to see beforehand whether the disk has it."""
 
     @property
     def in_place(self) -> bool:
         """Whether results may go into :attr:`root` itself."""
-
-    @property
-    def settings(self) -> PipelineConfig | DepthConfig:
-        """Settings of the segmentation."""
-
-    @property
-    def bytes_per_point(self) -> int:
-        """Space that the results of one point take, to see beforehand whether the disk has it."""
+        return False
 
     def describe(self) -> Record:
         """Return the kind of the source and what else decides results, for JSON."""
+        raise NotImplementedError
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
+        raise NotImplementedError
 
     def convert(self, scan: Scan, folder: Path, begin: Begin) -> TaskReport:
         """Read a scan, segment it, and write its results, each file whole or not at all.
 
         The folder exists; ``begin`` is to be called with the name of each stage when it starts.
         """
+        raise NotImplementedError
+
+    def check_results(self, scans: Sequence[Scan], out: Path) -> None:
+        """Raise FormatError if files of the results would replace those of others."""
+
+    def write_lists(self, out: Path, mark: str) -> None:
+        """Write what results have for the data set as a whole, from all scans in ``out``."""
 
 
 @dataclass(frozen=True)
 class Job:
     """The task of converting one scan, which any process can do.
-
-    It holds settings and paths but no open files.
 
     Attributes:
         source: The data set.
@@ -239,11 +245,11 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
             f"{cloud.source}: expected finite points, got none in {num_bad:,} points; those beyond "
             f"{FARTHEST:g} count as missing: use another unit, or look where they come from."
         )
-    notes: tuple[str, ...] = ()
+    notes = []
     if num_bad:
-        notes = (
+        notes.append(
             f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "
-            "stay in place, unlabelled",
+            "stay in place, unlabelled"
         )
     finite = cloud.coordinates[cloud.finite] if num_bad else cloud.coordinates
     low, high = (end.astype(np.float64) for end in (finite.min(axis=0), finite.max(axis=0)))
@@ -251,12 +257,13 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
     low, high = np.quantile(finite[:: max(len(cloud) // _LOOKED_AT, 1)], _MIDDLE, axis=0)
     width = float((high - low).max())
     if width > 0 and size > _FAR_OFF * width:
-        return (
-            *notes,
+        notes.append(
             f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which costs "
-            "the others their precision; remove those that are none",
+            "the others their precision; remove those that are none"
         )
-    return (*notes, cloud.precision_note) if cloud.precision_note else notes
+    elif cloud.precision_note:
+        notes.append(cloud.precision_note)
+    return tuple(notes)
 
 
 def segment_cloud(
@@ -347,8 +354,9 @@ def write_scan(
     folder: Path,
     reading: Reading,
     seg: Segmentation,
-    superpoint: NDArray[np.int32] | None,
+    superpoints: Superpoints | None,
     *,
+    level: int = 0,
     place: str | None = None,
 ) -> list[str]:
     """Write a cloud, its planes and its superpoints into the folder of its name, in a layout.
@@ -360,13 +368,17 @@ def write_scan(
         folder: The folder of that name in the output directory.
         reading: The cloud.
         seg: Its planes.
-        superpoint: Superpoint of each point, shape ``(N,)``.
+        superpoints: Its superpoints.
+        level: Which of their levels is written.
         place: Where the scan is in its data set, which some layouts keep. Default: its name.
 
     Returns:
         Names of the files, as paths from the folder.
     """
     cloud, arrays = reading.cloud, reading.arrays
+    superpoint = None
+    if superpoints is not None:
+        superpoint = [*superpoints.by_level().values()][level]
     if layout == "pointcept" or superpoint is None:
         origin = cloud.origin.tolist()
         if "coord" in arrays:

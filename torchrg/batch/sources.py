@@ -6,7 +6,7 @@ and a test.
 
 import dataclasses
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -19,6 +19,7 @@ from torchrg.batch.records import Record
 from torchrg.batch.scans import (
     Reading,
     Scan,
+    Source,
     check_finite,
     check_stems,
     note_on_origin,
@@ -59,14 +60,12 @@ TURNING = ("interior", "up")
 
 
 @dataclass(frozen=True)
-class CloudSource:
+class CloudSource(Source):
     """What sources of clouds share: how a cloud is converted, what is written, in which layout.
 
     A source of its own lists scans and reads one of them.
 
     Args:
-        root: The directory of the data set.
-        settings: How to segment.
         superpoint: Whether superpoints are written too; every layout but ``"pointcept"`` has them.
         layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
         partition: How superpoints are made.
@@ -74,7 +73,6 @@ class CloudSource:
         orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
     """
 
-    root: Path
     settings: PipelineConfig
     _: KW_ONLY
     superpoint: bool = False
@@ -88,11 +86,6 @@ class CloudSource:
     """The name of the kind of source."""
     dataset: ClassVar[str] = "ScanNet"
     """The data set whose layouts it has; clouds without labels are written as those of ScanNet."""
-
-    @property
-    def in_place(self) -> bool:
-        """Whether results go into the folders of the clouds."""
-        return False
 
     def read(self, scan: Scan) -> Reading:
         """Return what is read of a scan."""
@@ -109,11 +102,9 @@ class CloudSource:
         seg, superpoints = segment_cloud(
             cloud, self.settings, orient=self.orient, partition=partition, begin=begin
         )
-        level = None if superpoints is None else [*superpoints.by_level().values()][self.level]
         begin("write")
-        files = write_scan(
-            self.layout, scan.name, folder, reading, seg, level, place=_place_of(scan)
-        )
+        what, place = (reading, seg, superpoints), _place_of(scan)
+        files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)
         return TaskReport(
             scan.name,
             "converted",
@@ -136,13 +127,9 @@ class CloudSource:
             changed |= {"partition": partition, "level": self.level}
         return changed
 
-    def checked(self, scans: list[Scan]) -> list[Scan]:
-        """Return scans if none of them would write into the files of another."""
+    def check_results(self, scans: Sequence[Scan], out: Path) -> None:
+        """Raise FormatError if a scan would write into files of another, or lists into others."""
         check_stems(self.layout, {scan.name: _place_of(scan) for scan in scans})
-        return scans
-
-    def check_lists(self, out: Path) -> None:
-        """Raise FormatError if :meth:`write_lists` would replace files from elsewhere."""
         check_lists(self.layout, self.dataset, out)
 
     def write_lists(self, out: Path, mark: str) -> None:
@@ -200,7 +187,7 @@ class FolderSource(CloudSource):
             raise ConfigError("expected text or .npy for --columns, got files that name their own.")
         for scene in scenes:
             check_layout(self.layout, _dataset({file.stem for file in scene.files}), scene.name)
-        return self.checked([self._scan(scene) for scene in scenes])
+        return [self._scan(scene) for scene in scenes]
 
     def _scan(self, scene: SceneFiles) -> Scan:
         """Return a cloud with its input files."""
@@ -271,9 +258,7 @@ class S3DISSource(CloudSource):
             )
         require("pyarrow", extra="s3dis", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
-        return self.checked(
-            [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
-        )
+        return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
     def read(self, scan: Scan) -> Reading:
         """Read a room."""
@@ -304,7 +289,7 @@ class ScanNetSource(CloudSource):
                 # Programs that read superpoints of it have scans where the release has data.
                 place = f"scans/{mesh.parent.parent.name}/scans"
             scans.append(Scan(name, files, estimate_points(mesh), place))
-        return self.checked(scans)
+        return scans
 
     def read(self, scan: Scan) -> Reading:
         """Read a scan."""
@@ -340,7 +325,7 @@ def _estimate(scene: SceneFiles) -> int:
 
 
 @dataclass(frozen=True)
-class RGBDSource:
+class RGBDSource(Source):
     """The depth frames of a folder.
 
     Files of each frame, all of its height and width: ``coord`` ``(H, W, 3)``, ``normal``
@@ -349,9 +334,7 @@ class RGBDSource:
     and plane -1.
 
     Args:
-        root: The folder.
-        settings: How to segment.
-        layout: Its shape; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
+        layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
         intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
         depth_scale: Stored value of one metre. Default: the layout's.
         compile: Whether to run kernels compiled.
@@ -359,14 +342,12 @@ class RGBDSource:
             ``"up"``.
     """
 
-    root: Path
     settings: DepthConfig
     layout: str
     intrinsics: tuple[float, float, float, float] | None = None
     depth_scale: float | None = None
     compile: bool = False
     orient: CloudOrientation = "auto"
-    in_place: ClassVar[bool] = False
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
     def describe(self) -> Record:

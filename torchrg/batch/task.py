@@ -7,12 +7,15 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError
 from torchrg.io.files import is_disk_full
 
+Status = Literal["converted", "kept", "failed", "not started"]
+"""What became of a task: done now, or by an earlier run, or not."""
+STATUSES: tuple[Status, ...] = get_args(Status)
 Begin = Callable[[str], None]
 """Called with the name of each stage of the work when it starts."""
 
@@ -39,7 +42,7 @@ class TaskReport:
     """
 
     name: str
-    status: Literal["converted", "kept", "failed", "not started"]
+    status: Status
     num_points: int = 0
     num_regions: int = 0
     files: tuple[str, ...] = ()

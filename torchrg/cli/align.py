@@ -12,9 +12,11 @@ from torch import Tensor
 
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
-from torchrg.cli import console
+from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.loop import run_each
+from torchrg.cli.ending import say, warn, warnings_as_lines
+from torchrg.cli.loop import note_input, run_each, stage_bar
+from torchrg.cli.places import check_apart, output_paths
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
@@ -35,9 +37,8 @@ class Arguments:
         torchrg align scan.ply --out upright.ply --up 0 -1 0
     """
 
-    inputs: console.CloudsFlag
-    out: Path
-    """File to write, its format by suffix; for several inputs a directory."""
+    inputs: flags.CloudsFlag
+    out: flags.OutFlag
     matrix: Path | None = None
     """File for the motion of the scan, of one input: .npy holds it as 4 x 4 numbers, .txt as the
     line axisAlignment of ScanNet."""
@@ -45,22 +46,21 @@ class Arguments:
     """Write labels, normals, curvature and the table of planes too, as torchrg segment does."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction that points up in the input, to within 30 degrees."""
-    threads: int | None = None
-    """Number of threads. Default: as torch decides, usually one for each core."""
-    columns: console.ColumnsFlag = None
-    settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
+    threads: flags.ThreadsFlag = None
+    columns: flags.ColumnsFlag = None
+    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
-    start = {"settings": console.PlaneSettings.asked_for(argv)}
+    start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg align", default=start)
     if not any(arguments.up):
         raise ConfigError(f"expected --up to be a direction, got {arguments.up}.")
-    console.use_threads(arguments.threads)
-    console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    outputs = console.output_paths(arguments.inputs, arguments.out)
-    console.check_apart(outputs, arguments.inputs)
+    flags.use_threads(arguments.threads)
+    flags.check_columns(arguments.columns, arguments.inputs)
+    outputs = output_paths(arguments.inputs, arguments.out)
+    check_apart(outputs, arguments.inputs)
     if arguments.matrix is not None:
         _check_matrix(arguments, arguments.matrix, outputs)
     names = list(map(str, arguments.inputs))
@@ -73,39 +73,38 @@ def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None
         raise ConfigError(f"expected one input with --matrix, got {len(arguments.inputs)}.")
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
-    console.check_apart([path], [*arguments.inputs, *outputs])
+    check_apart([path], [*arguments.inputs, *outputs])
     check_place(path)
 
 
 def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Align one file."""
     begin = time.perf_counter()
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    cloud = read_cloud(source, columns=names.of(source))
-    console.note_input(f"{source}", cloud, target, RESULT_FIELDS if arguments.segment else ())
+    cloud = read_cloud(source, columns=flags.columns_of(source, arguments.columns))
+    note_input(f"{source}", cloud, target, RESULT_FIELDS if arguments.segment else ())
     for note in check_finite(cloud):
-        console.warn(f"{source}: {note}.")
+        warn(f"{source}: {note}.")
     check_output(target, dataclasses.replace(cloud, header={}))
     settings = arguments.settings.resolved
-    with console.stage_bar(source.name, ("neighbors", "normals", "regions", "planes")) as advance:
+    with stage_bar(source.name, ("neighbors", "normals", "regions", "planes")) as advance:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:
-        with console.warnings_as_lines():
+        with warnings_as_lines():
             motion = align_axes(seg, up=arguments.up)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    # That of the coordinates in the file; points are about their origin.
+    # The motion of the coordinates in the file; points are about their origin.
     whole = motion.clone()
     whole[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
     moved = move_cloud(cloud, whole)
-    found = _move(seg, motion, moved.origin) if arguments.segment else None
+    moved_seg = _move(seg, motion, moved.origin) if arguments.segment else None
     provenance = describe_run(source, settings) | {"motion": whole.tolist()}
-    write_cloud(target, moved, found, provenance=provenance)
+    write_cloud(target, moved, moved_seg, provenance=provenance)
     if arguments.matrix is not None:
         _write_matrix(arguments.matrix, whole.numpy())
     tilt, turn = _angles(whole)
     seconds = time.perf_counter() - begin
-    console.say(
+    say(
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
         f"{seconds:.1f} s -> {target}"
     )

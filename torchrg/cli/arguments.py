@@ -1,8 +1,9 @@
 """Arguments of commands from the fields of dataclasses: their parser, and what ``--help`` prints.
 
-A field is a flag, and its docstring says what the flag does. A field that is a dataclass is a part,
-whose flags are called ``--part.field``. ``--help`` tells what is needed, what is often wanted, the
-rest by part, and examples.
+A field is a flag, unless its metadata say otherwise (``torchrg.config.NO_FLAG``), and its docstring
+says what the flag does. A field that is a dataclass is a part, whose flags are called
+``--part.field``. ``--help`` tells what is needed, what is often wanted, the rest by part, and
+examples.
 """
 
 import argparse
@@ -277,6 +278,8 @@ def list_flags(
     """
     texts, hints = _texts(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
+        if not field.metadata.get("is_flag", True):
+            continue
         hint, argument = hints[field.name], Argument()
         if typing.get_origin(hint) is typing.Annotated:
             hint, argument = typing.get_args(hint)

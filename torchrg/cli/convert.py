@@ -1,7 +1,6 @@
 """``torchrg convert``: a whole data set, scan by scan, on one machine or on a Ray cluster."""
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -24,18 +23,26 @@ from torchrg.batch.run import (
 )
 from torchrg.batch.scans import Job, Source, mark_of
 from torchrg.batch.sources import (
-    CloudSource,
     FolderSource,
     RGBDSource,
     S3DISSource,
     ScanNetSource,
     find_areas,
 )
-from torchrg.batch.task import Reports, TaskReport
-from torchrg.cli import console
+from torchrg.batch.task import Reports
+from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import INTERRUPTED, SOME_FAILED, fail
+from torchrg.cli.ending import (
+    INTERRUPTED,
+    SOME_FAILED,
+    USAGE_ERROR,
+    fail,
+    say,
+    warn,
+    warnings_as_lines,
+)
 from torchrg.cli.loop import Progress, tell_failure
+from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
@@ -43,9 +50,6 @@ from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import read_result
-
-MOST_ROWS = 300
-"""Most scans of a batch that is printed scan by scan."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class Arguments:
         """Return the data set, both paths absolute."""
         raise NotImplementedError
 
-    def prepared(self) -> Self:
+    def with_kernels(self) -> Self:
         """Compile the kernels that are needed, if they are asked for."""
         raise NotImplementedError
 
@@ -99,10 +103,10 @@ class CloudArguments(Arguments):
     superpoint: bool = False
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
     in each level: --superpoint 1000,300."""
-    orient: console.OrientFlag = "auto"
+    orient: flags.OrientFlag = "auto"
     level: int = 0
     """Level of the superpoints that is written; 0 is the finest."""
-    layout: console.Layout = "pointcept"
+    layout: flags.Layout = "pointcept"
     """Files that are written: a folder for each scan (pointcept), bare arrays (npy), or superpoints
     with points, classes and objects where other programs look for them. These are OneFormer3D,
     UniDet3D and ESAM (mmdet3d), SPFormer (spformer), ISBNet, Open3DIS and SphericalMask (isbnet),
@@ -110,7 +114,7 @@ class CloudArguments(Arguments):
     and, of annotated scans, aggregation.json, to replace those of ScanNet; superpoints end at
     objects there. S3DIS has neither scannet nor spformer, ScanNet++ no other with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
-    settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
+    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
     usual_preset: ClassVar[str] = DEFAULT_PRESET
     """Settings to start from where no flag names any."""
 
@@ -120,9 +124,11 @@ class CloudArguments(Arguments):
         names = ("superpoint", "layout", "partition", "level", "orient")
         return {name: getattr(self, name) for name in names}
 
-    def prepared(self) -> Self:
+    def with_kernels(self) -> Self:
         """Compile the kernels of clouds if the settings ask for them."""
-        return dataclasses.replace(self, settings=console.prepared(self.settings))
+        resolved = flags.with_kernels(self.settings.resolved)
+        settings = dataclasses.replace(self.settings, resolved=resolved)
+        return dataclasses.replace(self, settings=settings)
 
 
 @dataclass(frozen=True)
@@ -138,21 +144,16 @@ class FolderArguments(CloudArguments):
         torchrg convert folder scans results --workers 4 --pages pages
     """
 
-    columns: console.ColumnsFlag = None
+    columns: flags.ColumnsFlag = None
     suffixes: tuple[str, ...] = tuple(FORMATS)
     """Suffixes of the files that are clouds, by default all that torchrg segment reads. Name fewer
     where two files differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
-        names = console.ColumnNames.parse(self.columns, None).names
+        names, settings = flags.split_columns(self.columns), self.settings.resolved
         return FolderSource(
-            root,
-            self.settings.resolved,
-            out,
-            columns=names,
-            suffixes=self.suffixes,
-            **self.output,
+            root, settings, out, columns=names, suffixes=self.suffixes, **self.output
         )
 
 
@@ -219,23 +220,21 @@ class RGBDArguments(Arguments):
     """Stored value of one metre. Default: that of the layout; images have none."""
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
-    orient: console.ImageOrientFlag = "auto"
-    compile: console.CompileFlag = False
+    orient: flags.ImageOrientFlag = "auto"
+    compile: flags.CompileFlag = False
     unit: ClassVar[str] = "frame"
     seconds_per_million: ClassVar[tuple[float, str]] = (3.0, "pixels")
     """As that of clouds, by the 0.9 s of a frame of 640 x 480 pixels in README.md."""
 
-    def prepared(self) -> Self:
+    def with_kernels(self) -> Self:
         """Compile the kernels of depth images if they are asked for."""
-        return dataclasses.replace(self, compile=console.prepared_for_depth(self.compile))
+        return dataclasses.replace(self, compile=flags.with_depth_kernels(self.compile))
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
-        intrinsics = None if self.intrinsics is None else console.parse_intrinsics(self.intrinsics)
-        return RGBDSource(
-            *(root, self.depth, self.layout, intrinsics, self.depth_scale, self.compile),
-            orient=self.orient,
-        )
+        camera = flags.parse_intrinsics(self.intrinsics)
+        options = (self.layout, camera, self.depth_scale, self.compile, self.orient)
+        return RGBDSource(root, self.depth, *options)
 
 
 KINDS: dict[str, type[Arguments]] = {
@@ -264,25 +263,25 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, check the plan, convert, and report."""
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
-        raise SystemExit(0 if argv else console.USAGE_ERROR)
-    kind, *rest = console.spell_counts(argv, "--superpoint")
+        raise SystemExit(0 if argv else USAGE_ERROR)
+    kind, *rest = flags.spell_counts(argv, "--superpoint")
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
     if issubclass(chosen, CloudArguments):
-        start["settings"] = console.PlaneSettings.asked_for(rest, chosen.usual_preset)
+        start["settings"] = flags.PlaneSettings.asked_for(rest, chosen.usual_preset)
     arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
-    arguments = arguments if arguments.dry_run else arguments.prepared()
+    arguments = arguments if arguments.dry_run else arguments.with_kernels()
     root, out = arguments.root.resolve(), arguments.out.resolve()
-    with console.warnings_as_lines():
+    with warnings_as_lines():
         source = arguments.source(root, out)
         jobs = list_jobs(source, out, only=arguments.only)
-    if isinstance(source, CloudSource):
-        source.check_lists(out)
     if arguments.dry_run:
-        plan = _look_at(jobs, arguments)
-        print(format_plan(plan), _say_costs(plan, out, arguments), sep="\n")
+        plan, workers = _look_at(jobs, arguments), arguments.workers or num_cores()
+        resources = (workers, _memory_limit(arguments), free_space(out))
+        costs = format_costs(plan, *resources, arguments.seconds_per_million)
+        print(format_plan(plan), costs, sep="\n")
         check_room(plan)
         return 0
     make_folder(out)
@@ -299,13 +298,13 @@ def _check(arguments: Arguments) -> None:
     """Refuse values that are out of range, or do not go together."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
-    console.check_memory(arguments.limit_memory)
+    flags.bytes_of_limit(arguments.limit_memory)
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address together with --engine ray.")
     if _pages_of(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
-        console.check_level(arguments.level, arguments.partition)
+        flags.check_level(arguments.level, arguments.partition)
         if arguments.orient == "viewpoint" and not isinstance(arguments, FolderArguments):
             raise ConfigError(
                 "expected --orient auto, interior, up or none, as this data set names no places of "
@@ -333,10 +332,10 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
 def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
     check_room(plan)
-    jobs, (workers, limit) = plan.to_convert, _workers_and_memory(arguments)
+    jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
     for job in jobs:
         if job.memory > limit:
-            console.warn(
+            warn(
                 f"{job.name}: about {job.scan.num_points:,} points may need more memory than "
                 f"{limit / 1e9:.1f} GB; it runs alone."
             )
@@ -355,17 +354,22 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
         shown = Progress(bar, sizes, unit=arguments.unit)
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     code = _finish(report, out, unit=arguments.unit)
-    if isinstance(source := plan.jobs[0].source, CloudSource) and not report.disk_full:
-        source.write_lists(out, mark_of(REPORT))
+    if not report.disk_full:
+        plan.jobs[0].source.write_lists(out, mark_of(REPORT))
     pages = _pages_of(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
     return code
 
 
+def _memory_limit(arguments: Arguments) -> int:
+    """Return the bytes that all scans at a time may take."""
+    return flags.bytes_of_limit(arguments.limit_memory, spare_memory())
+
+
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     """Write picture and page of each scan that is done, and the index of all of them."""
-    done = {scan.name: scan for scan in report.scans if scan.status in ("converted", "kept")}
+    done = {scan.name: scan for scan in report.complete}
     jobs = [job for job in plan.jobs if job.name in done]
     entries = []
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
@@ -374,8 +378,8 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
         try:
             entries.append(draw_entry(folder, name, read_result(job.folder), words=words))
         except (TorchrgError, OSError) as error:
-            console.warn(f"{name}: no page: {error}")
-    console.say(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
+            warn(f"{name}: no page: {error}")
+    say(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
 
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
@@ -391,7 +395,7 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     except FormatError as error:
         if not report.disk_full:
             raise
-        console.warn(str(error))
+        warn(str(error))
     state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
     again = "The same command goes on from here."
     if report.disk_full:
@@ -402,99 +406,5 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     if len(report.complete) < len(report.scans):
         told = f"{state}, {out / REPORT} says more."
         return fail(told, code=SOME_FAILED)
-    console.say(f"{state} -> {out}")
+    say(f"{state} -> {out}")
     return 0
-
-
-def format_plan(plan: Plan) -> str:
-    """Return what a plan would do: a row for each scan that is to be converted."""
-    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
-    if not plan.to_convert:
-        return sums
-    rows = [
-        [job.name, plan.reasons[job.name], f"{job.scan.num_points:,}"] for job in plan.to_convert
-    ]
-    return "\n".join([console.format_table(["scan", "why", "points (about)"], rows), sums])
-
-
-def _say_costs(plan: Plan, out: Path, arguments: Arguments) -> str:
-    """Return what a plan would take, in words, or that there is nothing to do."""
-    jobs = plan.to_convert
-    if not jobs:
-        return "nothing to do"
-    workers, limit = _workers_and_memory(arguments)
-    workers, memory, at_once = workers or num_cores(), 0, 0
-    for needed in sorted((job.memory for job in jobs), reverse=True)[:workers]:
-        if at_once and memory + needed > limit:
-            break
-        memory, at_once = memory + needed, at_once + 1
-    source, num_points = jobs[0].source, sum(job.scan.num_points for job in jobs)
-    cost, of_what = arguments.seconds_per_million
-    hours = cost * num_points / 1e6 / 3600
-    return (
-        f"disk: about {source.bytes_per_point * num_points / 1e9:,.3f} GB of "
-        f"{free_space(out) / 1e9:,.1f} that are free\n"
-        f"memory: about {memory / 1e9:,.1f} GB for {at_once} at a time, within {limit / 1e9:,.1f}\n"
-        f"time: about {hours / at_once:,.2f} hours, at {cost:g} s of a core for a million {of_what}"
-    )
-
-
-def _workers_and_memory(arguments: Arguments) -> tuple[int | None, int]:
-    """Return how many scans may run at a time, and the bytes that they may take."""
-    given = arguments.limit_memory
-    return arguments.workers, spare_memory() if given is None else int(given * 1e9)
-
-
-def format_report(report: BatchReport, *, unit: str = "scan") -> str:
-    """Return a report as text: a row for each scan, notes below, then the sums.
-
-    With more than :data:`MOST_ROWS` scans, only failures have a row. ``unit`` is what a scan is
-    called where its number in a second counts.
-    """
-    stages = list(report.stage_seconds)
-    shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
-    head = ["scan", "status", "points", "planes", *stages, "GB"]
-    rows = [_row(scan, stages) for scan in shown]
-    totals = report.with_status("converted")
-    rows.append(
-        [
-            "all",
-            f"{len(totals)} converted",
-            f"{report.num_points:,}",
-            f"{sum(scan.num_regions for scan in totals):,}",
-            *(f"{seconds:.1f}" for seconds in report.stage_seconds.values()),
-            f"{max((scan.peak_memory for scan in totals), default=0) / 1e9:.2f}",
-        ]
-    )
-    notes = [
-        console.printable(f"{scan.name}: {note}")
-        for scan in shown
-        for note in (
-            *(f"repaired: {text}" for text in scan.repairs),
-            *scan.warnings,
-            *([f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []),
-        )
-        if scan.status != "failed"
-    ]
-    points, scans = (
-        number / report.seconds if report.seconds else 0.0
-        for number in (report.num_points, len(totals))
-    )
-    speed = (
-        f"{report.num_points:,} points in {report.seconds:,.1f} s: {points:,.0f} points, "
-        f"{scans:,.2f} {unit}s a second"
-    )
-    return "\n".join([console.format_table(head, rows), *notes, speed])
-
-
-def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:
-    """Return the cells of a scan."""
-    points = f"{scan.num_points:,}" if scan.num_points else ""
-    return [
-        scan.name,
-        scan.status,
-        points,
-        f"{scan.num_regions:,}" if points else "",
-        *(f"{scan.seconds[stage]:.1f}" if stage in scan.seconds else "" for stage in stages),
-        f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else "",
-    ]

@@ -11,9 +11,11 @@ from torch import Tensor
 from torchrg.batch.memory import available_memory
 from torchrg.batch.records import describe_run
 from torchrg.batch.sources import orient_image
-from torchrg.cli import console
+from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.loop import run_each
+from torchrg.cli.ending import say, warn
+from torchrg.cli.loop import note_input, run_each
+from torchrg.cli.places import check_apart, output_paths, picture_paths
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
 from torchrg.depth import (
     DepthConfig,
@@ -64,38 +66,35 @@ class Arguments:
     labels that are written as .png, with _planes in its name."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
-    orient: console.ImageOrientFlag = "auto"
-    compile: console.CompileFlag = False
-    threads: int | None = None
-    """Number of threads. Default: as torch decides, usually one for each core."""
+    orient: flags.ImageOrientFlag = "auto"
+    compile: flags.CompileFlag = False
+    threads: flags.ThreadsFlag = None
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each image and write its result."""
     arguments = parse(Arguments, argv, prog="torchrg depth")
-    console.use_threads(arguments.threads)
+    flags.use_threads(arguments.threads)
     inputs = arguments.inputs
     _check_inputs(arguments)
-    targets = console.output_paths(inputs, arguments.out, suffix=".png")
-    pictures = [
-        picture or (target.with_name(f"{target.stem}_planes.png") if _is_png(target) else None)
-        for target, picture in zip(
-            targets,
-            console.picture_paths(targets, arguments.picture, suffixes=(".png",)),
-            strict=True,
-        )
-    ]
+    targets = output_paths(inputs, arguments.out, suffix=".png")
+    pictures = picture_paths(targets, arguments.picture, suffixes=(".png",))
+    if arguments.picture is None:
+        pictures = [
+            target.with_name(f"{target.stem}_planes.png") if _is_png(target) else None
+            for target in targets
+        ]
     drawn = [picture for picture in pictures if picture is not None]
-    console.check_apart([*targets, *drawn], inputs)
+    check_apart([*targets, *drawn], inputs)
     for picture in drawn:
         check_place(picture)
-    arguments = replace(arguments, compile=console.prepared_for_depth(arguments.compile))
+    arguments = replace(arguments, compile=flags.with_depth_kernels(arguments.compile))
     return run_each(_label, arguments, list(map(str, inputs)), inputs, targets, pictures)
 
 
 def _check_inputs(arguments: Arguments) -> None:
     """Refuse folders, and depth images without a camera and a scale, before any is read."""
-    camera = _camera_of(arguments)
+    camera = flags.parse_intrinsics(arguments.intrinsics)
     for path in arguments.inputs:
         if path.is_dir():
             raise ConfigError(
@@ -107,12 +106,6 @@ def _check_inputs(arguments: Arguments) -> None:
             raise ConfigError(f"{path}: expected {flag}, which depth images do not hold; pass it.")
 
 
-def _camera_of(arguments: Arguments) -> tuple[float, float, float, float] | None:
-    """Return the camera that is given, None for one that the points tell."""
-    text = arguments.intrinsics
-    return None if text is None else console.parse_intrinsics(text)
-
-
 def _label(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
     """Label an image, write its result, and print one line about it."""
     begin = time.perf_counter()
@@ -120,20 +113,16 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
     cloud, depth, camera = _read_frame(arguments, source)
     if not _is_png(target):
         check_output(target, cloud)
+    note_input(f"{source}", cloud, target, () if _is_png(target) else RESULT_FIELDS)
     # Results are about the cloud's origin.
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.from_numpy(cloud.origin)
     seg = segment_depth(depth, camera, arguments.depth, pose=pose, compile=arguments.compile)
     points = cloud.points.view(*depth.shape, 3)
     seg = orient_image(seg, points, arguments.orient)
-    if _is_png(target):
-        for note in cloud.notes:
-            console.warn(f"{source}: {note}.")
-    else:
-        console.note_input(str(source), cloud, target, RESULT_FIELDS)
     num_planes = len(seg.planes.count)
     if num_planes == 0:
-        console.warn(f"{source}: no plane found: no region is large enough.")
+        warn(f"{source}: no plane found: no region is large enough.")
     if picture is not None:
         colors = color_planes(seg.labels, _thinned(points))
         write_png(picture, colors * (depth > 0)[..., None])
@@ -143,7 +132,7 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
         _write_cloud(arguments, source, target, cloud, seg)
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
-    console.say(
+    say(
         f"{source}: {width} x {height} pixels, {num_seen:,} with depth, {num_planes:,} planes, "
         f"{share:.1f} % of these labelled, {time.perf_counter() - begin:.1f} s -> {target}"
     )
@@ -174,7 +163,7 @@ def _write_cloud(
     arguments: Arguments, source: Path, target: Path, cloud: Cloud, seg: Segmentation
 ) -> None:
     """Write an image as a cloud with its results."""
-    camera = _camera_of(arguments)
+    camera = flags.parse_intrinsics(arguments.intrinsics)
     provenance = describe_run(source, arguments.depth) | {
         "config": {"depth": asdict(arguments.depth)},
         "intrinsics": camera and ",".join(f"{value:.15g}" for value in camera),
@@ -197,7 +186,7 @@ def _thinned(points: Tensor) -> Tensor:
 
 def _read_frame(arguments: Arguments, path: Path) -> tuple[Cloud, Tensor, Tensor]:
     """Return the cloud in camera coordinates, its depth ``(H, W)``, and the camera matrix."""
-    numbers = _camera_of(arguments)
+    numbers = flags.parse_intrinsics(arguments.intrinsics)
     camera = None if numbers is None else make_intrinsics(*numbers)
     if camera is None or arguments.depth_scale is None or not _is_depth(path):
         return _read_organised(path, camera)

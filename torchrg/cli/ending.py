@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
@@ -46,6 +47,16 @@ def fail(message: str, *, code: int = USAGE_ERROR) -> int:
 def warn(message: str) -> None:
     """Print one warning line on stderr."""
     fail(f"warning: {message}")
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Print warnings as single lines."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    for warning in caught:
+        warn(" ".join(str(warning.message).split()))
 
 
 def end_at_once(*_: object) -> NoReturn:

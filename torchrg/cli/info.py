@@ -7,7 +7,8 @@ from typing import Annotated
 import numpy as np
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.console import ColumnNames, ColumnsFlag, say
+from torchrg.cli.ending import say
+from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
 from torchrg.io import read_cloud
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.structures import Cloud
@@ -34,8 +35,8 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments and print what the file holds."""
     arguments = parse(Arguments, argv, prog="torchrg info")
-    names = ColumnNames.parse(arguments.columns, [arguments.file])
-    cloud = read_cloud(arguments.file, columns=names.of(arguments.file))
+    check_columns(arguments.columns, [arguments.file])
+    cloud = read_cloud(arguments.file, columns=columns_of(arguments.file, arguments.columns))
     for name, value in describe_cloud(cloud).items():
         say(f"{name:<12}{value}")
     for note in filter(None, (*cloud.notes, cloud.precision_note)):

@@ -1,12 +1,18 @@
-"""The loop of every command over several inputs: progress, what failed, and the exit code."""
+"""The loop of every command over several inputs: progress, notes, failures, and the exit code."""
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from tqdm import tqdm
 
 from torchrg.batch.task import Begin, TaskReport, report_on
-from torchrg.cli.ending import SOME_FAILED, fail
+from torchrg.cli.ending import SOME_FAILED, fail, printable, warn
+from torchrg.cli.places import is_archive
+from torchrg.io import RESULT_FIELDS
+from torchrg.io.fields import notes_on_results
+from torchrg.structures import Cloud
 
 
 def run_each(
@@ -48,6 +54,34 @@ def tell_failure(report: TaskReport) -> None:
     """Print why a task failed, if it did."""
     if report.status == "failed":
         fail(f"{report.name}: {report.reason.removeprefix(f'{report.name}: ')}")
+
+
+def note_input(
+    source: str, cloud: Cloud, target: Path, results: Collection[str] = RESULT_FIELDS
+) -> None:
+    """Warn of what reading took for granted, and of fields of a cloud whose names results take."""
+    replaced = () if is_archive(target) else notes_on_results(cloud.fields, results)
+    for note in (*cloud.notes, *replaced):
+        warn(f"{source}: {note}.")
+
+
+def left_out(target: Path, fields: Collection[str]) -> str:
+    """Return the words for a report on which fields of a cloud its result does not hold."""
+    return f" (without its own {', '.join(fields)})" if fields and is_archive(target) else ""
+
+
+@contextlib.contextmanager
+def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar on a terminal; what is yielded is called as each stage begins."""
+    with tqdm(
+        total=len(stages), desc=printable(name), unit="stage", leave=False, disable=None
+    ) as bar:
+
+        def advance(stage: str) -> None:
+            bar.set_postfix_str(stage)
+            bar.update(stage != stages[0])
+
+        yield advance
 
 
 class Progress:

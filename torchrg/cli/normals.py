@@ -11,9 +11,11 @@ import torch
 from torchrg._compile import compiled
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
-from torchrg.cli import console
+from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.loop import run_each
+from torchrg.cli.ending import say, warn
+from torchrg.cli.loop import left_out, note_input, run_each, stage_bar
+from torchrg.cli.places import check_apart, is_archive, output_paths
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
@@ -37,9 +39,8 @@ class Arguments:
         torchrg normals scan.ply --out normals.ply --orient viewpoint --viewpoint 0 0 1.6
     """
 
-    inputs: console.CloudsFlag
-    out: Path
-    """File to write, its format by suffix; for several inputs a directory."""
+    inputs: flags.CloudsFlag
+    out: flags.OutFlag
     method: NormalMethod | None = None
     """Estimator of the normals, a short form of --normals.method."""
     orient: CloudOrientation = "none"
@@ -55,10 +56,9 @@ class Arguments:
     chunk_size: int = PipelineConfig.chunk_size
     """Number of points that are handled at a time. It bounds the memory and never changes a
     result."""
-    compile: console.CompileFlag = False
-    threads: int | None = None
-    """Number of threads. Default: as torch decides, usually one for each core."""
-    columns: console.ColumnsFlag = None
+    compile: flags.CompileFlag = False
+    threads: flags.ThreadsFlag = None
+    columns: flags.ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
@@ -68,15 +68,14 @@ def run(argv: list[str]) -> int:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
     if arguments.viewpoint is not None and arguments.orient != "viewpoint":
         raise ConfigError("expected --viewpoint X Y Z together with --orient viewpoint.")
-    console.use_threads(arguments.threads)
+    flags.use_threads(arguments.threads)
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
-    console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    outputs = console.output_paths(arguments.inputs, arguments.out)
-    console.check_apart(outputs, arguments.inputs)
+    flags.check_columns(arguments.columns, arguments.inputs)
+    outputs = output_paths(arguments.inputs, arguments.out)
+    check_apart(outputs, arguments.inputs)
     wanted = PipelineConfig(arguments.normals, compile=arguments.compile)
-    settings = console.prepared(console.PlaneSettings(resolved=wanted))
-    arguments = replace(arguments, compile=settings.resolved.compile)
+    arguments = replace(arguments, compile=flags.with_kernels(wanted).compile)
     return run_each(
         _estimate_file, arguments, list(map(str, arguments.inputs)), arguments.inputs, outputs
     )
@@ -85,40 +84,36 @@ def run(argv: list[str]) -> int:
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    cloud = read_cloud(source, columns=names.of(source))
-    console.note_input(f"{source}", cloud, target, RESULTS)
+    cloud = read_cloud(source, columns=flags.columns_of(source, arguments.columns))
+    note_input(f"{source}", cloud, target, RESULTS)
     check_finite(cloud)
     if cloud.precision_note:
-        console.warn(f"{source}: {cloud.precision_note}.")
+        warn(f"{source}: {cloud.precision_note}.")
     if arguments.viewpoint is None:
         check_viewpoint(cloud, arguments.orient, "pass --viewpoint X Y Z, or --orient interior")
     check_output(target, cloud)
-    settings, size = arguments.normals, arguments.chunk_size
-    with console.stage_bar(source.name, ("normals", "orientation")) as advance:
+    with stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")
         with compiled(arguments.compile):
-            fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
+            fit = estimate_normals(
+                cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size
+            )
         advance("orientation")
-        place = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
-        turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=place)
-        fit = fit._replace(normals=turned)
-    provenance = describe_run(source, settings)
-    provenance |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
-    provenance |= {"compile": arguments.compile}
-    if arguments.columns is not None:
-        provenance["columns"] = arguments.columns
+        scanner = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
+        turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=scanner)
+    provenance = describe_run(source, arguments.normals)
+    names = ("orient", "viewpoint", "compile", *["columns"] * (arguments.columns is not None))
+    provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    found = dict(zip(RESULTS, (fit.normals, fit.curvature, sharp, fit.valid), strict=True))
-    # As with segmentations, .npz holds the results alone, other formats the cloud's fields too.
-    kept = {} if target.suffix.lower() == ".npz" else cloud.fields
-    fields = put_results(kept, {name: values.numpy() for name, values in found.items()})
+    results = zip(RESULTS, (turned, fit.curvature, sharp, fit.valid), strict=True)
+    fields = {} if is_archive(target) else cloud.fields
+    fields = put_results(fields, {name: values.numpy() for name, values in results})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
     num_valid = int(fit.valid.sum())
     if num_valid < len(cloud):
         num_bad = len(cloud) - num_valid
-        console.warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
+        warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    without = console.without(target, cloud.fields)
-    console.say(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {target}{without}")
+    place = f"{target}{left_out(target, cloud.fields)}"
+    say(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {place}")

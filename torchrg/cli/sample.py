@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.console import say
+from torchrg.cli.ending import say
 from torchrg.io import check_output, write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud

@@ -11,7 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.console import ColumnNames, ColumnsFlag, warn, warnings_as_lines
+from torchrg.cli.ending import warn, warnings_as_lines
+from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.metrics import (
@@ -128,8 +129,11 @@ def _named(names: Iterable[str]) -> str:
 
 def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     """Return the scores of whatever two scans of the same points both have."""
-    names = ColumnNames.parse(arguments.columns, (predicted, truth))
-    ours, theirs = (read_result(path, columns=names.of(path)).cloud for path in (predicted, truth))
+    check_columns(arguments.columns, (predicted, truth))
+    ours, theirs = (
+        read_result(path, columns=columns_of(path, arguments.columns)).cloud
+        for path in (predicted, truth)
+    )
     for cloud in (ours, theirs):
         for note in cloud.notes:
             warn(f"{cloud.source}: {note}.")

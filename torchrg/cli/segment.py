@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -23,9 +24,11 @@ from torchrg.batch.scans import (
     segment_cloud,
     write_scan,
 )
-from torchrg.cli import console
+from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.loop import run_each
+from torchrg.cli.ending import say, warn
+from torchrg.cli.loop import left_out, note_input, run_each, stage_bar
+from torchrg.cli.places import check_apart, is_page, output_paths, picture_paths
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.depth import find_intrinsics
@@ -72,9 +75,8 @@ class Arguments:
         torchrg segment scan.ply --out parts.npz --superpoints 1000,300
     """
 
-    inputs: console.CloudsFlag
-    out: Path
-    """File to write, its format by suffix; for several inputs a directory."""
+    inputs: flags.CloudsFlag
+    out: flags.OutFlag
     picture: Path | None = None
     """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
     inputs a directory of pictures."""
@@ -91,28 +93,27 @@ class Arguments:
     instead of planes."""
     level: int = 0
     """Which level of the superpoints --layout takes, 0 the finest."""
-    layout: console.Layout | None = None
+    layout: flags.Layout | None = None
     """Write the files of other programs into the directory OUT instead of one result, as torchrg
     convert --layout does. Superpoints are added then."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
-    threads: int | None = None
-    """Number of threads. Default: as torch decides, usually one for each core."""
-    columns: console.ColumnsFlag = None
-    orient: console.OrientFlag = "auto"
+    threads: flags.ThreadsFlag = None
+    columns: flags.ColumnsFlag = None
+    orient: flags.OrientFlag = "auto"
     merge: bool = False
     """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
     limit_memory: float | None = None
     """Gigabytes of memory that a cloud may take. Of one that would take more the largest arrays are
     kept on the disk of OUT while it is segmented, or of TMPDIR, some 450 bytes a point, with the
     same result. Default: half of what is free."""
-    settings: console.SettingsFlags = dataclasses.field(default_factory=console.PlaneSettings)
+    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _refuse_images(argv)
-    argv = console.spell_counts(argv, "--superpoints")
-    start = {"settings": console.PlaneSettings.asked_for(argv)}
+    argv = flags.spell_counts(argv, "--superpoints")
+    start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):
         arguments = dataclasses.replace(arguments, superpoints=True)
@@ -120,30 +121,32 @@ def run(argv: list[str]) -> int:
         raise ConfigError(
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
-    console.check_level(arguments.level, arguments.partition)
+    flags.check_level(arguments.level, arguments.partition)
     if arguments.level and arguments.layout is None:
         raise ConfigError("expected --layout with --level, as other files hold all levels.")
-    console.use_threads(arguments.threads)
-    console.check_memory(arguments.limit_memory)
+    flags.use_threads(arguments.threads)
+    flags.bytes_of_limit(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
-    console.ColumnNames.parse(arguments.columns, arguments.inputs)
+    flags.check_columns(arguments.columns, arguments.inputs)
     firsts = tuple(sources[0] for sources in clouds if sources)
     suffix = ".npz" if arguments.layout is None else ""
-    outputs = console.output_paths(firsts, arguments.out, suffix=suffix)
-    console.check_apart(outputs, arguments.inputs)
-    pictures = console.picture_paths(outputs, arguments.picture)
+    outputs = output_paths(firsts, arguments.out, suffix=suffix)
+    check_apart(outputs, arguments.inputs)
+    pictures = picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    arguments = dataclasses.replace(arguments, settings=console.prepared(arguments.settings))
+    resolved = flags.with_kernels(arguments.settings.resolved)
+    settings = dataclasses.replace(arguments.settings, resolved=resolved)
+    arguments = dataclasses.replace(arguments, settings=settings)
     names = [_name_of(cloud) for cloud in clouds]
     with _sharing(arguments, outputs):
         code = run_each(_segment, arguments, names, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
-        console.say(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
+        say(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
 
 
@@ -174,7 +177,7 @@ def _page_of(picture: Path) -> Path:
 
 def _refuse_images(argv: list[str]) -> None:
     """Say where depth images went, if the arguments are about them."""
-    for last, argument in zip(["", *argv], argv, strict=False):
+    for last, argument in pairwise(("", *argv)):
         is_flag = argument.partition("=")[0] in IMAGE_FLAGS
         is_value = last.startswith("--") and "=" not in last
         is_input = not argument.startswith("-") and not is_value
@@ -191,19 +194,20 @@ def _segment(
 ) -> None:
     """Segment a cloud with a progress bar on a terminal, and one line about the result."""
     begin, source = time.perf_counter(), _name_of(sources)
-    limit = _limit_of(arguments)
+    limit = flags.bytes_of_limit(arguments.limit_memory, available_memory() // 2)
     _check_limit(source, sum(map(estimate_points, sources)), limit)
-    names = console.ColumnNames.parse(arguments.columns, arguments.inputs)
-    cloud = merge_clouds([read_cloud(path, columns=names.of(path)) for path in sources])
+    cloud = merge_clouds(
+        [read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources]
+    )
     where = _arrays_of(arguments, source, target, len(cloud), limit)
     _check_points(arguments, source, cloud, target)
     if _is_depth_image(cloud):
-        console.warn(
+        warn(
             f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
         )
     partition = arguments.partition if arguments.superpoints else None
     stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
-    with console.stage_bar(sources[0].name, stages) as advance, where:
+    with stage_bar(sources[0].name, stages) as advance, where:
         seg, superpoints = segment_cloud(
             cloud,
             arguments.settings.resolved,
@@ -220,17 +224,11 @@ def _segment(
     if picture is not None:
         _draw(arguments, picture, Result.of(cloud, seg, superpoints))
     if superpoints is not None:
-        levels = (superpoints.labels, *superpoints.levels)
+        levels = superpoints.by_level().values()
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
-        console.say(f"{source}: superpoints of each level: {counts}")
-    without = console.without(target, cloud.fields)
-    _report(source, seg, cloud, f"{target}{without}", time.perf_counter() - begin)
-
-
-def _limit_of(arguments: Arguments) -> int:
-    """Return how many bytes of memory a cloud may take."""
-    given = arguments.limit_memory
-    return available_memory() // 2 if given is None else int(given * 1e9)
+        say(f"{source}: superpoints of each level: {counts}")
+    place = f"{target}{left_out(target, cloud.fields)}"
+    _report(source, seg, cloud, place, time.perf_counter() - begin)
 
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
@@ -252,11 +250,10 @@ def _arrays_of(
     if needed <= limit:
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
-    k = max(
-        arguments.settings.resolved.normals.k, arguments.settings.resolved.normals.adaptive_k or 0
-    )
+    normals = arguments.settings.resolved.normals
+    k = max(normals.k, normals.adaptive_k or 0)
     check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
-    console.say(
+    say(
         f"{source}: about {num_points:,} points take {needed / 1e9:.2f} GB of memory, the limit is "
         f"{limit / 1e9:.2f}: the largest arrays are on the disk of {folder}"
     )
@@ -273,9 +270,9 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
     parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
     written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
-    console.note_input(source, cloud, target, written)
+    note_input(source, cloud, target, written)
     for note in check_finite(cloud):
-        console.warn(f"{source}: {note}.")
+        warn(f"{source}: {note}.")
     if arguments.layout is None:
         check_output(target, cloud)
 
@@ -311,20 +308,19 @@ def _write_layout(
     superpoints: Superpoints | None,
 ) -> None:
     """Write a result in a layout, its folder ``target``."""
-    layout, level = arguments.layout or "pointcept", None
-    if superpoints is not None:
-        level = [*superpoints.by_level().values()][arguments.level]
+    layout, level = arguments.layout or "pointcept", arguments.level
     for note in note_on_origin(layout, cloud):
-        console.warn(f"{cloud.source}: {note}.")
+        warn(f"{cloud.source}: {note}.")
     arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
-    write_scan(layout, target.name, target, Reading(cloud, arrays, _DATASET), seg, level)
+    reading = Reading(cloud, arrays, _DATASET)
+    write_scan(layout, target.name, target, reading, seg, superpoints, level=level)
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
     """Write the picture of a result, or the page, or both."""
     if arguments.pages:
         draw_entry(picture.parent, picture.stem, result)
-    elif console.is_page(picture):
+    elif is_page(picture):
         write_page(picture, make_page(result))
     else:
         draw_planes(picture, result)
@@ -336,10 +332,10 @@ def _report(source: str, seg: Segmentation, cloud: Cloud, target: str, seconds: 
         known = cloud.coordinates[cloud.finite]
         is_place = (known == known[0]).all()
         reason = "all points are equal" if is_place else "no region is large enough"
-        console.warn(f"{source}: no plane found: {reason}.")
+        warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes.count)
     share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
-    console.say(
+    say(
         f"{source}: {num_points:,} points, {num_planes:,} planes, {share:.1f} % of the points "
         f"labelled, {seconds:.1f} s -> {target}"
     )

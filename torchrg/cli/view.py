@@ -9,14 +9,9 @@ import torch
 from torch import Tensor
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.console import (
-    ColumnNames,
-    ColumnsFlag,
-    check_drawing,
-    is_page,
-    say,
-    warn,
-)
+from torchrg.cli.ending import say, warn
+from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
+from torchrg.cli.places import check_drawing, is_page
 from torchrg.errors import ConfigError
 from torchrg.io.fields import WIDEN
 from torchrg.render import (
@@ -84,6 +79,8 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, draw the cloud and write the picture."""
     arguments = parse(Arguments, argv, prog="torchrg view")
     check_drawing(arguments.out)
+    files = (arguments.file, arguments.beside, arguments.truth)
+    check_columns(arguments.columns, [path for path in files if path is not None])
     up = None if arguments.up is None else _direction(arguments.up)
     write = _write_page if is_page(arguments.out) else _write_picture
     said = write(arguments, _read(arguments.file, arguments), up)
@@ -93,8 +90,7 @@ def run(argv: list[str]) -> int:
 
 def _read(path: Path, arguments: Arguments) -> Result:
     """Read a cloud or a result with colours of 8 bits, which is what screens show."""
-    paths = [given for given in (arguments.file, arguments.beside, arguments.truth) if given]
-    result = read_result(path, columns=ColumnNames.parse(arguments.columns, paths).of(path))
+    result = read_result(path, columns=columns_of(path, arguments.columns))
     cloud = result.cloud
     for note in cloud.notes:
         warn(f"{path}: {note}.")

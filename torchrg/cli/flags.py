@@ -1,0 +1,215 @@
+"""Flags that several commands share, and what their values mean."""
+
+import dataclasses
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+
+from torchrg.cli.arguments import Argument
+from torchrg.cli.ending import say, warnings_as_lines
+from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
+from torchrg.depth.segment import prepare_depth_kernels
+from torchrg.errors import ConfigError
+from torchrg.io import FORMATS, takes_columns
+from torchrg.io.fields import COLUMNS_RULE
+from torchrg.pipeline import prepare_kernels
+
+_MOST_THREADS = 1024
+"""More than any machine has cores; many more cannot be started, and torch ends with the process."""
+_MOST_GIGABYTES = 1_000_000
+"""A petabyte, more than any machine has memory."""
+
+CloudsFlag = Annotated[
+    tuple[Path, ...],
+    Argument(
+        metavar="CLOUD",
+        is_positional=True,
+        text=f"Clouds to read, files that end in {' '.join(FORMATS)}. For depth images, and for "
+        "organised clouds taken as images, there is torchrg depth.",
+    ),
+]
+OutFlag = Annotated[
+    Path,
+    Argument(text="File to write, its format by suffix; for several inputs a directory."),
+]
+ColumnsFlag = Annotated[
+    str | None,
+    Argument(
+        metavar="X,Y,Z,...",
+        text="Names of the columns of text and of bare .npy arrays, in their order, as "
+        f"x,y,z,intensity,r,g,b; _ leaves one out. {COLUMNS_RULE} What was taken is printed.",
+    ),
+]
+ThreadsFlag = Annotated[
+    int | None,
+    Argument(text="Number of threads. Default: as torch decides, usually one for each core."),
+]
+CompileFlag = Annotated[
+    bool,
+    Argument(
+        text="Whether a C++ compiler makes kernels, once for all runs on this machine. They are "
+        "faster, and equal to rounding."
+    ),
+]
+_Side = Literal["auto", "interior", "viewpoint", "up", "none"]
+OrientFlag = Annotated[
+    _Side,
+    Argument(
+        text="To which side normals point: to the front of the faces where the file is a mesh, "
+        "else to the scanner where it names its places, as E57 does, else into the free space of "
+        "rooms (auto); always into rooms (interior), to the scanner (viewpoint) or along +z (up); "
+        "or to that side where the first of z, y, x that is not zero is positive (none).",
+    ),
+]
+ImageOrientFlag = Annotated[
+    _Side,
+    Argument(
+        text="To which side normals point: to the camera (auto, viewpoint, none), into the free "
+        "space of rooms (interior), or along +z (up), which is the optical axis where no pose of "
+        "the camera is known.",
+    ),
+]
+Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "npy"]
+
+
+@dataclass(frozen=True)
+class PlaneSettings:
+    """How planes are found: what the preset or the file says, where no flag says otherwise."""
+
+    preset: str = DEFAULT_PRESET
+    """Settings to start from: those of a method (classic, classic_increment, detmm, paper,
+    algorithm2, consensus), or those for a kind of data (s3dis, scannet, laser, rgbd). Flags change
+    them one by one."""
+    config: Path | None = None
+    """YAML file with settings, in place of a preset; what it does not name has its default."""
+    angle_deg: float | None = None
+    """The one threshold of the paper, in degrees: that of sharp points and of growth. The flags
+    --normals.sharp-angle-deg and --growing.max-angle-deg win where they are given."""
+    resolved: Annotated[PipelineConfig, Argument(is_inline=True)] = dataclasses.field(
+        default_factory=PipelineConfig
+    )
+
+    @classmethod
+    def asked_for(cls, argv: list[str], preset: str = DEFAULT_PRESET) -> "PlaneSettings":
+        """Return the settings of the preset or the file in the arguments: defaults of the flags.
+
+        ``preset`` is that of commands which name none.
+
+        Example:
+            >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
+            'pca'
+        """
+        values = {"--preset": preset, "--config": "", "--angle-deg": ""}
+        for argument, following in pairwise((*argv, "")):
+            name, equals, value = argument.partition("=")
+            name = name.replace("_", "-")
+            if name in values:
+                values[name] = value if equals else following
+        resolved = load_config(values["--config"] or values["--preset"])
+        try:
+            angle = float(values["--angle-deg"])
+        except ValueError:  # It is not given, or a word that the parser refuses.
+            return cls(preset, resolved=resolved)
+        return cls(preset, resolved=resolved.at_angle(angle))
+
+
+SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]
+"""Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
+
+
+def with_kernels(settings: PipelineConfig) -> PipelineConfig:
+    """Compile the kernels that settings ask for, or return settings without; a line says so."""
+    with warnings_as_lines():
+        return prepare_kernels(settings, announce=say)
+
+
+def with_depth_kernels(is_wanted: bool) -> bool:
+    """Compile the kernels of depth images if that is wanted, and tell whether it was done."""
+    with warnings_as_lines():
+        return is_wanted and prepare_depth_kernels(say)
+
+
+def split_columns(columns: str | None) -> tuple[str, ...] | None:
+    """Return the names in the value of ``--columns``.
+
+    Example:
+        >>> split_columns("x, y,z,_")
+        ('x', 'y', 'z', '_')
+    """
+    return None if columns is None else tuple(name.strip() for name in columns.split(","))
+
+
+def columns_of(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
+    """Return the names that ``--columns`` gives a file; None for one that names its own."""
+    return split_columns(columns) if takes_columns(path) else None
+
+
+def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) -> None:
+    """Refuse names of columns where every file names its own."""
+    if columns is not None and not any(map(takes_columns, paths)):
+        raise ConfigError("expected text or .npy for --columns, got files that name their own.")
+
+
+def spell_counts(argv: Sequence[str], flag: str) -> list[str]:
+    """Return arguments in which numbers after a flag of superpoints have a flag of their own.
+
+    Example:
+        >>> spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"], "--superpoints")
+        ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
+    """
+    spelled: list[str] = []
+    for argument in argv:
+        is_after = spelled[-1:] == [flag]
+        name, _, numbers = argument.rpartition("=")
+        if re.fullmatch(r"\d+(,\d+)*", numbers) and (name == flag or (is_after and not name)):
+            spelled += [name] * bool(name) + ["--partition.counts", *numbers.split(",")]
+        else:
+            spelled.append(argument)
+    return spelled
+
+
+def check_level(level: int, config: SuperpointsConfig) -> None:
+    """Refuse a level that superpoints do not have."""
+    if not 0 <= level < config.num_levels:
+        most = config.num_levels - 1
+        raise ConfigError(f"expected --level from 0 to {most}, the levels there are, got {level}.")
+
+
+def parse_intrinsics(text: str | None) -> tuple[float, float, float, float] | None:
+    """Return the four numbers of ``fx,fy,cx,cy``; None where no camera is given."""
+    if text is None:
+        return None
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(
+            f"expected --intrinsics fx,fy,cx,cy, four numbers without blanks, got {text!r}."
+        ) from None
+    return fx, fy, cx, cy
+
+
+def use_threads(threads: int | None) -> None:
+    """Let torch use so many threads; None leaves it to torch."""
+    if threads is None:
+        return
+    if not 1 <= threads <= _MOST_THREADS:
+        raise ConfigError(f"expected --threads from 1 to {_MOST_THREADS:,}, got {threads}.")
+    torch.set_num_threads(threads)
+
+
+def bytes_of_limit(limit_memory: float | None, usual: int = 0) -> int:
+    """Return the limit of memory in bytes, the usual one where none is set; refuse a wrong one."""
+    if limit_memory is None:
+        return usual
+    if not 0 < limit_memory <= _MOST_GIGABYTES:
+        raise ConfigError(
+            f"expected --limit-memory above 0 and at most {_MOST_GIGABYTES:,} GB, got "
+            f"{limit_memory}."
+        )
+    return int(limit_memory * 1e9)

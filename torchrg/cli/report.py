@@ -1,0 +1,122 @@
+"""What ``torchrg convert`` prints of a batch: its plan, what it will take, what became of it."""
+
+from collections.abc import Iterable, Sequence
+
+from torchrg.batch.run import BatchReport, Plan
+from torchrg.batch.task import TaskReport
+from torchrg.cli.ending import printable
+
+MOST_ROWS = 300
+"""Most scans of a batch that is printed scan by scan."""
+
+
+def format_plan(plan: Plan) -> str:
+    """Return what a plan would do: a row for each scan that is to be converted."""
+    sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
+    if not plan.to_convert:
+        return sums
+    rows = [
+        [job.name, plan.reasons[job.name], f"{job.scan.num_points:,}"] for job in plan.to_convert
+    ]
+    return "\n".join([format_table(["scan", "why", "points (about)"], rows), sums])
+
+
+def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[float, str]) -> str:
+    """Return what a plan would take, in words, or that there is nothing to do.
+
+    Args:
+        plan: The plan.
+        workers: Most scans at a time.
+        limit: Bytes of memory that these may take together.
+        free: Bytes that the disk of the results has free.
+        rate: Seconds of a core for a million points, and what these points are.
+    """
+    jobs, (seconds, of_what) = plan.to_convert, rate
+    if not jobs:
+        return "nothing to do"
+    memory, at_once = 0, 0
+    for needed in sorted((job.memory for job in jobs), reverse=True)[:workers]:
+        if at_once and memory + needed > limit:
+            break
+        memory, at_once = memory + needed, at_once + 1
+    num_points = sum(job.scan.num_points for job in jobs)
+    hours = seconds * num_points / 1e6 / 3600
+    return (
+        f"disk: about {jobs[0].source.bytes_per_point * num_points / 1e9:,.3f} GB of "
+        f"{free / 1e9:,.1f} that are free\n"
+        f"memory: about {memory / 1e9:,.1f} GB for {at_once} at a time, within {limit / 1e9:,.1f}\n"
+        f"time: about {hours / at_once:,.2f} hours, at {seconds:g} s of a core for a million "
+        f"{of_what}"
+    )
+
+
+def format_report(report: BatchReport, *, unit: str = "scan") -> str:
+    """Return a report as text: a row for each scan, notes below, then the sums.
+
+    With more than :data:`MOST_ROWS` scans, only failures have a row. ``unit`` is what a scan is
+    called where its number in a second counts.
+    """
+    stages = list(report.stage_seconds)
+    shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
+    head = ["scan", "status", "points", "planes", *stages, "GB"]
+    rows = [_row(scan, stages) for scan in shown]
+    totals = report.with_status("converted")
+    rows.append(
+        [
+            "all",
+            f"{len(totals)} converted",
+            f"{report.num_points:,}",
+            f"{sum(scan.num_regions for scan in totals):,}",
+            *(f"{seconds:.1f}" for seconds in report.stage_seconds.values()),
+            f"{max((scan.peak_memory for scan in totals), default=0) / 1e9:.2f}",
+        ]
+    )
+    notes = [
+        printable(f"{scan.name}: {note}")
+        for scan in shown
+        for note in (
+            *(f"repaired: {text}" for text in scan.repairs),
+            *scan.warnings,
+            *([f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []),
+        )
+        if scan.status != "failed"
+    ]
+    points, scans = (
+        number / report.seconds if report.seconds else 0.0
+        for number in (report.num_points, len(totals))
+    )
+    speed = (
+        f"{report.num_points:,} points in {report.seconds:,.1f} s: {points:,.0f} points, "
+        f"{scans:,.2f} {unit}s a second"
+    )
+    return "\n".join([format_table(head, rows), *notes, speed])
+
+
+def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:
+    """Return the cells of a scan."""
+    points = f"{scan.num_points:,}" if scan.num_points else ""
+    return [
+        scan.name,
+        scan.status,
+        points,
+        f"{scan.num_regions:,}" if points else "",
+        *(f"{scan.seconds[stage]:.1f}" if stage in scan.seconds else "" for stage in stages),
+        f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else "",
+    ]
+
+
+def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return rows of text as aligned columns, numbers to the right.
+
+    Example:
+        >>> print(format_table(["scan", "points"], [["hall", "1,000"], ["office", "20"]]))
+        scan    points
+        hall     1,000
+        office      20
+    """
+    columns = []
+    for cells in zip(*(map(printable, row) for row in (head, *rows)), strict=True):
+        width = max(map(len, cells))
+        numeric = all(cell[:1].isdigit() or not cell for cell in cells[1:])
+        columns.append([cell.rjust(width) if numeric else cell.ljust(width) for cell in cells])
+    return "\n".join("  ".join(row).rstrip() for row in zip(*columns, strict=True))
