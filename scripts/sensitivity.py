@@ -29,7 +29,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
 
-from tests.made import make_shape
+from tests.made import CurvedLayout, make_shape
 from torchrg import load_config
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels, score_normals
@@ -257,10 +257,10 @@ _ROOMS = {
         0.002,
     ),
     "curved room": (
-        _small(RoomLayout(), num_round_tables=1, num_bent_walls=2, num_windows=1),
+        _small(CurvedLayout(), num_round_tables=1, num_bent_walls=2, num_windows=1),
         0.003,
     ),
-    "bent walls, exact": (_small(RoomLayout(), num_bent_walls=4, num_tables=1), 0.0),
+    "bent walls, exact": (_small(CurvedLayout(), num_bent_walls=4, num_tables=1), 0.0),
 }
 _SHAPES = {
     "cube, exact": ("cube", 0.0, 50, None),
@@ -270,7 +270,7 @@ _SHAPES = {
     "cylinder": ("cylinder", 0.0025, 50, None),
     "rounded box": ("rounded_box", 0.001, 50, None),
     "torus": ("torus", 0.0025, 50, None),
-    "coral, exact": ("coral", 0.0, 50, None),
+    "ball, exact": ("sphere", 0.0, 50, None),
     "cube, k = 16": ("cube", 0.001, 16, None),
     "torus, adaptive k": ("torus", 0.012, 50, 300),
 }

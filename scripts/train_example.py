@@ -12,8 +12,10 @@ the table's last line is what can be said from a point's height and true normal 
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +24,13 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, gelu
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+
+from tests.made import CurvedLayout
 from torchrg import segment_planes
 from torchrg.neighbors import restore_points, sample_voxels, search_knn
 from torchrg.normals import orient_normals
-from torchrg.scenes import RoomLayout, Scene, make_room
+from torchrg.scenes import Scene, make_room
 
 CLASSES = {
     "floor": ["floor"],
@@ -107,7 +112,7 @@ def draw_room(seed: int, num_points: int) -> Scene:
     """Return a scan of a room of random size, heading and contents."""
     rng = np.random.default_rng(seed)
     length, width, height = rng.uniform((5.5, 4.8, 2.4), (7.0, 6.2, 3.3))
-    layout = RoomLayout(
+    layout = CurvedLayout(
         size=(float(length), float(width), float(height)),
         heading_deg=float(rng.uniform(0, 360)),
         num_doors=1,

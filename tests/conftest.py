@@ -1,10 +1,17 @@
-"""Options, devices and dtypes shared by all tests."""
+"""What all tests share: options, devices, dtypes, rooms, folders of clouds, the command line."""
 
+import functools
 import gc
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
+
+from torchrg.cli import main
+from torchrg.io import write_cloud
+from torchrg.scenes import make_room
+from torchrg.structures import Cloud
 
 SCANS = Path(__file__).parents[2] / "shared" / "data"
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
@@ -51,6 +58,14 @@ def rng():
 
 
 @pytest.fixture
+def set_threads():
+    """``set_threads(n)``: torch works in n threads, until the end of the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def scan():
     """Path of a real scan by name; the test is skipped where the scans are absent."""
 
@@ -77,3 +92,65 @@ def pointcept_folder():
     if not POINTCEPT.exists():
         pytest.skip("needs the data pipeline of Pointcept")
     return POINTCEPT
+
+
+@functools.cache
+def _room(num_points, noise, seed, layout):
+    return make_room(num_points, noise, seed, layout=layout)
+
+
+def copied_room(num_points=8000, noise=0.003, seed=1, layout=None):
+    """Return a made room whose tensors a test may change; rooms with equal arguments are equal."""
+    scene = _room(num_points, noise, seed, layout)
+    return scene._replace(
+        points=scene.points.clone(), labels=scene.labels.clone(), normals=scene.normals.clone()
+    )
+
+
+@pytest.fixture(scope="session")
+def room():
+    """``room(num_points, noise, seed, layout)``: a made room, each made once in a session."""
+    return copied_room
+
+
+@pytest.fixture(scope="session")
+def folder_of_clouds(tmp_path_factory):
+    """``folder_of_clouds("a.ply", "b/c.npz")``: a new folder of rooms with labels and normals."""
+
+    def write(*names, num_points=2000):
+        folder = tmp_path_factory.mktemp("clouds")
+        for seed, name in enumerate(names):
+            scene = copied_room(num_points, seed=seed)
+            fields = {"labels": scene.labels.numpy(), "normals": scene.normals.numpy()}
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_cloud(folder / name, Cloud(scene.points.numpy(), fields))
+        return folder
+
+    return write
+
+
+class Run(NamedTuple):
+    """What a command did: its exit code, and all that it wrote on stdout and on stderr."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def error(self):
+        """The one line that a refused command wrote on stderr."""
+        assert self.code != 0, self.out
+        assert self.err.count("\n") == 1, self.err
+        return self.err
+
+
+@pytest.fixture
+def run(capsys):
+    """``run("segment", path, "--out", out)``: a command of torchrg, in this process."""
+
+    def call(*arguments):
+        capsys.readouterr()
+        code = main([*map(str, arguments)])
+        return Run(code, *capsys.readouterr())
+
+    return call

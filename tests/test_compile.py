@@ -52,17 +52,14 @@ def test_the_digest_knows_constants_and_what_is_called(monkeypatch):
     assert _compile._digest(noise._deviations.function) != deviations
 
 
-def test_the_switch_reaches_the_threads():
-    torch.set_num_threads(2)
-    try:
-        with compiled():
-            found = _parallel.map_tasks(
-                lambda task: (_compile.is_active.get(), _parallel.allowed_threads()),
-                [0, 1],
-                torch.device("cpu"),
-            )
-    finally:
-        torch.set_num_threads(1)
+def test_the_switch_reaches_the_threads(set_threads):
+    set_threads(2)
+    with compiled():
+        found = _parallel.map_tasks(
+            lambda task: (_compile.is_active.get(), _parallel.allowed_threads()),
+            [0, 1],
+            torch.device("cpu"),
+        )
     assert found == [(True, 1), (True, 1)]
 
 
@@ -262,7 +259,7 @@ def test_code_gives_the_same_bits_for_any_rows_and_is_made_anew_if_torn(folder):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["consensus", "paper"])
-def test_compiled_results_do_not_depend_on_order_chunks_or_threads(preset):
+def test_compiled_results_do_not_depend_on_order_chunks_or_threads(preset, set_threads):
     """And they are those of the written code, to rounding; the code stays in the user's folder."""
     points = make_room(20_000, 0.003, seed=5).points
     config = dataclasses.replace(load_config(preset), compile=True)
@@ -271,11 +268,8 @@ def test_compiled_results_do_not_depend_on_order_chunks_or_threads(preset):
     shuffled = segment_planes(points[order], dataclasses.replace(config, chunk_size=777))
     assert torch.equal(shuffled.labels, expected.labels[order])
     assert torch.equal(shuffled.normals, expected.normals[order])
-    torch.set_num_threads(2)
-    try:
-        again = segment_planes(points, config)
-    finally:
-        torch.set_num_threads(1)
+    set_threads(2)
+    again = segment_planes(points, config)
     assert torch.equal(again.labels, expected.labels)
     assert torch.equal(again.normals, expected.normals)
     written = segment_planes(points, load_config(preset))
@@ -288,7 +282,7 @@ def test_compiled_results_do_not_depend_on_order_chunks_or_threads(preset):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["exact", "kinect"])
-def test_compiled_depth_is_that_of_the_written_code_on_any_number_of_threads(sensor):
+def test_compiled_depth_is_that_of_the_written_code_on_any_number_of_threads(sensor, set_threads):
     model = build_room(2)
     camera = cameras_around(model, 4, seed=2, width=320, height=240)[3]
     depth = render_depth(model, camera, sensor=sensor, seed=2).depth
@@ -297,10 +291,7 @@ def test_compiled_depth_is_that_of_the_written_code_on_any_number_of_threads(sen
     same = (first.labels == written.labels) & (first.valid == written.valid)
     torch.testing.assert_close(first.normals[same], written.normals[same], rtol=0, atol=1e-6)
     torch.testing.assert_close(first.curvature[same], written.curvature[same], rtol=0, atol=1e-6)
-    torch.set_num_threads(3)
-    try:
-        again = segment_depth(depth, camera.intrinsics, compile=True)
-    finally:
-        torch.set_num_threads(1)
+    set_threads(3)
+    again = segment_depth(depth, camera.intrinsics, compile=True)
     for part in ("labels", "normals", "curvature", "sharp", "valid"):
         assert torch.equal(getattr(again, part), getattr(first, part)), part

@@ -10,7 +10,15 @@ import torchrg
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import covariance, eigh3
-from torchrg.normals import ESTIMATORS, estimate_normals, find_sharp_points, orient_normals
+from torchrg.normals import (
+    ESTIMATORS,
+    estimate_normals,
+    find_sharp_points,
+    fit_jet,
+    fit_normals_irls,
+    fit_normals_pca,
+    orient_normals,
+)
 from torchrg.robust import (
     fit_detmcd,
     fit_detmm,
@@ -26,6 +34,7 @@ from torchrg.robust.mm import breakdown_constant, efficiency_constant
 from torchrg.transforms import EstimateNormals, SegmentPlanes
 
 FITS = sorted(ESTIMATORS.keys() - {"consensus"})
+irls = partial(fit_normals_irls, noise=torch.tensor(0.01), mu_decay=4.0)
 # A scale that shrinks by a third in a step, for as few steps as still make sense.
 FEW_STEPS = NormalsConfig(irls_decay=1.5)
 
@@ -46,12 +55,10 @@ def projectors(points, method):
     return normals[:, :, None] * normals[:, None, :]
 
 
-@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 20), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", FITS)
-def test_normals_of_a_cloud_have_the_gradient_of_finite_differences(method, seeds):
-    for seed in seeds:
-        points = bracket(seed).requires_grad_()
-        assert gradcheck(partial(projectors, method=method), points, fast_mode=True, atol=1e-4)
+def test_normals_of_a_cloud_have_the_gradient_of_finite_differences(method):
+    points = bracket(0).requires_grad_()
+    assert gradcheck(partial(projectors, method=method), points, fast_mode=True, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", FITS)
@@ -169,6 +176,25 @@ def test_repeated_eigenvalues_have_finite_gradients(dtype, diagonal):
     values, vectors = eigh3(matrix)
     (values.sum() + (vectors**3).sum()).backward()
     assert matrix.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("fit", [fit_normals_pca, fit_jet, irls], ids=["pca", "jet", "irls"])
+@pytest.mark.parametrize(
+    "points",
+    [
+        torch.zeros(8, 3),
+        torch.eye(3),
+        torch.cat([torch.eye(3), -torch.eye(3)]),
+        torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.zeros(1)),
+        torch.arange(8.0)[:, None].expand(8, 3),
+    ],
+    ids=["one place", "triangle", "octahedron", "lattice", "line"],
+)
+def test_planes_with_repeated_eigenvalues_have_finite_gradients(fit, points):
+    points = points.clone().requires_grad_()
+    parts = fit(points)._asdict().values()
+    sum(part.sum() for part in parts if part is not None and part.requires_grad).backward()
+    assert points.grad.isfinite().all()
 
 
 def test_normal_of_a_plane_with_a_round_disc_has_its_gradient():

@@ -4,46 +4,14 @@ import pytest
 import torch
 
 import torchrg
+from tests.test_transformations import FUNCTIONS
 from torchrg.config import NormalsConfig
 from torchrg.errors import ShapeError
-from torchrg.linalg import covariance, eigh3
-from torchrg.normals import (
-    ESTIMATORS,
-    fit_jet,
-    fit_normals_irls,
-    fit_normals_pca,
-    fit_normals_robust,
-    orient_normals,
-)
-from torchrg.robust import (
-    fit_detmcd,
-    fit_detmm,
-    fit_dets,
-    fit_fastmcd,
-    fit_mve,
-    mad,
-    median,
-    qn,
-    tau,
-)
+from torchrg.normals import ESTIMATORS, orient_normals
 from torchrg.transforms import SegmentDepth
 
 PATCHES = {
-    "covariance": lambda x: covariance(x)[1],
-    "eigh3": lambda x: eigh3(covariance(x)[1])[1].abs(),
-    "pca": lambda x: fit_normals_pca(x).curvature,
-    "jet": lambda x: fit_jet(x).principal_curvatures,
-    "irls": lambda x: fit_normals_irls(x, noise=x.detach()[:, 0, 0] * 0, mu_decay=3.0).curvature,
-    "robust": lambda x: fit_normals_robust(x).curvature,
-    "median": median,
-    "qn": qn,
-    "mad": mad,
-    "tau": tau,
-    "detmcd": lambda x: fit_detmcd(x, starts="more").covariance,
-    "fastmcd": lambda x: fit_fastmcd(x, num_starts=20).covariance,
-    "mve": lambda x: fit_mve(x, num_starts=20).covariance,
-    "dets": lambda x: fit_dets(x).covariance,
-    "detmm": lambda x: fit_detmm(x).covariance,
+    name: lambda x, function=function: function(x)[-1] for name, function in FUNCTIONS.items()
 }
 FEW_STEPS = NormalsConfig(irls_decay=3.0)
 CLOUDS = {

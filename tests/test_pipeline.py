@@ -11,7 +11,6 @@ from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels
 from torchrg.pipeline import segment_planes
-from torchrg.scenes import make_room
 from torchrg.structures import PLANE_KINDS, UNLABELED, Cloud
 
 PRESETS = ["classic", "paper", "consensus"]
@@ -27,8 +26,8 @@ def small(config):
 
 
 @pytest.fixture(scope="module")
-def room():
-    return make_room(8000, 0.003, 1)
+def scene(room):
+    return room(8000, 0.003, 1)
 
 
 @pytest.fixture(scope="module", params=PRESETS)
@@ -66,25 +65,25 @@ def test_box_faces_are_found(preset):
     assert torch.stack([axis, offset]).unique(dim=1).shape[1] == 6
 
 
-def test_table_says_what_meets_and_what_is_asked_for(room):
+def test_table_says_what_meets_and_what_is_asked_for(scene):
     plain = load_config("consensus")
-    planes = segment_planes(room.points, plain).planes
+    planes = segment_planes(scene.points, plain).planes
     assert planes.adjacency is not None
     assert [0, 2] in planes.adjacency.pairs.tolist()
     assert [planes.kind, planes.outline] == [None, None]
     asked = dataclasses.replace(plain, planes=PlanesConfig(up="z", outline=True))
-    planes = segment_planes(room.points, asked).planes
+    planes = segment_planes(scene.points, asked).planes
     assert [PLANE_KINDS[kind] for kind in planes.kind[:6]] == ["ceiling", "floor"] + ["wall"] * 4
     assert len(planes.outline) == len(planes.count)
     turned = dataclasses.replace(plain, planes=PlanesConfig(up="-y"))
-    points = room.points[:, [0, 2, 1]] * torch.tensor([1.0, -1, 1])
+    points = scene.points[:, [0, 2, 1]] * torch.tensor([1.0, -1, 1])
     assert segment_planes(points, turned).planes.kind.tolist() == planes.kind.tolist()
 
 
-def test_order_changes_nothing(room, config):
-    shuffled = torch.randperm(len(room.points), generator=torch.Generator().manual_seed(3))
-    plain = segment_planes(room.points, config)
-    other = segment_planes(room.points[shuffled], config)
+def test_order_changes_nothing(scene, config):
+    shuffled = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(3))
+    plain = segment_planes(scene.points, config)
+    other = segment_planes(scene.points[shuffled], config)
     assert torch.equal(other.labels, plain.labels[shuffled])
     assert torch.equal(other.normals, plain.normals[shuffled])
     assert torch.equal(other.curvature, plain.curvature[shuffled])
@@ -92,47 +91,43 @@ def test_order_changes_nothing(room, config):
     assert_same_planes(other.planes, plain.planes)
 
 
-def test_chunks_and_threads_change_nothing(room, config):
-    points = room.points[:3000]
+def test_chunks_and_threads_change_nothing(scene, config, set_threads):
+    points = scene.points[:3000]
     plain = segment_planes(points, config)
-    threads = torch.get_num_threads()
-    try:
-        for chunk_size, num_threads in ((397, 1), (100_000, 2)):
-            torch.set_num_threads(num_threads)
-            other = segment_planes(points, dataclasses.replace(config, chunk_size=chunk_size))
-            assert torch.equal(other.labels, plain.labels)
-            assert torch.equal(other.normals, plain.normals)
-            assert torch.equal(other.curvature, plain.curvature)
-    finally:
-        torch.set_num_threads(threads)
+    for chunk_size, num_threads in ((397, 1), (100_000, 2)):
+        set_threads(num_threads)
+        other = segment_planes(points, dataclasses.replace(config, chunk_size=chunk_size))
+        assert torch.equal(other.labels, plain.labels)
+        assert torch.equal(other.normals, plain.normals)
+        assert torch.equal(other.curvature, plain.curvature)
 
 
 @pytest.mark.parametrize("unit", [2.0**-13, 1000.0])
-def test_unit_changes_nothing(room, config, unit):
-    plain = segment_planes(room.points.double(), config)
-    other = segment_planes(room.points.double() * unit, config)
+def test_unit_changes_nothing(scene, config, unit):
+    plain = segment_planes(scene.points.double(), config)
+    other = segment_planes(scene.points.double() * unit, config)
     agreement = score_labels(other.labels, plain.labels).ari
     assert agreement > (0.999 if unit == 1000.0 else 1 - 1e-12)
     assert torch.allclose(other.planes.area.sum(), plain.planes.area.sum() * unit**2, rtol=1e-2)
 
 
-def test_origin_changes_nothing_in_double_precision(room, config):
+def test_origin_changes_nothing_in_double_precision(scene, config):
     # Coordinates on a grid of 2^-20 m are moved without rounding.
-    points = (room.points.double() * 2**20).round() / 2**20
+    points = (scene.points.double() * 2**20).round() / 2**20
     plain = segment_planes(points, config)
     other = segment_planes(points + torch.tensor([5e5, 4e6, 100.0]), config)
     assert score_labels(other.labels, plain.labels).ari > 0.999
 
 
-def test_arrays_and_tensors_give_the_same(room, config):
+def test_arrays_and_tensors_give_the_same(scene, config):
     assert torch.equal(
-        segment_planes(room.points.numpy(), config).labels,
-        segment_planes(room.points, config).labels,
+        segment_planes(scene.points.numpy(), config).labels,
+        segment_planes(scene.points, config).labels,
     )
 
 
-def test_points_that_are_not_finite_stay_in_place(room, config):
-    spoiled = room.points.clone()
+def test_points_that_are_not_finite_stay_in_place(scene, config):
+    spoiled = scene.points.clone()
     spoiled[5] = torch.nan
     spoiled[100, 2] = torch.inf
     seg = segment_planes(spoiled, config)
@@ -141,7 +136,7 @@ def test_points_that_are_not_finite_stay_in_place(room, config):
     assert seg.labels[~kept].tolist() == [UNLABELED] * 2
     assert not seg.valid[~kept].any()
     assert not seg.normals[~kept].any()
-    assert torch.equal(seg.labels[kept], segment_planes(room.points[kept], config).labels)
+    assert torch.equal(seg.labels[kept], segment_planes(scene.points[kept], config).labels)
 
 
 @pytest.mark.parametrize("size", [0, 1, 2])
@@ -165,16 +160,16 @@ def test_equal_points_give_no_region(config):
     assert bool((seg.labels == UNLABELED).all())
 
 
-def test_labels_are_sorted_by_size(room, config):
-    seg = segment_planes(room.points, config)
+def test_labels_are_sorted_by_size(scene, config):
+    seg = segment_planes(scene.points, config)
     counts = torch.bincount(seg.labels[seg.labels >= 0])
     assert torch.equal(counts, seg.planes.count)
     assert bool((counts.diff() <= 0).all())
 
 
-def test_stages_are_announced_in_order(room, config):
+def test_stages_are_announced_in_order(scene, config):
     stages = []
-    segment_planes(room.points, config, on_stage=stages.append)
+    segment_planes(scene.points, config, on_stage=stages.append)
     assert stages == ["neighbors", "normals", "regions", "planes", "done"]
 
 

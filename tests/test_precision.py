@@ -1,7 +1,6 @@
 """What float32, or a coarse scale, has taken from coordinates is told once, where it is so."""
 
 import warnings
-from functools import cache
 
 import numpy as np
 import pytest
@@ -11,37 +10,30 @@ from scipy.spatial import KDTree
 from torchrg import Cloud, estimate_normals, load_config, read_cloud, segment_planes, write_cloud
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.sources import FolderSource
-from torchrg.cli import main
 from torchrg.errors import PrecisionWarning
 from torchrg.precision import _spacing, note_on_steps
-from torchrg.scenes import make_room
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
 LINE = "coordinates have steps of 0.5 for a spacing of about 0.09"
 
 
-@cache
-def room_of(num_points):
-    return make_room(num_points, 0.003).points.double().numpy()
-
-
 @pytest.fixture
-def room():
-    return room_of(4000)
+def places(room):
+    return room(4000, 0.003, 0).points.double().numpy()
 
 
-def moved(room, offset):
-    return (room + offset).astype(np.float32)
+def moved(places, offset):
+    return (places + offset).astype(np.float32)
 
 
 @pytest.mark.parametrize("num_points", [500, 4000, 20_000])
 @pytest.mark.parametrize("offset", [0.0, 1e3, 1e4, 1e5, 3e5, 1e6, UTM])
-def test_the_line_comes_where_steps_are_a_tenth_of_the_spacing(num_points, offset):
-    room = room_of(num_points)
-    spacing = np.median(KDTree(room).query(room, k=2)[0][:, 1])
+def test_the_line_comes_where_steps_are_a_tenth_of_the_spacing(num_points, offset, room):
+    places = room(num_points, 0.003, 0).points.double().numpy()
+    spacing = np.median(KDTree(places).query(places, k=2)[0][:, 1])
     step = np.spacing(np.float32(np.max(offset)))
-    found = note_on_steps(moved(room, offset))
+    found = note_on_steps(moved(places, offset))
     if not 0.07 < step / spacing < 0.15:
         assert bool(found) == (step > 0.1 * spacing)
     if found:
@@ -50,10 +42,10 @@ def test_the_line_comes_where_steps_are_a_tenth_of_the_spacing(num_points, offse
         assert spacing / 2 < told < 2 * spacing
 
 
-def test_the_line_does_not_depend_on_the_order_of_the_points(room):
+def test_the_line_does_not_depend_on_the_order_of_the_points(places):
     random = np.random.default_rng(0)
     for offset in (3e5, UTM):
-        points = moved(room, offset)
+        points = moved(places, offset)
         found = {note_on_steps(points[random.permutation(len(points))]) for _ in range(5)}
         assert len(found) == 1
         assert found != {""}
@@ -82,26 +74,26 @@ def test_dense_parts_of_a_cloud_count_though_the_whole_is_wide():
     assert f"steps of {step:.2g} for" in note_on_steps(points.astype(np.float32))
 
 
-def test_single_points_far_off_do_not_decide(room):
-    near, far = moved(room, 0), moved(room, UTM)
+def test_single_points_far_off_do_not_decide(places):
+    near, far = moved(places, 0), moved(places, UTM)
     near[:5], far[:5] = 1e7, 0
     assert note_on_steps(near) == ""
     assert LINE in note_on_steps(far)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, np.finfo(np.float32).max])
-def test_missing_points_do_not_count(room, value):
-    points = moved(room, UTM)
+def test_missing_points_do_not_count(places, value):
+    points = moved(places, UTM)
     points[::3] = value
     assert "steps of 0.5" in Cloud(points).precision_note
 
 
-def test_what_cannot_be_told_is_not_told(room):
-    assert note_on_steps(moved(room, UTM)[:2]) == ""
+def test_what_cannot_be_told_is_not_told(places):
+    assert note_on_steps(moved(places, UTM)[:2]) == ""
     assert note_on_steps(np.full((50, 3), 5.4e6, np.float32)) == ""
     assert note_on_steps(np.zeros((0, 3), np.float32)) == ""
     assert note_on_steps(np.full((9, 3), np.nan, np.float32)) == ""
-    assert note_on_steps(room + UTM) == ""
+    assert note_on_steps(places + UTM) == ""
 
 
 @pytest.mark.parametrize(
@@ -113,17 +105,17 @@ def test_what_cannot_be_told_is_not_told(room):
     ],
     ids=["segment_planes", "estimate_normals", "SegmentPlanes"],
 )
-def test_the_library_warns_once_a_call(room, call):
+def test_the_library_warns_once_a_call(places, call):
     with pytest.warns(PrecisionWarning, match=f"{LINE}; pass float64, or subtract") as caught:
-        call(moved(room, UTM))
+        call(moved(places, UTM))
     assert len(caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        call(moved(room, 0))
+        call(moved(places, 0))
 
 
-def test_the_warning_is_where_the_function_was_called(room):
-    points = moved(room, UTM)
+def test_the_warning_is_where_the_function_was_called(places):
+    points = moved(places, UTM)
     for call in (segment_planes, estimate_normals):
         with pytest.warns(PrecisionWarning, match="steps of 0.5") as caught:
             call(points, "classic")
@@ -133,9 +125,9 @@ def test_the_warning_is_where_the_function_was_called(room):
     assert caught[0].filename == __file__
 
 
-def test_points_of_a_file_warn_once_with_its_name(room, tmp_path):
+def test_points_of_a_file_warn_once_with_its_name(places, tmp_path):
     for dtype in (np.float32, np.float64):
-        write_cloud(tmp_path / f"{dtype.__name__}.ply", Cloud((room + UTM).astype(dtype)))
+        write_cloud(tmp_path / f"{dtype.__name__}.ply", Cloud((places + UTM).astype(dtype)))
     cloud = read_cloud(tmp_path / "float32.ply")
     with pytest.warns(PrecisionWarning, match=r"float32\.ply: coordinates have steps") as caught:
         segment_planes(cloud.points, "classic")
@@ -146,19 +138,19 @@ def test_points_of_a_file_warn_once_with_its_name(room, tmp_path):
         segment_planes(read_cloud(tmp_path / "float64.ply").points, "classic")
 
 
-def test_a_point_so_far_off_that_float32_is_too_coarse_for_all_others_is_told(room):
-    cloud = Cloud(np.concatenate([room + UTM, [[0, 0, 0]]]))
+def test_a_point_so_far_off_that_float32_is_too_coarse_for_all_others_is_told(places):
+    cloud = Cloud(np.concatenate([places + UTM, [[0, 0, 0]]]))
     assert cloud.precision_note.startswith(LINE)
     assert "leave out points that are far off, or cut the cloud" in cloud.precision_note
 
 
-def test_a_coarse_scale_of_las_is_told(room, tmp_path):
+def test_a_coarse_scale_of_las_is_told(places, tmp_path):
     laspy = pytest.importorskip("laspy")
     for scale in (0.01, 0.1):
         header = laspy.LasHeader(point_format=0, version="1.2")
         header.scales, header.offsets = [scale] * 3, UTM
         data = laspy.LasData(header)
-        data.x, data.y, data.z = (room + UTM).T
+        data.x, data.y, data.z = (places + UTM).T
         data.write(str(tmp_path / f"{scale}.las"))
     assert read_cloud(tmp_path / "0.01.las").precision_note == ""
     expected = (
@@ -176,23 +168,23 @@ def test_a_coarse_scale_of_las_is_told(room, tmp_path):
     ],
     ids=lambda words: words[0],
 )
-def test_commands_say_it_once_a_file(room, tmp_path, capsys, command):
-    np.save(tmp_path / "single.npy", moved(room, UTM))
-    np.save(tmp_path / "double.npy", room + UTM)
-    name, *flags = command
+def test_commands_say_it_once_a_file(places, tmp_path, run, command):
+    np.save(tmp_path / "single.npy", moved(places, UTM))
+    np.save(tmp_path / "double.npy", places + UTM)
+    (name, *flags), lines = command, []
     for kind in ("single", "double"):
-        path = str(tmp_path / f"{kind}.npy")
-        assert main([name, path, "--out", str(tmp_path / "out.npz"), *flags]) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "steps" in line]
+        path = tmp_path / f"{kind}.npy"
+        done = run(name, path, "--out", tmp_path / "out.npz", *flags)
+        assert done.code == 0
+        lines += [line for line in done.err.splitlines() if "steps" in line]
     cure = "write float64, or subtract an offset before saving"
     assert lines == [f"torchrg: warning: {tmp_path / 'single.npy'}: {LINE}; {cure}."]
 
 
-def test_reports_of_convert_and_info_say_it_too(room, tmp_path, capsys):
+def test_reports_of_convert_and_info_say_it_too(places, tmp_path, run):
     (tmp_path / "scans").mkdir()
-    np.save(tmp_path / "scans" / "hall.npy", moved(room, UTM))
+    np.save(tmp_path / "scans" / "hall.npy", moved(places, UTM))
     source = FolderSource(tmp_path / "scans", load_config("classic"), tmp_path / "out")
     report = convert_scan(Job(source, source.list_scans()[0], tmp_path / "out"))
     assert [LINE in warning for warning in report.warnings] == [True]
-    assert main(["info", str(tmp_path / "scans" / "hall.npy")]) == 0
-    assert capsys.readouterr().out.count(LINE) == 1
+    assert run("info", tmp_path / "scans" / "hall.npy").out.count(LINE) == 1

@@ -75,17 +75,15 @@ def test_calls_in_two_threads_change_nothing_for_others(make_threads):
 
 
 @pytest.fixture
-def make_threads():
+def make_threads(set_threads):
     """Run functions side by side and wait for them, with a setting of two threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
+    set_threads(2)
 
-    def run(*functions):
+    def start(*functions):
         threads = [Thread(target=function) for function in functions]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
 
-    yield run
-    torch.set_num_threads(before)
+    return start

@@ -95,12 +95,6 @@ transformed_functions = pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=[] if name in WITHOUT_RULES else newer_torch) for name in FUNCTIONS],
 )
-# Compilers take seconds for the long kernels, which others stand for.
-QUICK = {"covariance", "eigh3", "qn", "detmcd"}
-quick_functions = pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in FUNCTIONS],
-)
 # Torch's own, where it inlines a function that has no gradient to record.
 of_torch = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 
@@ -164,7 +158,7 @@ def test_functional_gradients_are_those_of_autograd(name, patches):
 
 @pytest.mark.slow
 @of_torch
-@quick_functions
+@functions
 def test_compiled_without_graph_breaks(name, patches):
     compiled = torch.compile(FUNCTIONS[name], fullgraph=True, backend="aot_eager")
     assert_close(compiled(patches), FUNCTIONS[name](patches))
@@ -184,7 +178,7 @@ class Exported(nn.Module):
 
 @pytest.mark.slow
 @of_torch
-@quick_functions
+@functions
 def test_exported_for_any_number_of_patches(name, patches):
     sizes = {0: torch.export.Dim("patches", min=2, max=1000)}
     program = torch.export.export(Exported(name), (patches,), dynamic_shapes=({**sizes},))

@@ -25,18 +25,25 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Figures, Results, markdown
-from tests.made import in_pieces, make_kinect_room, objects_of, on_voxels, scan_scene
+from tests.made import (
+    CurvedLayout,
+    in_pieces,
+    make_kinect_room,
+    objects_of,
+    on_voxels,
+    scan_scene,
+)
 from torchrg import make_superpoints, read_cloud, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.metrics import score_partition
-from torchrg.scenes import RoomLayout, Scene, build_room, make_room
+from torchrg.scenes import Scene, build_room, make_room
 from torchrg.structures import UNLABELED
 
 VOXEL = 0.03
 """Side of voxels, metres."""
 STRENGTHS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 7.0, 12.0, 20.0, 35.0)
 PEER_STRENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
-LAYOUT = RoomLayout(
+LAYOUT = CurvedLayout(
     size=(9.0, 7.0, 2.8), num_tables=5, num_columns=1, num_round_tables=1, num_balls=1, num_lamps=1
 )
 NOISE = 0.003

@@ -16,7 +16,6 @@ from tests.made import (
     CURVED_LAYOUT,
     HALL_LAYOUT,
     KINECT_LAYOUT,
-    StoreyLayout,
     make_kinect_room,
     make_mapped_room,
     make_storey,
@@ -198,9 +197,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     ),
     "cory": (
         lambda quick: (
-            make_storey(80_000, layout=StoreyLayout(rooms_per_side=2))
-            if quick
-            else make_storey(POINTS["cory"])
+            make_storey(80_000, rooms_per_side=2) if quick else make_storey(POINTS["cory"])
         ),
         "a hallway and the furnished rooms on both sides of it, noise 3 mm",
     ),

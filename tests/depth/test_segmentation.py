@@ -44,32 +44,19 @@ def corner(height=120, width=160):
     return depth, truth
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "camera"), [(0, 2), (2, 3)])
 def test_faces_of_rendered_rooms_are_found(seed, camera):
-    exact = rendered(seed, camera, sensor="exact")
+    small = {"width": 320, "height": 240}
+    exact = rendered(seed, camera, sensor="exact", **small)
     intrinsics = exact.camera.intrinsics
     seg = segment_depth(exact.depth, intrinsics)
     assert f1(seg.labels, exact) >= 95
     angles = unsigned_angle_deg(seg.normals[seg.valid], exact.normals[seg.valid])
     assert float((angles < 1).double().mean()) > 0.99
-    noisy = rendered(seed, camera, sensor="kinect")
+    noisy = rendered(seed, camera, sensor="kinect", **small)
     assert f1(segment_depth(noisy.depth, intrinsics).labels, noisy) >= 85
     millimeters = (exact.depth * 1000).round() / 1000
     assert f1(segment_depth(millimeters, intrinsics).labels, exact) >= 95
-
-
-@pytest.mark.slow
-def test_faces_of_many_rendered_rooms_are_found():
-    scores = {"exact": [], "kinect": []}
-    for seed in range(70, 76):
-        for sensor, found in scores.items():
-            frame = rendered(seed, seed % 4, sensor=sensor)
-            if len(frame.labels.unique()) > 3:
-                seg = segment_depth(frame.depth, frame.camera.intrinsics)
-                found.append(f1(seg.labels, frame))
-    assert min(scores["exact"]) >= 95
-    assert min(scores["kinect"]) >= 85
 
 
 def test_faces_of_a_real_frame_are_regions(scan):
@@ -187,16 +174,12 @@ def test_unit_origin_and_dtype_do_not_matter():
     torch.testing.assert_close(shift, seg.planes.offset, atol=1e-3, rtol=0)
 
 
-def test_threads_do_not_matter():
+def test_threads_do_not_matter(set_threads):
     frame = rendered(2, 3, sensor="kinect", width=320, height=240)
-    before = torch.get_num_threads()
-    try:
-        found = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            found.append(segment_depth(frame.depth, frame.camera.intrinsics))
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 3):
+        set_threads(threads)
+        found.append(segment_depth(frame.depth, frame.camera.intrinsics))
     assert torch.equal(found[0].labels, found[1].labels)
     assert torch.equal(found[0].normals, found[1].normals)
 

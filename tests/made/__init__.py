@@ -1,10 +1,10 @@
-"""Shapes, halls, storeys, laser scans, depth cameras: scenes that tests and scripts need.
+"""Scenes beside furnished rooms: curved rooms, storeys, scans, depth frames, shapes.
 
 To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
 each a face, and solids that hide what is inside them) and places where a scanner may stand.
 :func:`torchrg.scenes.sample_scene` turns it into a cloud with truth. A new kind of surface has the
-properties and methods of :class:`torchrg.scenes.Surface`, and ``intersect`` (as in ``rays``) if it
-is scanned. A part of the report takes it once it has a key in ``reproduction.clouds``, or in
+properties and methods of :class:`torchrg.scenes.Surface`, and a function in ``rays`` if it is
+scanned. A part of the report takes it once it has a key in ``reproduction.clouds``, or in
 ``shapes.SHAPES``.
 """
 
@@ -18,10 +18,11 @@ from tests.made.cameras import (
     make_mapped_room,
     render_depth,
 )
-from tests.made.patches import OUTLIERS, contaminated
+from tests.made.curved import CURVED_LAYOUT, CurvedLayout
 from tests.made.rays import cast_rays, scan_scene
 from tests.made.samples import (
-    CURVED_LAYOUT,
+    OUTLIERS,
+    contaminated,
     drawn_from_triangles,
     in_pieces,
     objects_of,
@@ -31,7 +32,6 @@ from tests.made.samples import (
 from tests.made.shapes import SHAPES, make_shape
 from tests.made.storeys import (
     HALL_LAYOUT,
-    StoreyLayout,
     build_storey,
     make_storey,
 )
@@ -43,8 +43,8 @@ __all__ = [
     "OUTLIERS",
     "SHAPES",
     "Camera",
+    "CurvedLayout",
     "DepthFrame",
-    "StoreyLayout",
     "build_storey",
     "cameras_around",
     "cast_rays",

@@ -1,4 +1,4 @@
-"""Other samples of scenes: voxels, pieces of unlike density, depth in steps, objects as truth."""
+"""Other samples of scenes: voxels, pieces of unlike density, triangles, depth in steps."""
 
 from collections.abc import Callable
 
@@ -8,36 +8,17 @@ from torch import Tensor
 
 from tests.made.cameras import cameras_around, fuse_frames, render_depth
 from torchrg.neighbors import sample_voxels, search_knn
-from torchrg.scenes import RoomLayout, Scene, SceneModel
+from torchrg.scenes import Scene, SceneModel
 from torchrg.structures import UNLABELED
 
-CURVED_LAYOUT = RoomLayout(
-    size=(8.0, 6.0, 2.6),
-    num_doors=1,
-    num_windows=0,
-    num_cabinets=0,
-    num_shelves=0,
-    num_tables=0,
-    num_boxes=0,
-    num_small_boxes=0,
-    num_pillars=0,
-    num_columns=3,
-    num_round_tables=1,
-    num_balls=3,
-    num_lamps=1,
-    num_bent_walls=2,
-)
-"""A small room in which most is round."""
+OUTLIERS = ("cluster", "shell", "far")
+"""Kinds: a compact cluster beside the plane, a shell around the point, and a cluster far away."""
+_PATCH_SIZE = 50
+"""Points of a neighbourhood."""
 
 
 def take_rows(scene: Scene, rows: Tensor) -> Scene:
-    """Return some points of a scene.
-
-    Example:
-        >>> from torchrg.scenes import make_room
-        >>> len(take_rows(make_room(100), torch.arange(7)).labels)
-        7
-    """
+    """Return some points of a scene."""
     points, labels, normals = (values[rows] for values in scene[:3])
     return scene._replace(points=points, labels=labels, normals=normals)
 
@@ -73,11 +54,6 @@ def drawn_from_triangles(scene: Scene, num_points: int, *, seed: int = 0) -> Sce
 
     A triangle is a point and two of its six neighbours; a point of it belongs to the face of the
     nearest corner.
-
-    Example:
-        >>> from torchrg.scenes import make_room
-        >>> drawn_from_triangles(make_room(1000), 3000).points.shape
-        torch.Size([3000, 3])
     """
     rng, num_neighbors = np.random.default_rng(seed), 6
     near = search_knn(scene.points, 1 + num_neighbors).indices.numpy()
@@ -103,3 +79,26 @@ def quantised_frame(
 def objects_of(scene: Scene) -> Tensor:
     """Return the object of each point, shape ``(N,)``, -1 for none."""
     return torch.cat([scene.objects, torch.tensor([UNLABELED])])[scene.labels]
+
+
+def contaminated(
+    kind: str, share: float, rng: torch.Generator, count: int = 30
+) -> tuple[Tensor, Tensor]:
+    """Return noisy planes turned at random, a share of the points outliers, and their normals.
+
+    Example:
+        >>> patches, normals = contaminated("shell", 0.1, torch.Generator(), count=3)
+        >>> patches.shape, normals.shape
+        (torch.Size([3, 50, 3]), torch.Size([3, 3]))
+    """
+    patches = torch.rand(count, _PATCH_SIZE, 3, generator=rng) - 0.5
+    patches[..., 2] = 0.01 * torch.randn(count, _PATCH_SIZE, generator=rng)
+    number = round(share * _PATCH_SIZE)
+    scatter = torch.randn(count, number, 3, generator=rng)
+    patches[:, :number] = {
+        "cluster": torch.tensor([0.2, 0.1, 0.4]) + 0.05 * scatter,
+        "shell": 0.5 * scatter / scatter.norm(dim=-1, keepdim=True),
+        "far": torch.tensor([5.0, 5.0, 10.0]) + scatter,
+    }[kind]
+    turn = torch.linalg.qr(torch.randn(count, 3, 3, generator=rng)).Q
+    return patches @ turn, turn[:, 2]

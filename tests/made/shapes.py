@@ -1,23 +1,19 @@
 """Closed shapes with exact normals: what normal estimators are compared on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.made.extrusions import Outline, extrude
-from torchrg.errors import ConfigError
+from tests.made.curved import Cone, Ring
 from torchrg.scenes import (
     Array,
-    Cone,
     Flat,
     Frame,
     Part,
-    Ring,
     Scene,
     SceneModel,
     Surface,
@@ -26,203 +22,203 @@ from torchrg.scenes import (
     sample_scene,
     unit,
 )
-
-_NODES = 96
-"""Of the quadrature for the area."""
-_STEPS = 512
-"""Along a ray; a graze shorter than one of them is not seen."""
-_HALVINGS = 48
-"""Of a step, to find where it crosses the surface."""
-
-
-@dataclass(frozen=True, eq=False)
-class Bumpy:
-    """A ball whose radius goes up and down with the direction.
-
-    In the direction d from the middle the radius is ``radius (1 + sum_i a_i T_n(d . e_i))`` with
-    Chebyshev polynomials of some degree n: ``T_n(cos t) = cos(n t)``, waves about the axes e_i.
-
-    Args:
-        kind: What it is part of.
-        frame: The middle, and the axes of the directions.
-        radius: Without bumps.
-        axes: Unit vectors e_i, shape ``(B, 3)``.
-        heights: Of the waves in radii, a_i, shape ``(B,)``; their sum is below one.
-        degree: Number of waves along a great circle through their axis.
-
-    Example:
-        >>> ball = Bumpy("ball", Frame.upright(np.zeros(3)), 0.5, np.eye(3), np.zeros(3), 4)
-        >>> abs(ball.area - np.pi) < 1e-12
-        True
-    """
-
-    kind: str
-    frame: Frame
-    radius: float
-    axes: Array
-    heights: Array
-    degree: int
-
-    plane = None
-
-    @cached_property
-    def area(self) -> float:
-        """Its area, by quadrature."""
-        z, weights = np.polynomial.legendre.leggauss(_NODES)
-        angle, flat = np.arange(2 * _NODES) * (np.pi / _NODES), np.sqrt(1 - z * z)[:, None]
-        sides = (flat * np.cos(angle), flat * np.sin(angle), z[:, None])
-        towards = np.stack(np.broadcast_arrays(*sides), axis=-1)
-        elements = self._elements(towards.reshape(-1, 3)).reshape(_NODES, 2 * _NODES)
-        return float((elements * weights[:, None]).sum() * np.pi / _NODES)
-
-    @property
-    def bounds(self) -> Array:
-        """Lowest and highest coordinates of a box around it, shape ``(2, 3)``."""
-        reach = self.radius * (1 + np.abs(self.heights).sum())
-        return np.stack([self.frame.origin - reach, self.frame.origin + reach])
-
-    def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return points spread evenly over it, shape ``(count, 3)``."""
-        total = np.abs(self.heights).sum()
-        reach, slope = self.radius * (1 + total), self.radius * total * self.degree
-        most = reach * np.sqrt(reach * reach + slope * slope)
-        drawn, missing = [np.zeros((0, 3))], count
-        while missing > 0:
-            towards = unit(rng.standard_normal((2 * missing + 16, 3)))
-            kept = rng.random(len(towards)) * most < self._elements(towards)
-            drawn.append(towards[kept][:missing])
-            missing -= len(drawn[-1])
-        towards = np.concatenate(drawn)
-        return self.frame.to_world(self._radius(towards)[0][:, None] * towards)
-
-    def normals_at(self, points: Array) -> Array:
-        """Return the outward unit normals at points on it, shape ``(N, 3)``."""
-        towards = unit(self.frame.to_local(points))
-        radius, slope = self._radius(towards)
-        return self.frame.vectors_to_world(unit(radius[:, None] * towards - slope))
-
-    def intersect(self, origins: Array, directions: Array) -> Array:
-        """Return how far along each ray it is first met, shape ``(N,)``; infinite where never.
-
-        The ray is followed in small steps, so that it may miss what it only grazes.
-        """
-        start, step = self.frame.to_local(origins), self.frame.vectors_to_local(directions)
-        near, far = self._entry_and_exit(start, step)
-        nearest = np.full(len(step), np.inf)
-        rows = np.flatnonzero(far > near)
-        start = np.broadcast_to(start, step.shape)[rows]
-        step, near, far = step[rows], near[rows], far[rows]
-        width = (far - near) / _STEPS
-        first = np.full(len(rows), _STEPS)
-        outside = self._is_outside(start, step, near)
-        for number in range(1, _STEPS + 1):
-            crossed = self._is_outside(start, step, near + number * width) != outside
-            first = np.where(crossed, np.minimum(first, number - 1), first)
-        before = near + first * width
-        found = self._crossing(start, step, before, before + width, outside)
-        nearest[rows] = np.where(first < _STEPS, found, np.inf)
-        return nearest
-
-    def _entry_and_exit(self, start: Array, step: Array) -> tuple[Array, Array]:
-        """Return where rays are inside the ball around the body; exit before entry if never."""
-        reach = self.radius * (1 + np.abs(self.heights).sum())
-        a, b = np.vecdot(step, step), np.vecdot(start, step)
-        discriminant = b * b - a * (np.vecdot(start, start) - reach * reach)
-        half = np.sqrt(np.maximum(discriminant, 0))
-        far = np.where(discriminant > 0, (half - b) / a, -np.inf)
-        return np.maximum((-half - b) / a, 0), far
-
-    def _is_outside(self, start: Array, step: Array, distance: Array) -> NDArray[np.bool_]:
-        """Return whether places along rays are outside of the body."""
-        places = start + distance[:, None] * step
-        lengths = np.sqrt(np.vecdot(places, places))
-        outside: NDArray[np.bool_] = lengths > self._radius(places / lengths[:, None])[0]
-        return outside
-
-    def _crossing(
-        self, start: Array, step: Array, before: Array, after: Array, outside: NDArray[np.bool_]
-    ) -> Array:
-        """Return where rays cross the surface between two places, by halving."""
-        for _ in range(_HALVINGS):
-            middle = (before + after) / 2
-            same = self._is_outside(start, step, middle) == outside
-            before, after = np.where(same, middle, before), np.where(same, after, middle)
-        return (before + after) / 2
-
-    def _radius(self, towards: Array) -> tuple[Array, Array]:
-        """Return radius ``(N,)`` and its slope on the unit sphere ``(N, 3)`` in directions."""
-        radius, slope = np.ones(len(towards)), np.zeros(towards.shape)
-        for axis, height in zip(self.axes, self.heights, strict=True):
-            value, derivative = _chebyshev(np.vecdot(towards, axis), self.degree)
-            radius += height * value
-            across = axis - np.vecdot(towards, axis)[:, None] * towards
-            slope += (height * derivative)[:, None] * across
-        return self.radius * radius, self.radius * slope
-
-    def _elements(self, towards: Array) -> Array:
-        """Return the area of the surface by solid angle in directions, shape ``(N,)``."""
-        radius, slope = self._radius(towards)
-        elements: Array = radius * np.sqrt(radius * radius + np.vecdot(slope, slope))
-        return elements
-
-
-def _chebyshev(x: Array, degree: int) -> tuple[Array, Array]:
-    """Return the Chebyshev polynomial of a degree and its derivative, by their recurrences."""
-    lower, value = np.ones_like(x), x
-    lower_derivative, derivative = np.zeros_like(x), np.ones_like(x)
-    for _ in range(degree - 1):
-        following = 2 * value + 2 * x * derivative - lower_derivative
-        lower_derivative, derivative = derivative, following
-        lower, value = value, 2 * x * value - lower
-    return value, derivative
-
+from torchrg.scenes.geometry import box_around
+from torchrg.scenes.scene import NoiseDirection
+from torchrg.scenes.surfaces import Plane, in_space
 
 _HERE = Frame.upright(np.zeros(3))
 _QUARTER = np.pi / 2
-_VIEWPOINT = np.array([[1.5, -2.0, 1.5]])
 
 
 def make_shape(
     name: str,
-    num_points: int = 100_000,
+    num_points: int = 30_000,
     noise_fraction: float = 0.0,
     seed: int = 0,
     *,
-    noise_direction: Literal["normal", "isotropic"] = "isotropic",
+    noise_direction: NoiseDirection = "isotropic",
 ) -> Scene:
-    """Make a cloud of a closed shape of about unit size with exact outward normals.
+    """Make a cloud of one of ``SHAPES``, of a size of about one, with outward normals.
 
-    Args:
-        name: One of ``SHAPES``.
-        num_points: Number of points, spread evenly.
-        noise_fraction: Standard deviation of the noise, as a share of the diagonal of the box
-            around the shape.
-        seed: Two calls with equal arguments give equal clouds.
-        noise_direction: ``"isotropic"``: that deviation along each coordinate; ``"normal"``:
-            along the normal only.
-
-    Returns:
-        The cloud and its truth.
-
-    Raises:
-        ConfigError: If there is no such shape, or a setting is not allowed.
+    The standard deviation of the noise, along each coordinate or along the normal, is a share of
+    the diagonal of the box around the shape.
 
     Example:
         >>> cube = make_shape("cube", 1000)
         >>> float(cube.points.abs().max()), len(cube.kinds)
         (0.5, 6)
     """
-    if name not in SHAPES:
-        names = ", ".join(SHAPES)
-        raise ConfigError(f"make_shape: expected name to be one of {names}, got {name!r}.")
-    model = SceneModel((Part(SHAPES[name]()),), _VIEWPOINT)
-    diagonal = float(np.sqrt(((model.bounds[1] - model.bounds[0]) ** 2).sum()))
-    return sample_scene(
-        model,
-        num_points,
-        noise=noise_fraction * diagonal,
-        seed=seed,
-        noise_direction=noise_direction,
+    model = SceneModel((Part(SHAPES[name]()),), np.full((1, 3), 10.0))
+    low, high = box_around(np.concatenate([surface.bounds for surface in model.surfaces]))
+    noise = noise_fraction * float(np.sqrt(((high - low) ** 2).sum()))
+    return sample_scene(model, num_points, noise=noise, seed=seed, noise_direction=noise_direction)
+
+
+class Fan(Flat):
+    """A union of triangles in one plane, each half of a cell."""
+
+    @property
+    def area(self) -> float:
+        """Its area."""
+        return float((self._cell_areas / 2).sum())
+
+    def _corners(self) -> Array:
+        corner, first, second = self.cells.swapaxes(0, 1)
+        return in_space(np.concatenate([corner, corner + first, corner + second]))
+
+    def _shares(self, first: Array, second: Array) -> tuple[Array, Array]:
+        beyond = first + second > 1
+        return np.where(beyond, 1 - first, first), np.where(beyond, 1 - second, second)
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A polygon whose corners may be rounded, with round holes.
+
+    Args:
+        corners: Counterclockwise, shape ``(M, 2)``.
+        radii: Radius at each corner, 0 for a sharp one, shape ``(M,)``; inward corners are rounded
+            by fillets.
+        holes: Each as (x, y, radius); they meet neither each other nor the edge.
+    """
+
+    corners: Array
+    radii: Array
+    holes: Sequence[tuple[float, float, float]] = ()
+
+    @cached_property
+    def ways(self) -> tuple[Array, Array]:
+        """Unit vectors along the edge into and out of each corner, shape ``(M, 2)`` each."""
+        edges = np.roll(self.corners, -1, axis=0) - self.corners
+        out = edges / np.sqrt((edges * edges).sum(axis=1))[:, None]
+        return np.roll(out, 1, axis=0), out
+
+    @cached_property
+    def turns(self) -> tuple[Array, Array]:
+        """Sine, positive to the left, and cosine of the turn at each corner, ``(M,)`` each."""
+        into, out = self.ways
+        return into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], (into * out).sum(axis=1)
+
+    @cached_property
+    def arcs(self) -> tuple[Array, Array, Array]:
+        """Start ``(M, 2)``, middle ``(M, 2)`` and unsigned angle ``(M,)`` of each rounding."""
+        into, (sines, cosines) = self.ways[0], self.turns
+        left = np.stack([-into[:, 1], into[:, 0]], axis=1)
+        starts = self.corners - self.tangents[:, None] * into
+        middles = starts + (np.sign(sines) * self.radii)[:, None] * left
+        return starts, middles, np.arctan2(np.abs(sines), cosines)
+
+    @cached_property
+    def tangents(self) -> Array:
+        """Distance from each corner to where its rounding starts, shape ``(M,)``."""
+        sines, cosines = self.turns
+        reach: Array = self.radii * np.abs(sines) / (1 + cosines)  # tan(turn / 2)
+        return reach
+
+    @cached_property
+    def area(self) -> float:
+        """Area inside."""
+        x, y = self.corners.T
+        whole = ((x * np.roll(y, -1)) - np.roll(x, -1) * y).sum() / 2
+        # Between a corner and its arc: a kite less a sector.
+        cut = self.radii * self.tangents - self.radii**2 * self.arcs[2] / 2
+        holes = sum(np.pi * radius**2 for _, _, radius in self.holes)
+        return float(whole - (np.sign(self.turns[0]) * cut).sum() - holes)
+
+    def contains(self, x: Array, y: Array) -> NDArray[np.bool_]:
+        """Return which places, of shape ``(N,)``, are inside."""
+        inside, places, (_, out) = _in_polygon(x, y, self.corners), np.stack([x, y], 1), self.ways
+        starts, middles, _ = self.arcs
+        ends = self.corners + self.tangents[:, None] * out
+        for row in np.flatnonzero(self.radii):
+            kite = np.stack([starts[row], self.corners[row], ends[row], middles[row]])
+            beyond = ((places - middles[row]) ** 2).sum(axis=1) > self.radii[row] ** 2
+            between = _in_polygon(x, y, kite) & beyond
+            inside = np.where(between, self.turns[0][row] < 0, inside)
+        for *middle, radius in self.holes:
+            inside &= ((places - middle) ** 2).sum(axis=1) >= radius**2
+        return inside
+
+
+def _in_polygon(x: Array, y: Array, corners: Array) -> NDArray[np.bool_]:
+    """Return which places are inside a polygon: a line to the right crosses it an odd number."""
+    inside = np.zeros(len(x), dtype=bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y0 != y1:
+            crosses = (y0 > y) != (y1 > y)
+            inside ^= crosses & (x < x0 + (y - y0) * ((x1 - x0) / (y1 - y0)))
+    return inside
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet(Surface):
+    """The flat inside of an outline in the plane of a frame's first two axes."""
+
+    outline: Outline
+
+    @property
+    def plane(self) -> Plane:
+        """Normal and offset of its plane."""
+        return self.frame.axes[2], float(np.vecdot(self.frame.axes[2], self.frame.origin))
+
+    @property
+    def area(self) -> float:
+        """Its area."""
+        return self.outline.area
+
+    def normals_at(self, points: Array) -> Array:
+        """Return the outward unit normal at each point, shape ``(N, 3)``."""
+        return np.broadcast_to(self.frame.axes[2], points.shape)
+
+    def _corners(self) -> Array:
+        return in_space(self.outline.corners)
+
+    def _draw(self, rng: np.random.Generator, count: int) -> Array:
+        low, high = box_around(self.outline.corners)
+        drawn, missing = [np.zeros((0, 2))], count
+        while missing > 0:
+            tried = low + (high - low) * rng.random((2 * missing + 16, 2))
+            drawn.append(tried[self.outline.contains(*tried.T)][:missing])
+            missing -= len(drawn[-1])
+        return in_space(np.concatenate(drawn))
+
+
+def extrude(outline: Outline, height: float) -> tuple[Surface, ...]:
+    """Return the faces of a body with the same outline at every height.
+
+    These are the bottom, the top, the straight sides, the roundings, the holes.
+    """
+    mirrored = Outline(
+        (outline.corners * [1, -1])[::-1],
+        outline.radii[::-1],
+        [(x, -y, radius) for x, y, radius in outline.holes],
+    )
+    upside_down = Frame(_HERE.origin, _HERE.axes * np.array([[1], [-1], [-1]]))
+    faces: list[Surface] = [
+        Sheet("side", upside_down, mirrored),
+        Sheet("side", _HERE.moved(0, 0, height), outline),
+    ]
+    after = outline.corners + outline.tangents[:, None] * outline.ways[1]
+    before, middles, angles = outline.arcs
+    for start, end in zip(after, np.roll(before, -1, axis=0), strict=True):
+        edge = end - start
+        span = Frame.spanned(np.array([*start, 0]), np.array([*edge, 0]), np.array([0, 0, 1.0]))
+        span = span.inside(_HERE)
+        faces.append(rectangle("side", span, float(np.sqrt((edge * edge).sum())), height))
+    for row in np.flatnonzero(outline.radii * outline.turns[0]):
+        # From the first point of the arc the turn is to the left, or for a fillet to the right:
+        # then the third axis points down, so up is towards negative heights.
+        side = int(np.sign(outline.turns[0][row]))
+        x, y = before[row] - middles[row]
+        span = Frame.spanned(
+            np.array([*middles[row], 0]), np.array([x, y, 0]), side * np.array([-y, x, 0])
+        )
+        radius, turn = float(outline.radii[row]), (0.0, float(angles[row]))
+        span = span.inside(_HERE)
+        faces.append(Cone("side", span, (radius, 0), (radius, side * height), turn))
+    return (
+        *faces,
+        *(Cone("side", _HERE.moved(x, y), (r, height), (r, 0)) for x, y, r in outline.holes),
     )
 
 
@@ -233,23 +229,19 @@ def _box(*size: float) -> tuple[Surface, ...]:
 
 
 def _convex(corners: Array, directions: Array) -> tuple[Surface, ...]:
-    """Return the faces of a convex body, given its corners and a normal of each face."""
+    """Return the faces of a convex body, from its corners and a normal of each face."""
     faces: list[Surface] = []
     for normal in unit(directions):
         heights = corners @ normal
         face = corners[heights > heights.max() - 1e-6]
         frame = Frame.spanned(face.mean(axis=0), face[0] - face.mean(axis=0), face[1] - face[0])
         x, y, z = (*frame.to_local(face).T[:2], frame.axes[2] @ normal)
-        faces.append(_polygon("side", face[np.argsort(np.arctan2(y * np.sign(z), x))]))
+        ring = face[np.argsort(np.arctan2(y * np.sign(z), x))]
+        frame = Frame.spanned(ring[0], ring[1] - ring[0], ring[2] - ring[0])
+        flat = frame.to_local(ring)[:, :2]
+        fan = [[(0.0, 0.0), tuple(left), tuple(right)] for left, right in pairwise(flat[1:])]
+        faces.append(Fan("side", frame, np.array(fan)))
     return tuple(faces)
-
-
-def _polygon(kind: str, corners: Array) -> Flat:
-    """Return a convex polygon, given its corners counterclockwise seen from outside."""
-    frame = Frame.spanned(corners[0], corners[1] - corners[0], corners[2] - corners[0])
-    flat = frame.to_local(corners)[:, :2]
-    fan = [[(0.0, 0.0), tuple(left), tuple(right)] for left, right in pairwise(flat[1:])]
-    return Flat(kind, frame, np.array(fan), triangular=True)
 
 
 def _signs(*values: float) -> Array:
@@ -262,10 +254,6 @@ def _cycled(corners: Array) -> Array:
     return np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
 
 
-def _octahedron() -> tuple[Surface, ...]:
-    return _convex(_cycled(_signs(0.7, 0, 0)), _signs(1, 1, 1))
-
-
 def _dodecahedron() -> tuple[Surface, ...]:
     golden = (1 + np.sqrt(5)) / 2
     corners = np.concatenate([_signs(1, 1, 1), _cycled(_signs(0, 1 / golden, golden))])
@@ -275,26 +263,26 @@ def _dodecahedron() -> tuple[Surface, ...]:
 def _hexagonal_prism() -> tuple[Surface, ...]:
     angles = np.arange(6) * (np.pi / 3)
     corners = 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return extrude("side", _HERE, Outline(corners, np.zeros(6)), 0.7)
+    return extrude(Outline(corners, np.zeros(6)), 0.7)
 
 
 def _bracket() -> tuple[Surface, ...]:
     """Return an angle with a rounded heel, a fillet, one rounded toe and one sharp."""
     corners = np.array([(0, 0), (1, 0), (1, 0.25), (0.25, 0.25), (0.25, 0.9), (0, 0.9)])
-    return extrude("side", _HERE, Outline(corners, np.array([0.2, 0, 0.1, 0.12, 0, 0])), 0.5)
+    return extrude(Outline(corners, np.array([0.2, 0, 0.1, 0.12, 0, 0])), 0.5)
 
 
 def _stairs() -> tuple[Surface, ...]:
     steps = [(1, 0), (1, 0.2), (0.75, 0.2), (0.75, 0.4), (0.5, 0.4), (0.5, 0.6), (0.25, 0.6)]
     corners = np.array([(0, 0), *steps, (0.25, 0.8), (0, 0.8)])
-    return extrude("side", _HERE, Outline(corners, np.zeros(len(corners))), 0.6)
+    return extrude(Outline(corners, np.zeros(len(corners))), 0.6)
 
 
 def _plate() -> tuple[Surface, ...]:
     """Return a plate with two rounded and two sharp corners and two holes."""
     corners = np.array([(0, 0), (1, 0), (1, 0.7), (0, 0.7)])
     holes = [(0.3, 0.35, 0.15), (0.72, 0.35, 0.1)]
-    return extrude("side", _HERE, Outline(corners, np.array([0.15, 0.15, 0, 0]), holes), 0.15)
+    return extrude(Outline(corners, np.array([0.15, 0.15, 0, 0]), holes), 0.15)
 
 
 def _rounded_box() -> tuple[Surface, ...]:
@@ -320,53 +308,24 @@ def _rounded_box() -> tuple[Surface, ...]:
     return tuple(faces)
 
 
-def _cylinder() -> tuple[Surface, ...]:
-    radius, half = 0.3, 0.5
-    profile = [(0, -half), (radius, -half), (radius, half), (0, half)]
-    return _lathe(profile)
-
-
-def _cone() -> tuple[Surface, ...]:
-    return _lathe([(0, 0), (0.4, 0), (0, 1)])
-
-
-def _lathe(profile: list[tuple[float, float]]) -> tuple[Surface, ...]:
+def _lathe(*profile: tuple[float, float]) -> tuple[Surface, ...]:
     """Return a body turned from a profile, from the lower to the upper end of its axis."""
     return tuple(Cone("side", _HERE, start, end) for start, end in pairwise(profile))
-
-
-def _capsule() -> tuple[Surface, ...]:
-    radius, half = 0.25, 0.3
-    return (
-        Ring("end", _HERE.moved(0, 0, -half), 0, radius, (-_QUARTER, 0)),
-        Cone("side", _HERE, (radius, -half), (radius, half)),
-        Ring("end", _HERE.moved(0, 0, half), 0, radius, (0, _QUARTER)),
-    )
-
-
-def _bumpy(radius: float, height: float, degree: int) -> tuple[Surface, ...]:
-    """Return a ball with waves about four axes."""
-    axes = unit(np.array([(1.0, 0.3, 0.2), (-0.4, 1, 0.1), (0.2, -0.3, 1), (1, 1, -1)]))
-    return (Bumpy("ball", _HERE, radius, axes, np.full(4, height), degree),)
 
 
 SHAPES: dict[str, Callable[[], tuple[Surface, ...]]] = {
     "cube": lambda: _box(1, 1, 1),
     "cuboid": lambda: _box(1, 0.6, 0.35),
     "thin_plate": lambda: _box(1, 0.8, 0.02),
-    "octahedron": _octahedron,
+    "octahedron": lambda: _convex(_cycled(_signs(0.7, 0, 0)), _signs(1, 1, 1)),
     "dodecahedron": _dodecahedron,
     "hexagonal_prism": _hexagonal_prism,
     "stairs": _stairs,
     "bracket": _bracket,
     "plate": _plate,
     "rounded_box": _rounded_box,
-    "capsule": _capsule,
-    "cylinder": _cylinder,
-    "cone": _cone,
+    "cylinder": lambda: _lathe((0, -0.5), (0.3, -0.5), (0.3, 0.5), (0, 0.5)),
     "sphere": lambda: (Ring("ball", _HERE, 0, 0.5),),
     "torus": lambda: (Ring("torus", _HERE, 0.35, 0.15, (-np.pi, np.pi)),),
-    "pebble": lambda: _bumpy(0.45, 0.04, 3),
-    "coral": lambda: _bumpy(0.4, 0.05, 7),
 }
 """The shapes :func:`make_shape` knows, each with what builds it."""

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchrg.errors import ConfigError
 from torchrg.scenes import (
     Flat,
     Frame,
@@ -19,6 +18,7 @@ from torchrg.scenes import (
     room_walls,
     sample_scene,
 )
+from torchrg.scenes.surfaces import Hole
 
 HALL_LAYOUT = RoomLayout(
     size=(24.0, 2.4, 2.7),
@@ -36,19 +36,8 @@ HALL_LAYOUT = RoomLayout(
 )
 """A hallway with doors on both sides."""
 
-
-HALL_WALLS = (0, 2)
-"""The long walls of the hallway."""
-_DOOR_HEIGHT = (1.98, 2.15)
-"""Metres."""
-_DOOR_LEAF = 0.04
-"""Thickness, metres."""
-_FIRST_WALL = 0
-"""Of a room: the one along the hallway."""
-_STOREY = 500
-"""What random numbers are drawn for: rooms and what is in them."""
-
 _HALL = replace(HALL_LAYOUT, size=(24.0, 2.4, 2.5), num_doors=2, num_cabinets=1, num_panels=2)
+"""The hallway of a storey; its length is that of the rooms."""
 _ROOM = RoomLayout(
     num_doors=0,
     num_windows=1,
@@ -59,38 +48,64 @@ _ROOM = RoomLayout(
     num_small_boxes=1,
     num_pillars=0,
 )
+"""What is in each room of a storey; its size is drawn."""
+_WIDTHS, _DEPTHS, _HEIGHTS = (4.6, 6.2), (4.3, 5.1), (2.6, 2.9)
+"""Least and greatest extents of rooms, metres; the width is along the hallway."""
+_WALLS = (0.33, 0.42)
+"""Least and greatest thickness of walls, metres."""
+_DOOR_HEIGHTS = (1.98, 2.15)
+"""Metres."""
+_DOOR_LEAF = 0.04
+"""Thickness, metres."""
+
+_HALL_WALLS = (0, 2)
+"""The long walls of the hallway."""
+_FIRST_WALL = 0
+"""Of a room: the one along the hallway."""
+_STOREY = 500
+"""Purpose of the random numbers: rooms and what is in them."""
+
+
+def make_storey(
+    num_points: int, noise: float = 0.003, seed: int = 0, *, rooms_per_side: int = 4
+) -> Scene:
+    """Make a cloud of a hallway and the furnished rooms along it; see :func:`build_storey`.
+
+    Example:
+        >>> make_storey(1000).kinds.count("ceiling")
+        9
+    """
+    model = build_storey(seed, rooms_per_side=rooms_per_side)
+    return sample_scene(model, num_points, noise=noise, seed=seed)
+
+
+def build_storey(seed: int = 0, *, rooms_per_side: int = 4) -> SceneModel:
+    """Build the description of a hallway and the rooms on both sides of it.
+
+    The floor, which is the first face, runs through the open doors; every ceiling is at a height of
+    its own. Within each room no face lies in the plane of another.
+    """
+    rng, width = np.random.default_rng([seed, _STOREY]), _HALL.size[1]
+    rooms = _draw_rooms(2 * rooms_per_side, width, rng)
+    length = max(room.left + room.size[0] for room in rooms) + rng.uniform(0.2, 0.5)
+    hall_layout = replace(_HALL, size=(length, width, _HALL.size[2]))
+    hall = Frame.upright(np.zeros(3))
+    walls = room_walls(hall, hall_layout.size)
+    doorways = [(room.hall_wall, room.hall_doorway(length)) for room in rooms]
+    hall_parts = furnish(hall_layout, hall, rng, doorways=doorways, with_floor=False)
+    parts: list[Part] = [Part((_floor(rooms, length, width),)), *hall_parts]
+    viewpoints = [free_places(hall_layout, hall, hall_parts, rng)]
+    for room, (wall, doorway) in zip(rooms, doorways, strict=True):
+        layout, holes = replace(_ROOM, size=room.size), [(_FIRST_WALL, room.doorway)]
+        contents = furnish(layout, room.frame, rng, doorways=holes, with_floor=False)
+        parts += [passage("door frame", walls[wall], doorway, room.thickness), *contents]
+        parts.append(_open_door(room, rng))
+        viewpoints.append(free_places(layout, room.frame, parts, rng))
+    return SceneModel(tuple(parts), np.concatenate(viewpoints))
 
 
 @dataclass(frozen=True)
-class StoreyLayout:
-    """Rooms on both sides of a hallway, with open doors; lengths in metres."""
-
-    rooms_per_side: int = 4
-    room_width: tuple[float, float] = (4.6, 6.2)
-    """Least and greatest width, along the hallway."""
-    room_depth: tuple[float, float] = (4.3, 5.1)
-    room_height: tuple[float, float] = (2.6, 2.9)
-    wall_thickness: tuple[float, float] = (0.33, 0.42)
-    hall: RoomLayout = _HALL
-    """The hallway; its length is that of the rooms. A short one has place for less."""
-    room: RoomLayout = _ROOM
-    """What is in each room; its size is drawn."""
-
-    def __post_init__(self) -> None:
-        if self.rooms_per_side < 1:
-            raise ConfigError(
-                f"StoreyLayout: expected rooms_per_side >= 1, got {self.rooms_per_side}."
-            )
-        for name in ("room_width", "room_depth", "room_height", "wall_thickness"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise ConfigError(
-                    f"StoreyLayout: expected {name} as (least, greatest), got {(low, high)}."
-                )
-
-
-@dataclass(frozen=True)
-class StoreyRoom:
+class _Room:
     """A room along the hallway; lengths along it are those of the world's first axis."""
 
     size: tuple[float, float, float]
@@ -103,13 +118,13 @@ class StoreyRoom:
     @property
     def frame(self) -> Frame:
         """The room's own axes: the second leads away from the hallway."""
-        if self.hall_wall == HALL_WALLS[0]:
+        if self.hall_wall == _HALL_WALLS[0]:
             corner = (self.left + self.size[0], -self.thickness, 0)
             return Frame.upright(np.array(corner), heading_deg=180)
         return Frame.upright(np.array([self.left, self.hall_width + self.thickness, 0]))
 
     @property
-    def doorway(self) -> tuple[float, float, float, float]:
+    def doorway(self) -> Hole:
         """Hole in the room's first wall, which starts at its right end."""
         left, right, top = self.door
         return self.size[0] - right, self.size[0] - left, 0.0, top
@@ -119,42 +134,30 @@ class StoreyRoom:
         ends = self.frame.to_world(np.array([(x, 0, 0) for x in self.door[:2]]))[:, 0]
         return float(ends.min()), float(ends.max())
 
-    def hall_doorway(self, length: float) -> tuple[float, float, float, float]:
+    def hall_doorway(self, length: float) -> Hole:
         """Return the hole in the hallway's wall; its first wall starts at the far end."""
         left, right = self.span()
-        if self.hall_wall == HALL_WALLS[0]:
+        if self.hall_wall == _HALL_WALLS[0]:
             left, right = length - right, length - left
         return left, right, 0.0, self.door[2]
 
 
-def draw_rooms(
-    layout: StoreyLayout, hall_width: float, rng: np.random.Generator
-) -> list[StoreyRoom]:
+def _draw_rooms(count: int, hall_width: float, rng: np.random.Generator) -> list[_Room]:
     """Return the rooms on both sides, with walls, ceilings and doors in planes of their own."""
-    count = 2 * layout.rooms_per_side
-    depths = _spread(rng, count, layout.room_depth)
-    heights = _spread(rng, count, layout.room_height)
-    thicknesses = _spread(rng, count, layout.wall_thickness)
-    tops = _spread(rng, count, _DOOR_HEIGHT)
-    rooms: list[StoreyRoom] = []
+    depths, heights = _spread(rng, count, _DEPTHS), _spread(rng, count, _HEIGHTS)
+    thicknesses, tops = _spread(rng, count, _WALLS), _spread(rng, count, _DOOR_HEIGHTS)
+    rooms: list[_Room] = []
     for number in range(count):
-        side, first = HALL_WALLS[number % 2], number < 2
+        first = number < 2
         left = rng.uniform(0.1, 0.4) if first else rooms[-2].left + rooms[-2].size[0]
-        left += 0 if first else rng.uniform(*layout.wall_thickness)
-        width, door_width = rng.uniform(*layout.room_width), rng.uniform(0.85, 1.0)
+        left += 0 if first else rng.uniform(*_WALLS)
+        width, door_width = rng.uniform(*_WIDTHS), rng.uniform(0.85, 1.0)
         door_left = rng.uniform(0.35, 0.5)
         if rng.random() < 0.5:
             door_left = width - door_left - door_width
-        rooms.append(
-            StoreyRoom(
-                size=(width, depths[number], heights[number]),
-                left=left,
-                hall_wall=side,
-                hall_width=hall_width,
-                thickness=thicknesses[number],
-                door=(door_left, door_left + door_width, tops[number]),
-            )
-        )
+        door = (door_left, door_left + door_width, tops[number])
+        size, wall = (width, depths[number], heights[number]), _HALL_WALLS[number % 2]
+        rooms.append(_Room(size, left, wall, hall_width, thicknesses[number], door))
     return rooms
 
 
@@ -165,65 +168,7 @@ def _spread(rng: np.random.Generator, count: int, ends: tuple[float, float]) -> 
     return [float(value) for value in low + (high - low) * steps / count]
 
 
-def make_storey(
-    num_points: int = 1_097_901,
-    noise: float = 0.003,
-    seed: int = 0,
-    *,
-    layout: StoreyLayout | None = None,
-) -> Scene:
-    """Make a cloud of a hallway and the furnished rooms along it; see :func:`build_storey`.
-
-    The floor runs through the open doors and is one face; every ceiling is at a height of its own.
-    Within each room no face lies in the plane of another.
-
-    Example:
-        >>> make_storey(1000).kinds.count("ceiling")
-        9
-    """
-    return sample_scene(build_storey(seed, layout=layout), num_points, noise=noise, seed=seed)
-
-
-def build_storey(seed: int = 0, *, layout: StoreyLayout | None = None) -> SceneModel:
-    """Build the description of a hallway and the rooms along it.
-
-    Args:
-        seed: Of sizes and places.
-        layout: Number and sizes of the rooms, and what is in them. Default: ``StoreyLayout()``.
-
-    Returns:
-        The scene. Its first face is the floor.
-
-    Raises:
-        ConfigError: If a room is too small for its furniture.
-
-    Example:
-        >>> build_storey().surfaces[0].kind
-        'floor'
-    """
-    layout, rng = layout or StoreyLayout(), np.random.default_rng([seed, _STOREY])
-    width = layout.hall.size[1]
-    rooms = draw_rooms(layout, width, rng)
-    length = max(room.left + room.size[0] for room in rooms) + rng.uniform(0.2, 0.5)
-    hall_layout = replace(layout.hall, size=(length, width, layout.hall.size[2]))
-    hall = Frame.upright(np.zeros(3))
-    walls = room_walls(hall, hall_layout.size)
-    doorways = [(room.hall_wall, room.hall_doorway(length)) for room in rooms]
-    hall_parts = furnish(hall_layout, hall, rng, doorways=doorways, with_floor=False)
-    parts: list[Part] = [Part((_floor(rooms, length, width),)), *hall_parts]
-    viewpoints = [free_places(hall_layout, hall, hall_parts, rng)]
-    for room, (wall, doorway) in zip(rooms, doorways, strict=True):
-        room_layout = replace(layout.room, size=room.size)
-        contents = furnish(
-            room_layout, room.frame, rng, doorways=[(_FIRST_WALL, room.doorway)], with_floor=False
-        )
-        parts += [passage("door frame", walls[wall], doorway, room.thickness), *contents]
-        parts.append(_open_door(room, rng))
-        viewpoints.append(free_places(room_layout, room.frame, parts, rng))
-    return SceneModel(tuple(parts), np.concatenate(viewpoints))
-
-
-def _floor(rooms: list[StoreyRoom], length: float, width: float) -> Flat:
+def _floor(rooms: list[_Room], length: float, width: float) -> Flat:
     """Return the floor of the hallway, the rooms and the doorways between them."""
     cells = [[(0.0, 0.0), (length, 0.0), (0.0, width)]]
     for room in rooms:
@@ -231,12 +176,12 @@ def _floor(rooms: list[StoreyRoom], length: float, width: float) -> Flat:
         (left, low), (right, high) = np.sort(room.frame.to_world(corners)[:, :2], axis=0)
         cells.append([(left, low), (right - left, 0), (0, high - low)])
         start, end = room.span()
-        below = -room.thickness if room.hall_wall == HALL_WALLS[0] else width
+        below = -room.thickness if room.hall_wall == _HALL_WALLS[0] else width
         cells.append([(start, below), (end - start, 0), (0, room.thickness)])
     return Flat("floor", Frame.upright(np.zeros(3)), np.array(cells))
 
 
-def _open_door(room: StoreyRoom, rng: np.random.Generator) -> Part:
+def _open_door(room: _Room, rng: np.random.Generator) -> Part:
     """Return the leaf of an open door, inside the room beside the doorway."""
     left, right, top = room.door
     hinge = left - 0.1 if left < room.size[0] / 2 else right + 0.1

@@ -38,17 +38,13 @@ def test_neighbors_do_not_depend_on_the_order(rng):
     assert torch.equal(shuffled[search_knn(points[shuffled], 12).indices.long()], plain[shuffled])
 
 
-def test_chunks_and_threads_change_nothing(rng, monkeypatch):
+def test_chunks_and_threads_change_nothing(rng, monkeypatch, set_threads):
     points = torch.rand(3000, 3, generator=rng)
     whole = search_knn(points, 9).indices
     monkeypatch.setattr(knn_module, "ROWS_AT_ONCE", 117)
     assert torch.equal(search_knn(points, 9).indices, whole)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1 if threads > 1 else 2)
-    try:
-        assert torch.equal(search_knn(points, 9).indices, whole)
-    finally:
-        torch.set_num_threads(threads)
+    set_threads(1 if torch.get_num_threads() > 1 else 2)
+    assert torch.equal(search_knn(points, 9).indices, whole)
 
 
 def test_a_point_comes_first_even_among_many_duplicates():

@@ -16,16 +16,9 @@ SAME_DEG = 0.02
 SWAPPED = 3
 
 
-def each_method(slow=()):
-    """Parametrise by method; the long tests of some only run with --run-slow."""
-    marks = dict.fromkeys(slow, pytest.mark.slow)
-    names = [pytest.param(name, marks=marks.get(name, ())) for name in sorted(ESTIMATORS)]
-    return pytest.mark.parametrize("method", names)
-
-
-methods = each_method()
+methods = pytest.mark.parametrize("method", sorted(ESTIMATORS))
 # Its hundreds of small steps take a second however few the points.
-methods_but_slow_irls = each_method(["irls"])
+methods_but_irls = pytest.mark.parametrize("method", sorted(ESTIMATORS.keys() - {"irls"}))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +69,7 @@ def test_most_normals_are_right(corner, fits, method):
     assert unsigned_angle_deg(fits[method].normals, corner[1]).median() < 15
 
 
-@methods_but_slow_irls
+@methods_but_irls
 @pytest.mark.parametrize("unit", [1e-4, 1e3])
 def test_unit_changes_nothing(corner, fits, method, unit):
     fit = estimate_normals(corner[0] * unit, method=method, k=K)
@@ -85,7 +78,7 @@ def test_unit_changes_nothing(corner, fits, method, unit):
     assert (~near).sum() <= SWAPPED
 
 
-@methods_but_slow_irls
+@methods_but_irls
 def test_far_origin_changes_nothing_in_float64(corner, fits, method):
     # Multiples of 2^-20, so that the move itself rounds nothing.
     points = (corner[0].double() * 2**20).round() / 2**20
@@ -94,43 +87,39 @@ def test_far_origin_changes_nothing_in_float64(corner, fits, method):
     assert_same(fit, fits[method])
 
 
-@methods_but_slow_irls
+@methods_but_irls
 def test_order_changes_nothing(corner, fits, method):
     order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
     fit = estimate_normals(corner[0][order], method=method, k=K)
     assert_equal(fit, fits[method].each(lambda part: part[order]))
 
 
-@methods_but_slow_irls
+@methods_but_irls
 def test_chunk_size_changes_nothing(corner, fits, method):
     fit = estimate_normals(corner[0], method=method, k=K, chunk_size=37)
     assert_equal(fit, fits[method])
 
 
-@each_method(["consensus", "irls", "detmm"])
+@pytest.mark.parametrize("method", ["pca", "jet", "paper", "detmcd", "fastmcd", "mve"])
 def test_batch_is_a_loop_of_singles(corner, method):
     points = corner[0][:24]
     whole = estimate_normals(points, method=method, k=K)
     assert_equal(estimate_normals(points, method=method, k=K, chunk_size=1), whole)
 
 
-@each_method(["consensus", "detmm", "fastmcd", "irls", "mve"])
-def test_number_of_threads_changes_nothing(method):
+@pytest.mark.parametrize("method", ["pca", "jet", "paper", "detmcd"])
+def test_number_of_threads_changes_nothing(method, set_threads):
     # Enough numbers for torch to share them out: it does not below 32,768.
     points = torch.rand(1700, 3, generator=torch.Generator().manual_seed(0))
     points[:, 2] *= torch.arange(1700) % 2 / 10
-    threads = torch.get_num_threads()
     found = []
-    try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            found.append(estimate_normals(points, method=method, k=K))
-    finally:
-        torch.set_num_threads(threads)
+    for count in (1, 2):
+        set_threads(count)
+        found.append(estimate_normals(points, method=method, k=K))
     assert_equal(*found)
 
 
-@methods_but_slow_irls
+@methods_but_irls
 def test_points_that_are_not_finite_take_no_part(corner, fits, method):
     bad = torch.tensor([[torch.nan, 0, 0], [0, torch.inf, 0]])
     points = torch.cat([bad[:1], corner[0], bad[1:]])
@@ -141,7 +130,7 @@ def test_points_that_are_not_finite_take_no_part(corner, fits, method):
         assert not fit.normals[row].any()
 
 
-@each_method(["irls", "detmm"])
+@pytest.mark.parametrize("method", sorted(ESTIMATORS.keys() - {"irls", "detmm"}))
 def test_neighbors_outside_the_radius_do_not_count(corner, method):
     # The columns beyond the most neighbours of any point hold nothing that counts.
     points = corner[0][:70]
@@ -196,7 +185,7 @@ def test_lattice_is_flat(method):
     assert torch.allclose(fit.normals.abs(), torch.tensor([0.0, 0, 1]), atol=1e-6)
 
 
-@methods_but_slow_irls
+@methods_but_irls
 def test_duplicates_are_no_trouble(corner, method):
     points = corner[0][:50].repeat(3, 1)
     fit = estimate_normals(points, method=method, k=K)

@@ -165,24 +165,6 @@ def test_gradients_are_right(rng):
     assert torch.autograd.gradcheck(fit, patches, fast_mode=True)
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        torch.zeros(8, 3),
-        torch.eye(3),
-        torch.cat([torch.eye(3), -torch.eye(3)]),
-        torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.zeros(1)),
-        torch.arange(8.0)[:, None].expand(8, 3),
-    ],
-    ids=["one place", "triangle", "octahedron", "lattice", "line"],
-)
-def test_gradients_are_finite_at_repeated_eigenvalues(points):
-    points = points.clone().requires_grad_()
-    fit = fit_normals_irls(points, noise=torch.tensor(0.01), mu_decay=4.0)
-    (fit.normals.sum() + fit.curvature + fit.residual_rms).backward()
-    assert points.grad.isfinite().all()
-
-
 def test_wrong_settings_are_refused(rng):
     patches = torch.rand(2, 9, 3, generator=rng)
     with pytest.raises(ConfigError, match=r"expected mu_decay > 1, got 1\.0"):

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 import torch
 
 from torchrg.linalg import unsigned_angle_deg
@@ -143,32 +142,6 @@ def test_gradients_are_right(rng):
         )
 
     assert torch.autograd.gradcheck(fit, patch.requires_grad_())
-
-
-@pytest.mark.parametrize(
-    "points",
-    [
-        torch.zeros(8, 3),
-        torch.eye(3),
-        torch.cat([torch.eye(3), -torch.eye(3)]),
-        torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.zeros(1)),
-        torch.arange(8.0)[:, None].expand(8, 3),
-    ],
-    ids=["one place", "triangle", "octahedron", "lattice", "line"],
-)
-def test_gradients_are_finite_at_repeated_eigenvalues(points):
-    points = points.clone().requires_grad_()
-    fit = fit_jet(points)
-    parts = (fit.normals, fit.foot, fit.principal_curvatures, fit.curvature, fit.residual_rms)
-    sum(part.sum() for part in parts).backward()
-    assert points.grad.isfinite().all()
-
-
-def test_vmap_is_the_batch(rng):
-    patches = torch.randn(6, 20, 3, generator=rng)
-    mapped, fit = torch.vmap(fit_jet)(patches), fit_jet(patches)
-    for name, value in fit._asdict().items():
-        assert torch.equal(getattr(mapped, name), value), name
 
 
 def test_least_squares_is_that_of_numpy(rng):

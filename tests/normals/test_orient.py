@@ -11,7 +11,6 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, orient, orient_normals
 from torchrg.normals.orient import propagate_signs, vote_free_side
-from torchrg.scenes import make_room
 
 
 def shuffled_signs(normals):
@@ -26,8 +25,8 @@ def share_right(oriented, truth):
 
 
 @pytest.fixture(scope="module")
-def room():
-    scene = make_room(30_000, 0.003, 1)
+def scanned(room):
+    scene = room(30_000, 0.003, 1)
     fit = estimate_normals(scene.points, method="pca", k=20)
     return scene, shuffled_signs(fit.normals)
 
@@ -82,7 +81,7 @@ def test_right_angles_have_one_answer():
         ("stairs", 5000),
         ("bracket", 5000),
         ("torus", 5000),
-        ("coral", 5000),
+        ("rounded_box", 5000),
         ("thin_plate", 15_000),
     ],
 )
@@ -125,8 +124,8 @@ def test_patches_end_at_edges(rng):
     assert sizes.max() <= 1500
 
 
-def test_rooms_are_seen_from_inside(room):
-    scene, normals = room
+def test_rooms_are_seen_from_inside(scanned):
+    scene, normals = scanned
     oriented = orient_normals(scene.points, normals)
     # Table tops of 4 cm are thinner than the neighbourhoods of this sparse cloud.
     assert share_right(oriented, scene.normals) > 0.97
@@ -136,8 +135,8 @@ def test_rooms_are_seen_from_inside(room):
     assert share_right(oriented[shell], scene.normals[shell]) > 0.998
 
 
-def test_thin_plates_are_two_faces_where_normals_are_robust():
-    scene = make_room(30_000, 0.003, 2)
+def test_thin_plates_are_two_faces_where_normals_are_robust(room):
+    scene = room(30_000, 0.003, 2)
     fit = estimate_normals(scene.points, method="detmcd", k=30)
     oriented = orient_normals(scene.points, shuffled_signs(fit.normals))
     assert share_right(oriented, scene.normals) > 0.985
@@ -202,8 +201,8 @@ def test_points_that_follow_look_to_their_own_side_of_a_plate(rng, monkeypatch):
 
 @pytest.mark.parametrize("towards", ["consistent", "interior"])
 @pytest.mark.parametrize("rounded", [False, True], ids=["generic", "ties"])
-def test_neither_signs_nor_order_matter(room, towards, rounded):
-    scene, normals = room
+def test_neither_signs_nor_order_matter(scanned, towards, rounded):
+    scene, normals = scanned
     points, normals = scene.points[:6000], normals[:6000]
     if rounded:
         # Equal distances everywhere, and normals that agree with nothing.
@@ -226,8 +225,8 @@ def test_both_faces_of_a_thin_plate_look_away_from_it(rng, height):
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e3])
-def test_votes_have_no_unit(room, unit):
-    points, normals = room[0].points[:5000].double(), room[1][:5000].double()
+def test_votes_have_no_unit(scanned, unit):
+    points, normals = scanned[0].points[:5000].double(), scanned[1][:5000].double()
     neighbors = search_knn(points, 20)
     votes = vote_free_side(points, normals, neighbors)
     again = vote_free_side(points * unit, normals, neighbors)

@@ -93,24 +93,6 @@ def test_gradients_are_right(rng):
     assert torch.autograd.gradcheck(fit, patches)
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        torch.zeros(5, 3),
-        torch.eye(3),
-        torch.cat([torch.eye(3), -torch.eye(3)]),
-        torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.zeros(1)),
-        torch.arange(4.0)[:, None].expand(4, 3),
-    ],
-    ids=["one place", "triangle", "octahedron", "lattice", "line"],
-)
-def test_gradients_are_finite_at_repeated_eigenvalues(points):
-    points = points.clone().requires_grad_()
-    fit = fit_normals_pca(points)
-    (fit.normals.sum() + fit.curvature + fit.residual_rms).backward()
-    assert points.grad.isfinite().all()
-
-
 @pytest.mark.parametrize("masked", [False, True])
 def test_vmap_is_the_batch(rng, dtype, masked):
     patches = torch.cat([random_patches(rng), strips(rng, 0.0, torch.float64, k=15)]).to(dtype)
@@ -121,25 +103,6 @@ def test_vmap_is_the_batch(rng, dtype, masked):
     for name in ("normals", "curvature", "valid", "residual_rms"):
         assert torch.equal(getattr(mapped, name), getattr(fit, name))
     assert not fit.valid.all()
-
-
-def test_vmap_of_the_gradient_is_the_gradient(rng):
-    patches = random_patches(rng, count=8)
-    mapped = torch.vmap(torch.func.grad(lambda points: fit_normals_pca(points).curvature))(patches)
-    leaf = patches.clone().requires_grad_()
-    fit_normals_pca(leaf).curvature.sum().backward()
-    assert torch.allclose(mapped, leaf.grad)
-
-
-@pytest.mark.slow
-# torch's tracer makes one itself.
-@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
-def test_compiled_fit_is_the_fit(rng):
-    patches = torch.cat([random_patches(rng), strips(rng, 0.0, torch.float64, k=15)]).float()
-    # The backend that needs no C++ compiler; it takes the same graph, without a break.
-    compiled = torch.compile(fit_normals_pca, fullgraph=True, backend="aot_eager")
-    for name, value in compiled(patches)._asdict().items():
-        assert value is None or torch.equal(value, getattr(fit_normals_pca(patches), name))
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,13 @@ import torch
 
 from torchrg.errors import ConfigError
 from torchrg.normals import estimate_normals, orient_cloud, orient_normals
-from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
 
 @pytest.fixture(scope="module")
-def room():
+def scanned(room):
     """A cloud far from the origin whose front is the outside, the normals that it is for, truth."""
-    scene = make_room(6000, 0.003, 1)
+    scene = room(6000, 0.003, 1)
     normals = estimate_normals(scene.points, method="pca", k=20).normals
     front = (-3 * scene.normals).float().numpy()
     return Cloud(scene.points.numpy().astype(np.float64) + 5e5, front=front), normals, scene
@@ -25,8 +24,8 @@ def agrees(normals, truth):
     return (normals * truth.to(normals)).sum(dim=1) > 0
 
 
-def test_normals_look_to_the_front_whatever_signs_they_had(room):
-    cloud, normals, scene = room
+def test_normals_look_to_the_front_whatever_signs_they_had(scanned):
+    cloud, normals, scene = scanned
     for signs in (1, -1):
         turned = orient_cloud(cloud, signs * normals)
         assert agrees(turned, -scene.normals)[normals.any(dim=1)].all()
@@ -36,15 +35,15 @@ def test_normals_look_to_the_front_whatever_signs_they_had(room):
     )
 
 
-def test_without_a_front_rooms_are_seen_from_inside(room):
-    cloud, normals, scene = room
+def test_without_a_front_rooms_are_seen_from_inside(scanned):
+    cloud, normals, scene = scanned
     turned = orient_cloud(replace(cloud, front=None), normals)
     assert torch.equal(turned, orient_normals(cloud.points, normals))
     assert agrees(turned, scene.normals).double().mean() > 0.9
 
 
-def test_up_and_none_and_a_viewpoint_are_what_they_say(room):
-    cloud, normals, _ = room
+def test_up_and_none_and_a_viewpoint_are_what_they_say(scanned):
+    cloud, normals, _ = scanned
     assert orient_cloud(cloud, normals, "none") is normals
     assert torch.equal(
         orient_cloud(cloud, normals, "up"), orient_normals(cloud.points, normals, towards="+z")
@@ -55,8 +54,8 @@ def test_up_and_none_and_a_viewpoint_are_what_they_say(room):
     assert ((turned.double() * arms).sum(dim=1) > -1e-4).all()
 
 
-def test_few_points_without_a_front_follow_the_nearest_that_have_one(room):
-    cloud, normals, scene = room
+def test_few_points_without_a_front_follow_the_nearest_that_have_one(scanned):
+    cloud, normals, scene = scanned
     front = cloud.front.copy()
     lost = torch.randperm(len(front), generator=torch.Generator().manual_seed(1))[:50]
     front[lost] = 0
@@ -68,8 +67,8 @@ def test_few_points_without_a_front_follow_the_nearest_that_have_one(room):
     assert torch.equal(orient_cloud(moved, -normals[order]), turned[order])
 
 
-def test_many_points_without_a_front_look_into_the_room(room):
-    cloud, normals, _ = room
+def test_many_points_without_a_front_look_into_the_room(scanned):
+    cloud, normals, _ = scanned
     front = cloud.front.copy()
     front[200:] = 0
     turned = orient_cloud(replace(cloud, front=front), normals)
@@ -77,8 +76,8 @@ def test_many_points_without_a_front_look_into_the_room(room):
     assert torch.equal(turned[200:], orient_normals(cloud.points, normals)[200:])
 
 
-def test_points_without_normals_or_place_need_no_front(room):
-    cloud, normals, scene = room
+def test_points_without_normals_or_place_need_no_front(scanned):
+    cloud, normals, scene = scanned
     front, normals = cloud.front.copy(), normals.clone()
     places = cloud.coordinates.copy()
     front[:3000], normals[:2000], places[2000:3000] = 0, 0, np.nan
@@ -88,8 +87,8 @@ def test_points_without_normals_or_place_need_no_front(room):
     assert agrees(turned[3000:], -scene.normals[3000:]).all()
 
 
-def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(room):
-    cloud, normals, _ = room
+def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(scanned):
+    cloud, normals, _ = scanned
     named = replace(cloud, source="a.ply")
     message = r"^a\.ply: expected poses of scanners, .* got none; use interior\.$"
     with pytest.raises(ConfigError, match=message):

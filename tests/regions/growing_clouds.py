@@ -1,10 +1,18 @@
-"""Small clouds that try region growing: rooms, noise, ties, lattices, duplicates."""
+"""Small clouds that try region growing, and the settings without what consensus adds."""
+
+import dataclasses
 
 import numpy as np
 import torch
 
+from torchrg.config import load_config
 from torchrg.linalg import covariance, eigh3
 from torchrg.neighbors import finite_rows, gather_patches, search_knn
+
+
+def papers_growing(**changes):
+    """Return the growth of the preset paper, with some settings changed."""
+    return dataclasses.replace(load_config("paper").growing, **changes)
 
 
 def room(rng, n, noise=0.0):

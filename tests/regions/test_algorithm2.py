@@ -8,8 +8,8 @@ import pytest
 import torch
 from pypcd4 import PointCloud
 
-from tests.made.settings import papers_growing
 from tests.regions import algorithm2, growing_clouds
+from tests.regions.growing_clouds import papers_growing
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
 
@@ -69,15 +69,7 @@ def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
 
 @pytest.mark.parametrize(
     ("kind", "variant"),
-    [
-        pytest.param(
-            kind,
-            variant,
-            marks=[] if (place - variant) % len(VARIANTS) == 0 else [pytest.mark.slow],
-        )
-        for place, kind in enumerate(growing_clouds.KINDS)
-        for variant in range(len(VARIANTS))
-    ],
+    [(kind, place % len(VARIANTS)) for place, kind in enumerate(growing_clouds.KINDS)],
 )
 def test_labels_equal_the_literal_algorithm(kind, variant):
     rng = np.random.default_rng(variant)

@@ -11,7 +11,6 @@ from torchrg import align_axes, segment_planes
 from torchrg.errors import ConfigError
 from torchrg.regions import summarize_planes
 from torchrg.regions.axes import move_planes
-from torchrg.scenes import make_room
 from torchrg.structures import PLANE_COLUMNS, Planes
 
 
@@ -30,20 +29,17 @@ def degrees_off(rotation):
     return tilt, abs(angle - 90 * round(angle / 90))
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *[pytest.param(n, marks=pytest.mark.slow) for n in range(1, 100)]]
-)
-def test_made_rooms_are_set_upright_along_their_walls(seed):
-    rng = np.random.default_rng(seed)
-    room = make_room(num_points=12_000, noise=0.005, seed=seed)
+def test_made_rooms_are_set_upright_along_their_walls(room):
+    rng = np.random.default_rng(0)
+    scene = room(12_000, 0.005, 0)
     turn = tilted(rng)
-    points = room.points.double() @ turn.T + torch.tensor([1e5, -20, 3.0])
+    points = scene.points.double() @ turn.T + torch.tensor([1e5, -20, 3.0])
     motion = align_axes(segment_planes(points))
     tilt, off = degrees_off(motion[:3, :3] @ turn)
     assert tilt < 0.2
     assert off < 0.2
     moved = points @ motion[:3, :3].T + motion[:3, 3]
-    expected = room.points[:, 2] - room.points[:, 2].median()
+    expected = scene.points[:, 2] - scene.points[:, 2].median()
     assert torch.allclose(moved[:, 2] - moved[:, 2].median(), expected.double(), atol=0.05)
     # Boxes on the floor and the doors' frames are above it, and its noise on both sides.
     assert abs(float(moved[:, 2].quantile(0.02))) < 0.02
@@ -134,13 +130,13 @@ def test_what_has_no_axes_is_refused():
         align_axes(table([[0, 0, 1]], [9.0]), up=(0, 0, 0))
 
 
-def test_tables_are_moved_as_if_made_of_moved_points():
-    room = make_room(num_points=6_000, noise=0.003, seed=2)
+def test_tables_are_moved_as_if_made_of_moved_points(room):
+    scene = room(6_000, 0.003, 2)
     turn = torch.from_numpy(Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix())
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3], motion[:3, 3] = turn, torch.tensor([3.0, -4, 5])
-    points, normals = room.points.double(), room.normals.double()
-    labels = torch.unique(room.labels, return_inverse=True)[1]
+    points, normals = scene.points.double(), scene.normals.double()
+    labels = torch.unique(scene.labels, return_inverse=True)[1]
     given = summarize_planes(points, normals, labels, outline=True)
     moved = move_planes(given, motion)
     expected = summarize_planes(points @ turn.T + motion[:3, 3], normals @ turn.T, labels)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
+from tests.regions.growing_clouds import papers_growing
 from torchrg import load_config, segment_planes
 from torchrg.metrics import score_labels
 from torchrg.neighbors import search_knn

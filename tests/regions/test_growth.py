@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
+from tests.regions.growing_clouds import papers_growing
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
+from tests.regions.growing_clouds import papers_growing
 from torchrg.config import load_config
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
@@ -62,19 +62,14 @@ def test_swapped_duplicates_are_all_that_another_order_changes(config, rng):
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_labels_do_not_depend_on_chunk_size_or_threads(config, monkeypatch):
+def test_labels_do_not_depend_on_chunk_size_or_threads(config, set_threads):
     cloud = clouds("quantized", dtype=torch.float32)
     labels = grow_regions(*cloud, config)
     for chunk_size in (1, 7, 64, 1000):
         assert torch.equal(grow_regions(*cloud, config, chunk_size=chunk_size), labels)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(3)
+    for threads in (3, 1):
+        set_threads(threads)
         assert torch.equal(grow_regions(*cloud, config, chunk_size=50), labels)
-        torch.set_num_threads(1)
-        assert torch.equal(grow_regions(*cloud, config, chunk_size=50), labels)
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)

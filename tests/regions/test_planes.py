@@ -149,17 +149,15 @@ def test_rows_do_not_depend_on_the_order_of_the_points(rng):
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
-def test_threads_change_nothing():
+def test_threads_change_nothing(set_threads):
     generator = np.random.default_rng(6)
     points = torch.cat([rectangle(generator, 3000, 2.0, 1.0, noise=0.01)[0] for _ in range(3)])
     labels = torch.arange(3).repeat_interleave(3000)
     neighbors = search_knn(points, 10)
-    before = torch.get_num_threads()
     tables = []
     for num_threads in (1, 3):
-        torch.set_num_threads(num_threads)
+        set_threads(num_threads)
         tables.append(summarize_planes(points, points, labels, neighbors=neighbors))
-    torch.set_num_threads(before)
     for a, b in zip(tables[0][:10], tables[1][:10], strict=True):
         assert torch.equal(a, b)
     for a, b in zip(tables[0].adjacency, tables[1].adjacency, strict=True):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.made.settings import papers_growing
 from tests.regions import growing_clouds
+from tests.regions.growing_clouds import papers_growing
 from torchrg.errors import ConfigError
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from tests.made.cameras import KINECT_LAYOUT
-from torchrg import make_superpoints, read_cloud, segment_planes
+from torchrg import make_superpoints, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import score_partition
@@ -170,17 +170,13 @@ def test_planes_are_what_most_points_are_on(room, parts):
     assert 5 < (parts.plane >= 0).sum() < len(parts.plane)
 
 
-def test_order_threads_and_chunks_change_nothing(room, parts, monkeypatch):
+def test_order_threads_and_chunks_change_nothing(room, parts, monkeypatch, set_threads):
     order = torch.randperm(6000, generator=torch.Generator().manual_seed(1))
     moved = partition_points(*(values[order] for values in room), CONFIG)
     assert torch.equal(moved.labels, parts.labels[order])
     assert torch.equal(moved.plane, parts.plane)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2 if before == 1 else 1)
-    try:
-        assert torch.equal(partition_points(*room, CONFIG).levels[1], parts.levels[1])
-    finally:
-        torch.set_num_threads(before)
+    set_threads(2 if torch.get_num_threads() == 1 else 1)
+    assert torch.equal(partition_points(*room, CONFIG).levels[1], parts.levels[1])
     monkeypatch.setattr(superpoints, "ROWS_AT_ONCE", 77)
     assert torch.equal(partition_points(*room, CONFIG).labels, parts.labels)
 
@@ -362,19 +358,6 @@ def test_a_made_room_is_parted_at_its_objects():
     assert score.asa > 0.98
     assert score.oracle_miou > 0.85
     assert score.boundary_recall > 0.9
-
-
-@pytest.mark.slow
-def test_office_parts_need_half_the_superpoints_of_cut_pursuit(scan):
-    cloud = read_cloud(scan("office_parts.pcd"))
-    found = make_superpoints(cloud.points)
-    fine, coarse = (
-        score_partition(level, cloud.fields["labels"], ignore=0) for level in found.levels[1:]
-    )
-    assert fine.count <= 900
-    assert fine.asa >= 0.95
-    assert coarse.count <= 390
-    assert coarse.asa >= 0.93
 
 
 def test_a_superpoint_is_on_the_plane_of_more_than_half_of_its_points():

@@ -5,10 +5,23 @@ import json
 import numpy as np
 import torch
 
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
+
 FRACTIONS = {"50": 0.5, "75": 0.75}
 
 # What MATLAB's LIBRA calls DetMCD, but for what it trusts by default (0.75).
 LIBRA = {"scaling": "quantile", "inliers": "reweighted"}
+
+ESTIMATORS = {
+    "paper": fit_detmcd,
+    "libra": lambda patches, **k: fit_detmcd(patches, **LIBRA, **k),
+    "planes": lambda patches, **k: fit_detmcd(patches, starts="planes", **k),
+    "more": lambda patches, **k: fit_detmcd(patches, starts="more", **k),
+    "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=20, **k),
+    "mve": lambda patches, **k: fit_mve(patches, num_starts=20, **k),
+    "dets": fit_dets,
+    "detmm": fit_detmm,
+}
 
 # Listed in the notes beside the reference values: QR tolerance, false exact fits, cut iterations.
 WRONG_RRCOV = {"planar_very_fine", "planar_tilt__aniso_units"}

@@ -1,25 +1,10 @@
 import pytest
 import torch
 
-from tests.robust.oracle_cases import LIBRA
-from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
+from tests.robust.oracle_cases import ESTIMATORS
+from torchrg.robust import fit_detmcd, qn
 from torchrg.robust.lanes import smallest_points
 from torchrg.robust.scale import sum_points
-
-ESTIMATORS = {
-    "paper": fit_detmcd,
-    "libra": lambda patches, **k: fit_detmcd(patches, **LIBRA, **k),
-    "planes": lambda patches, **k: fit_detmcd(patches, starts="planes", **k),
-    "fastmcd": lambda patches, **k: fit_fastmcd(patches, num_starts=30, **k),
-    "mve": lambda patches, **k: fit_mve(patches, num_starts=30, **k),
-    "dets": fit_dets,
-    "detmm": fit_detmm,
-}
-
-
-@pytest.fixture(params=ESTIMATORS)
-def estimator(request):
-    return ESTIMATORS[request.param]
 
 
 @pytest.fixture
@@ -61,16 +46,12 @@ def test_devices_agree(estimator, patches, device):
     torch.testing.assert_close(there.covariance.cpu(), fit.covariance, **close)
 
 
-def test_result_does_not_depend_on_threads(patches):
-    setting = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            results.append((fit_detmcd(patches, chunk_size=5), qn(patches.repeat(80, 1, 1))))
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(setting)
+def test_result_does_not_depend_on_threads(patches, set_threads):
+    results = []
+    for threads in (1, 3):
+        set_threads(threads)
+        results.append((fit_detmcd(patches, chunk_size=5), qn(patches.repeat(80, 1, 1))))
+    assert torch.get_num_threads() == 3
     assert_equal_fits(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
 

@@ -5,23 +5,21 @@ behind them into :class:`Part`, parts and places for a scanner into :class:`Scen
 points from it by :func:`sample_scene`. The modules below this one may change without notice.
 """
 
-from torchrg.scenes.furniture import block
 from torchrg.scenes.geometry import Array, Frame, unit
+from torchrg.scenes.parts import block, passage, room_walls
 from torchrg.scenes.rooms import RoomLayout, build_room, free_places, furnish, make_room
 from torchrg.scenes.scene import Part, Scene, SceneModel, label_points, sample_scene
-from torchrg.scenes.shells import passage, room_walls
-from torchrg.scenes.surfaces import Cone, Flat, Ring, Surface, rectangle
+from torchrg.scenes.surfaces import Flat, Solid, Surface, rectangle
 
 __all__ = [
     "Array",
-    "Cone",
     "Flat",
     "Frame",
     "Part",
-    "Ring",
     "RoomLayout",
     "Scene",
     "SceneModel",
+    "Solid",
     "Surface",
     "block",
     "build_room",

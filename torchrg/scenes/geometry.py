@@ -42,13 +42,13 @@ class Frame:
         return cls(origin, np.stack([axis0, axis1, np.cross(axis0, axis1)]))
 
     def placed(self, origin: Triple, first: Triple, second: Triple) -> "Frame":
-        """Return another frame, given in this one by its origin and two directions."""
+        """Return another frame, described in this one by its origin and two directions."""
         local = Frame.spanned(*(np.array(v, dtype=np.float64) for v in (origin, first, second)))
         return local.inside(self)
 
-    def moved(self, *local: float) -> "Frame":
+    def moved(self, x: float, y: float = 0, z: float = 0) -> "Frame":
         """Return the same frame with its origin moved by local coordinates."""
-        return Frame(self.to_world(np.array(local, dtype=np.float64)), self.axes)
+        return Frame(self.to_world(np.array((x, y, z), dtype=np.float64)), self.axes)
 
     def inside(self, outer: "Frame") -> "Frame":
         """Return this frame, given in ``outer``, in the world of ``outer``."""

@@ -1,17 +1,17 @@
 """Furnished rooms: the sizes and places of all that is in them, drawn from a seed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from itertools import product
+from itertools import count, islice, product
 from typing import TypeVar
 
 import numpy as np
 
 from torchrg.errors import ConfigError
-from torchrg.scenes import furniture
-from torchrg.scenes.furniture import between
+from torchrg.scenes import parts as draw
 from torchrg.scenes.geometry import Array, Frame, Triple
+from torchrg.scenes.parts import between, recess, room_walls
 from torchrg.scenes.scene import (
     Part,
     Scene,
@@ -21,10 +21,11 @@ from torchrg.scenes.scene import (
     sample_scene,
     seeded_generator,
 )
-from torchrg.scenes.shells import recess, room_walls, shell
-from torchrg.scenes.surfaces import Hole
+from torchrg.scenes.surfaces import Hole, rectangle
 
 T = TypeVar("T")
+Furniture = Callable[[np.random.Generator, Frame], Part]
+"""What draws an object on a place of the floor."""
 
 _ROOM = 100
 """Purpose of the random numbers: sizes and places in a room."""
@@ -70,15 +71,6 @@ class RoomLayout:
     num_small_boxes: int = 2
     """On tables, at most one on each."""
     num_pillars: int = 1
-    num_columns: int = 0
-    """Round pillars."""
-    num_round_tables: int = 0
-    num_balls: int = 0
-    num_lamps: int = 0
-    num_bent_walls: int = 0
-    """Walls that are arcs of large cylinders, without anything on them; up to 4."""
-    wall_bend: float = 0.04
-    """How far the middle of a bent wall bulges into the room."""
     plate_thickness: float = 0.04
     """Thickness of table tops and shelves."""
     panel_thickness: float = 0.015
@@ -95,20 +87,27 @@ class RoomLayout:
             value = getattr(self, field.name)
             if field.name.startswith("num_") and value < 0:
                 raise ConfigError(f"RoomLayout: expected {field.name} >= 0, got {value}.")
-        for name, (value, limit) in {
-            "num_small_boxes": (self.num_small_boxes, self.num_tables),
-            "num_bent_walls": (self.num_bent_walls, 4),
-            "wall_bend": (self.wall_bend, min(self.size[:2]) / 8),
-        }.items():
-            if value > limit:
-                raise ConfigError(f"RoomLayout: expected {name} <= {limit}, got {value}.")
-        for name in ("wall_bend", "plate_thickness", "panel_thickness", "num_viewpoints"):
+        if self.num_small_boxes > self.num_tables:
+            raise ConfigError(
+                f"RoomLayout: expected num_small_boxes <= {self.num_tables}, "
+                f"got {self.num_small_boxes}."
+            )
+        for name in ("plate_thickness", "panel_thickness", "num_viewpoints"):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"RoomLayout: expected {name} > 0, got {getattr(self, name)}.")
         if min(self.size[:2]) < 1 or self.size[2] < 2.3:
             raise ConfigError(
                 f"RoomLayout: expected size of at least 1 x 1 x 2.3 metres, got {self.size}."
             )
+
+    def draw_wall(self, number: int, wall: Frame, length: float, holes: Sequence[Hole]) -> Part:
+        """Return a wall along the first axis of a frame; a subclass may bend one without holes."""
+        return Part((rectangle("wall", wall, length, self.size[2], holes),))
+
+    def furniture(self) -> list[tuple[int, Furniture]]:
+        """Return the number of each kind on the floor but tables, and what draws one of them."""
+        pillar = partial(draw.draw_pillar, ceiling=self.size[2])
+        return [(self.num_boxes, draw.draw_box), (self.num_pillars, pillar)]
 
 
 def make_room(
@@ -145,17 +144,10 @@ def make_room(
 
 
 def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel:
-    """Build the description of a furnished room, to be sampled or rendered.
-
-    Args:
-        seed: Seed of sizes and places.
-        layout: What is in the room. Default: ``RoomLayout()``.
+    """Build the description of a furnished room, to be sampled or rendered; see :func:`make_room`.
 
     Returns:
         The scene. Its first six faces are floor, ceiling and walls.
-
-    Raises:
-        ConfigError: If the room is too small for its furniture.
 
     Example:
         >>> [surface.kind for surface in build_room().surfaces[:3]]
@@ -176,147 +168,108 @@ def furnish(
     doorways: Sequence[tuple[int, Hole]] = (),
     with_floor: bool = True,
 ) -> tuple[Part, ...]:
-    """Return the parts of a room, whose origin is a corner of the floor: its shell, then the rest.
+    """Return the parts of a room, whose origin is a corner of the floor; the shell is the first.
 
     ``doorways`` are holes in walls that are there already, each with its wall.
 
     Raises:
         ConfigError: If the room is too small for its furniture.
     """
-    furnisher, ceiling = _Furnisher(layout, room, rng, doorways, with_floor), layout.size[2]
+    walls, ceiling, plate = room_walls(room, layout.size), layout.size[2], layout.plate_thickness
+    holes = [[hole for wall, hole in doorways if wall == number] for number in range(4)]
+    middles = [walls[wall].moved((a + b) / 2, 0, 0).origin for wall, (a, b, _, _) in doorways]
+    parts = [_shell(layout, room, holes, with_floor)]
+    is_flat = [surface.plane is not None for surface in parts[0].surfaces[-len(walls) :]]
+    wall_places = [
+        (wall, along)
+        for wall, along in _wall_places(layout.size)
+        if is_flat[wall] and _is_away(walls[wall].moved(along), middles, _DOORWAY_AISLE)
+    ]
+    wall_places = [wall_places[row] for row in rng.permutation(len(wall_places))]
+    floor_places = [
+        (x, y)
+        for x, y in _floor_places(layout.size)
+        if _is_away(room.moved(x, y), middles, _DOORWAY_SPACE)
+    ]
+    floor_places = [floor_places[row] for row in rng.permutation(len(floor_places))]
+
+    def place(drawn: Iterator[Part]) -> None:
+        parts.append(_first_apart(drawn, parts, layout.min_plane_gap))
+
+    def open_wall(kind: str, draw_hole: Callable[[np.random.Generator, float], Hole]) -> None:
+        wall, middle = _take(wall_places, "walls")
+        holes[wall].append((0, 0, 0, 0))
+
+        def recesses() -> Iterator[Part]:
+            while True:
+                holes[wall][-1] = draw_hole(rng, middle)
+                yield recess(kind, walls[wall], holes[wall][-1], between(rng, 0.06, 0.16))
+
+        place(recesses())
+
+    def standing(middle: tuple[float, float], max_heading_deg: float) -> Frame:
+        x, y = (value + between(rng, -0.1, 0.1) for value in middle)
+        heading = between(rng, -max_heading_deg, max_heading_deg)
+        return Frame.upright(np.zeros(3), heading).inside(room.moved(x, y))
+
     for _ in range(layout.num_doors):
-        furnisher.open_wall("door", furniture.draw_door)
+        open_wall("door", draw.draw_door)
     for _ in range(layout.num_windows):
-        furnisher.open_wall("window", partial(furniture.draw_window, ceiling=ceiling))
-    furnisher.parts[0] = furnisher.shell()
-    for draw_at, count in (
-        (furniture.draw_cabinet, layout.num_cabinets),
-        (partial(furniture.draw_shelf, thickness=layout.plate_thickness), layout.num_shelves),
-        (partial(furniture.draw_panel, thickness=layout.panel_thickness), layout.num_panels),
-    ):
-        for _ in range(count):
-            furnisher.place_at_wall(draw_at)
+        open_wall("window", partial(draw.draw_window, ceiling=ceiling))
+    parts[0] = _shell(layout, room, holes, with_floor)
+    on_walls: list[tuple[int, Callable[[np.random.Generator, Frame, float], Part]]] = [
+        (layout.num_cabinets, draw.draw_cabinet),
+        (layout.num_shelves, partial(draw.draw_shelf, thickness=plate)),
+        (layout.num_panels, partial(draw.draw_panel, thickness=layout.panel_thickness)),
+    ]
+    for draw_at in (draw_at for number, draw_at in on_walls for _ in range(number)):
+        wall, along = _take(wall_places, "walls")
+        place(draw_at(rng, walls[wall], along + between(rng, -0.1, 0.1)) for _ in count())
     for number in range(layout.num_tables):
-        furnisher.place_table(with_box=number < layout.num_small_boxes)
-    draw_round_table = partial(furniture.draw_round_table, thickness=layout.plate_thickness)
-    for draw_on, count in (
-        (furniture.draw_box, layout.num_boxes),
-        (partial(furniture.draw_pillar, ceiling=ceiling), layout.num_pillars),
-        (partial(furniture.draw_column, ceiling=ceiling), layout.num_columns),
-        (draw_round_table, layout.num_round_tables),
-        (furniture.draw_ball, layout.num_balls),
-        (furniture.draw_lamp, layout.num_lamps),
-    ):
-        for _ in range(count):
-            furnisher.place_on_floor(draw_on)
-    return tuple(furnisher.parts)
-
-
-class _Furnisher:
-    """The free places of a room, and the objects that are in it so far."""
-
-    def __init__(
-        self,
-        layout: RoomLayout,
-        room: Frame,
-        rng: np.random.Generator,
-        doorways: Sequence[tuple[int, Hole]],
-        with_floor: bool,
-    ) -> None:
-        self.layout, self.room, self.rng, self.with_floor = layout, room, rng, with_floor
-        self.walls = room_walls(room, layout.size)
-        self.bends = [layout.wall_bend * (wall < layout.num_bent_walls) for wall in range(4)]
-        self.holes: list[list[Hole]] = [[] for _ in self.walls]
-        for wall, hole in doorways:
-            self.holes[wall].append(hole)
-        self.wall_places = self._shuffled(
-            [
-                (wall, middle)
-                for wall, middle in _wall_places(layout.size)
-                if self.bends[wall] == 0
-                and self._is_away(self.walls[wall].moved(middle, 0, 0).origin, _DOORWAY_AISLE)
-            ]
-        )
-        self.floor_places = self._shuffled(
-            [
-                (x, y)
-                for x, y in _floor_places(layout.size)
-                if self._is_away(room.moved(x, y, 0).origin, _DOORWAY_SPACE)
-            ]
-        )
-        self.parts = [self.shell()]
-
-    def shell(self) -> Part:
-        """Return floor, ceiling and walls with the holes that are there so far."""
-        return shell(
-            self.room, self.layout.size, self.holes, bends=self.bends, with_floor=self.with_floor
-        )
-
-    def open_wall(self, kind: str, draw_hole: Callable[[np.random.Generator, float], Hole]) -> None:
-        """Put a door or a window into a free place of a wall."""
-        wall, middle = _take(self.wall_places, "walls")
-        holes: list[Hole] = []
-
-        def draw() -> Part:
-            holes.append(draw_hole(self.rng, middle))
-            return recess(kind, self.walls[wall], holes[-1], between(self.rng, 0.06, 0.16))
-
-        self._place(draw)
-        self.holes[wall].append(holes[-1])
-
-    def place_at_wall(self, draw: Callable[[np.random.Generator, Frame, float], Part]) -> None:
-        """Put an object against a free place of a wall."""
-        wall, middle = _take(self.wall_places, "walls")
-        self._place(lambda: draw(self.rng, self.walls[wall], middle + between(self.rng, -0.1, 0.1)))
-
-    def place_on_floor(self, draw: Callable[[np.random.Generator, Frame], Part]) -> None:
-        """Put an object on a free place of the floor."""
-        middle = _take(self.floor_places, "floor")
-        self._place(lambda: draw(self.rng, self._standing(middle, max_heading_deg=90)))
-
-    def place_table(self, *, with_box: bool) -> None:
-        """Put a table on a free place of the floor, and on it perhaps a box."""
-        middle, thickness = _take(self.floor_places, "floor"), self.layout.plate_thickness
-        desk = self._place(
-            lambda: furniture.draw_table(
-                self.rng, self._standing(middle, max_heading_deg=12), thickness
-            )
-        )
-        if with_box:
-            [top] = [surface for surface in desk.surfaces if surface.kind == "table top"]
+        middle = _take(floor_places, "floor")
+        place(draw.draw_table(rng, standing(middle, 12), plate) for _ in count())
+        if number < layout.num_small_boxes:
+            [top] = [surface for surface in parts[-1].surfaces if surface.kind == "table top"]
             middle_of_top = Frame.upright(top.bounds.mean(axis=0))
-            self._place(lambda: furniture.draw_small_box(self.rng, middle_of_top))
+            place(draw.draw_small_box(rng, middle_of_top) for _ in count())
+    for draw_on in (draw_on for number, draw_on in layout.furniture() for _ in range(number)):
+        middle = _take(floor_places, "floor")
+        place(draw_on(rng, standing(middle, 90)) for _ in count())
+    return tuple(parts)
 
-    def _place(self, draw: Callable[[], Part]) -> Part:
-        """Add the first of several drawn objects that has no face in the plane of another."""
-        gap = self.layout.min_plane_gap
-        for _ in range(_TRIES):
-            part = draw()
-            if not _shares_plane(part, self.parts, gap):
-                self.parts.append(part)
-                return part
-        raise ConfigError(
-            f"build_room: expected no face within min_plane_gap={gap} of the plane of another, "
-            "got too many objects for that; lower it."
-        )
 
-    def _standing(self, middle: tuple[float, float], *, max_heading_deg: float) -> Frame:
-        """Return an upright frame of random heading on the floor near a place."""
-        x, y = (value + between(self.rng, -0.1, 0.1) for value in middle)
-        heading = between(self.rng, -max_heading_deg, max_heading_deg)
-        return Frame.upright(np.zeros(3), heading).inside(self.room.moved(x, y, 0))
+def _shell(
+    layout: RoomLayout, room: Frame, holes: Sequence[Sequence[Hole]], with_floor: bool
+) -> Part:
+    """Return floor, ceiling and four walls, each with its holes, as one part."""
+    length, width, height = layout.size
+    above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
+    ends = [rectangle("floor", room, length, width), rectangle("ceiling", above, length, width)]
+    walls = [
+        layout.draw_wall(number, wall, layout.size[number % 2], holes[number])
+        for number, wall in enumerate(room_walls(room, layout.size))
+    ]
+    surfaces = (surface for wall in walls for surface in wall.surfaces)
+    return Part(
+        (*ends[not with_floor :], *surfaces), tuple(body for wall in walls for body in wall.solids)
+    )
 
-    def _is_away(self, place: Array, distance: float) -> bool:
-        """Return whether a place on the floor is away from all doorways."""
-        for wall, holes in zip(self.walls, self.holes, strict=True):
-            for left, right, _, _ in holes:
-                gap = wall.moved((left + right) / 2, 0, 0).origin - place
-                if np.vecdot(gap, gap) < distance * distance:
-                    return False
-        return True
 
-    def _shuffled(self, places: list[T]) -> list[T]:
-        return [places[row] for row in self.rng.permutation(len(places))]
+def _is_away(place: Frame, middles: Sequence[Array], distance: float) -> bool:
+    """Return whether a place is so far from the middles of all doorways, on the floor."""
+    gaps = (middle - place.origin for middle in middles)
+    return all(np.vecdot(gap, gap) >= distance * distance for gap in gaps)
+
+
+def _first_apart(drawn: Iterator[Part], others: Sequence[Part], gap: float) -> Part:
+    """Return the first of several drawn objects that has no face in the plane of another."""
+    for part in islice(drawn, _TRIES):
+        if not _shares_plane(part, others, gap):
+            return part
+    raise ConfigError(
+        f"build_room: expected no face within min_plane_gap={gap} of the plane of another, "
+        "got too many objects for that; lower it."
+    )
 
 
 def _take(places: list[T], where: str) -> T:

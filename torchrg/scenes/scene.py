@@ -65,7 +65,7 @@ class SceneModel:
     """The description of a scene, to be sampled or rendered.
 
     Args:
-        parts: The objects; their surfaces in order are the faces.
+        parts: The objects; their surfaces, in order, are the faces.
         viewpoints: Places in free space where a scanner may stand, shape ``(V, 3)``, at least one.
     """
 
@@ -78,48 +78,26 @@ class SceneModel:
         return tuple(surface for part in self.parts for surface in part.surfaces)
 
     @cached_property
-    def solids(self) -> tuple[Solid, ...]:
-        """The bodies."""
-        return tuple(solid for part in self.parts for solid in part.solids)
-
-    @cached_property
     def objects(self) -> NDArray[np.int64]:
         """Which part each face belongs to, shape ``(M,)``."""
         counts = [len(part.surfaces) for part in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
-    @cached_property
-    def bounds(self) -> Array:
-        """Lowest and highest coordinates of a box around all faces, shape ``(2, 3)``."""
-        boxes = np.stack([surface.bounds for surface in self.surfaces])
-        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-
     def is_visible(self, face: int, points: Array, normals: Array) -> NDArray[np.bool_]:
         """Return at which points of a face there is free space in front of it, shape ``(N,)``."""
-        free = np.ones(len(points), dtype=bool)
-        if self._touching[face]:
-            front = points + self._clearance * normals
-            for solid in self._touching[face]:
-                free &= ~solid.contains(front)
-        return free
+        low, high = self.surfaces[face].bounds + np.outer((-1, 1), np.full(3, self._clearance))
+        near = [
+            part
+            for part in self.parts
+            if any((b.bounds[0] <= high).all() and (b.bounds[1] >= low).all() for b in part.solids)
+        ]
+        return ~is_occupied(near, points + self._clearance * normals)
 
     @cached_property
     def _clearance(self) -> float:
         """Length by which what is in front of a face is told from what touches it."""
-        return _CLEARANCE * float((self.bounds[1] - self.bounds[0]).max())
-
-    @cached_property
-    def _touching(self) -> tuple[tuple[Solid, ...], ...]:
-        """For each face the bodies that may cover part of it."""
-        return tuple(
-            tuple(
-                solid
-                for solid in self.solids
-                if (solid.bounds[0] <= surface.bounds[1] + self._clearance).all()
-                and (solid.bounds[1] >= surface.bounds[0] - self._clearance).all()
-            )
-            for surface in self.surfaces
-        )
+        lowest, highest = zip(*(surface.bounds for surface in self.surfaces), strict=True)
+        return _CLEARANCE * float((np.max(highest, axis=0) - np.min(lowest, axis=0)).max())
 
 
 def sample_scene(
@@ -136,16 +114,13 @@ def sample_scene(
     front of it, so the number of points of a face is proportional to its visible area. What other
     objects hide from a scanner is sampled as well.
 
-    Convention:
-        The same seed gives the same places on the surface whatever the noise, so the noise of a
-        cloud is its difference to the cloud with ``noise=0``.
-
     Args:
         model: The scene.
         num_points: Number of points.
-        noise: Standard deviation of the noise, in metres.
+        noise: Standard deviation of the noise, in metres: the difference to the cloud of the same
+            seed with ``noise=0``.
         seed: Two calls with equal arguments give equal clouds; on another processor sines of
-            slanted and curved parts may differ in the last bit.
+            slanted parts may differ in the last bit.
         noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
             every direction.
 
@@ -211,9 +186,8 @@ def _draw_places(
 def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
     """Return which points of shape ``(N, 3)`` are inside a body."""
     inside = np.zeros(len(points), dtype=bool)
-    for part in parts:
-        for solid in part.solids:
-            inside |= solid.contains(points)
+    for solid in (solid for part in parts for solid in part.solids):
+        inside |= solid.contains(points)
     return inside
 
 

@@ -1,4 +1,4 @@
-"""Furniture of random sizes: doors and windows, cabinets, boards, tables, boxes, round things."""
+"""Parts of rooms: walls with doors and windows, and furniture of random sizes."""
 
 from collections.abc import Collection, Mapping
 
@@ -6,14 +6,55 @@ import numpy as np
 
 from torchrg.scenes.geometry import Frame, Triple
 from torchrg.scenes.scene import Part
-from torchrg.scenes.shells import against
-from torchrg.scenes.surfaces import Ball, Block, Cone, Drum, Hole, Ring, rectangle
+from torchrg.scenes.surfaces import Hole, Solid, rectangle
 
 SIDES = ("left", "right", "front", "back")
 """Left and right are across the first axis of a body, front and back across the second."""
 
-_TABLE_HEIGHT = (0.62, 0.92)
+TABLE_HEIGHT = (0.62, 0.92)
 """Least and greatest height of a table top, metres."""
+
+
+def room_walls(room: Frame, size: Triple) -> list[Frame]:
+    """Return the frames of the four walls: first axis along the wall, second up, third inwards.
+
+    Example:
+        >>> walls = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))
+        >>> [wall.axes[2].tolist()[:2] for wall in walls]
+        [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]]
+    """
+    length, width, _ = size
+    starts = ((length, 0), (length, width), (0, width), (0, 0))
+    along = ((-1, 0), (0, -1), (1, 0), (0, 1))
+    return [
+        room.placed((*start, 0), (*axis, 0), (0, 0, 1))
+        for start, axis in zip(starts, along, strict=True)
+    ]
+
+
+def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
+    """Return what is behind a hole in a wall: a leaf ``depth`` behind it, and the four sides to it.
+
+    The hole is in the first two axes of the wall, along it and up; the third is into the room.
+    """
+    left, right, low, high = hole
+    leaf = rectangle(kind, wall.moved(left, low, -depth), right - left, high - low)
+    sill = wall.placed((left, low, -depth), (0, 0, 1), (1, 0, 0))
+    under = rectangle(f"{kind} frame", sill, depth, right - left)
+    return Part((leaf, under, *passage(f"{kind} frame", wall, hole, depth).surfaces))
+
+
+def passage(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
+    """Return the left, right and upper side of a hole through a wall of a thickness ``depth``."""
+    left, right, low, high = hole
+    sides = (
+        ((left, low, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), high - low),
+        ((right, low, -depth), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), high - low),
+        ((left, high, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), right - left),
+    )
+    return Part(
+        tuple(rectangle(kind, wall.placed(*axes), depth, length) for *axes, length in sides)
+    )
 
 
 def block(
@@ -43,7 +84,17 @@ def block(
         for name, (corner, u, v, width, height) in corners.items()
         if name not in without
     )
-    return Part(surfaces, (Block(frame, size),))
+    return Part(surfaces, (Solid(frame.moved(0, 0, z / 2), size),))
+
+
+def against(wall: Frame, along: float, height: float, depth: float) -> Frame:
+    """Return the frame of an object of a depth with its back against a wall.
+
+    Its first axis is along the wall, the second into it, the third up; its origin is the middle
+    of its base, ``along`` from the start of the wall and ``height`` above the floor.
+    """
+    along_axis, up, inwards = wall.axes
+    return Frame(wall.moved(along, height, depth / 2).origin, np.stack([along_axis, -inwards, up]))
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -92,27 +143,13 @@ def _board(kind: str, frame: Frame, size: Triple) -> Part:
 
 def draw_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part:
     """Return a plate with all its faces on a square post."""
-    height = between(rng, *_TABLE_HEIGHT)
+    height = between(rng, *TABLE_HEIGHT)
     length, width, post = between(rng, 1.25, 1.5), between(rng, 0.65, 0.8), between(rng, 0.2, 0.35)
     names = dict.fromkeys(SIDES, "table edge") | {"bottom": "table underside", "top": "table top"}
     under = height - thickness
     plate = block("table", frame.moved(0, 0, under), (length, width, thickness), kinds=names)
     stand = block("table post", frame, (post, post, under), without=("bottom", "top"))
     return Part(plate.surfaces + stand.surfaces, plate.solids + stand.solids)
-
-
-def draw_round_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part:
-    """Return a disc with a curved edge on a round post."""
-    radius, height = between(rng, 0.45, 0.6), between(rng, *_TABLE_HEIGHT)
-    under, post = height - thickness, radius / 5
-    surfaces = (
-        Cone("table underside", frame, (0, under), (radius, under)),
-        Cone("table top", frame, (radius, height), (0, height)),
-        Cone("table edge", frame, (radius, under), (radius, height)),
-        Cone("table post", frame, (post, 0), (post, under)),
-    )
-    plate = Drum(frame.moved(0, 0, under), radius, thickness)
-    return Part(surfaces, (plate, Drum(frame, post, under)))
 
 
 def draw_box(rng: np.random.Generator, frame: Frame) -> Part:
@@ -133,29 +170,3 @@ def draw_pillar(rng: np.random.Generator, frame: Frame, ceiling: float) -> Part:
     """Return a square pillar."""
     width = between(rng, 0.3, 0.5)
     return block("pillar", frame, (width, width, ceiling), without=("bottom", "top"))
-
-
-def draw_column(rng: np.random.Generator, frame: Frame, ceiling: float) -> Part:
-    """Return a round pillar."""
-    radius = between(rng, 0.15, 0.3)
-    side = Cone("column", frame, (radius, 0), (radius, ceiling))
-    return Part((side,), (Drum(frame, radius, ceiling),))
-
-
-def draw_ball(rng: np.random.Generator, frame: Frame) -> Part:
-    """Return a ball on the floor."""
-    radius = between(rng, 0.2, 0.4)
-    return _ball("ball", frame.moved(0, 0, radius), radius)
-
-
-def draw_lamp(rng: np.random.Generator, frame: Frame) -> Part:
-    """Return a ball that sits on a round post, a little into it."""
-    radius, height = between(rng, 0.15, 0.25), between(rng, 1.2, 1.6)
-    post = Cone("lamp post", frame, (radius / 5, 0), (radius / 5, height))
-    shade = _ball("lamp", frame.moved(0, 0, height + 0.9 * radius), radius)
-    return Part((post, *shade.surfaces), (Drum(frame, radius / 5, height), *shade.solids))
-
-
-def _ball(kind: str, middle: Frame, radius: float) -> Part:
-    """Return a ball about the origin of a frame."""
-    return Part((Ring(kind, middle, 0, radius),), (Ball(middle.origin, radius),))
