@@ -161,3 +161,9 @@ def test_clouds_of_few_points_have_no_walls(rng, count):
     sides = find_sides(surface, None, UP)
     assert len(sides.directions) == 0
     assert choose_viewpoint(surface, sides, "cutaway", UP).cut == 0
+
+
+def test_walls_that_voxels_at_a_corner_join_are_walls_all_the_same(room):
+    surface = sample_surface(room(80_000, 0.003, 0).points)
+    assert find_sides(surface, None, UP).directions.abs().max(dim=1).values.amin() > 0.99
+    assert len(find_sides(surface, None, UP).directions) == 5
