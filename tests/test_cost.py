@@ -53,10 +53,6 @@ def estimate(points, method, chunk_size):
     estimate_normals(points, config=config, chunk_size=chunk_size)
 
 
-LONG = {"fastmcd", "mve", "detmm", "irls"}
-"""Methods that take long on the same code as a shorter one."""
-
-
 @pytest.mark.parametrize(
     ("work", "name"),
     [(segment, preset) for preset in ("classic", "paper", "consensus")]

@@ -9,6 +9,7 @@ import torch
 
 import torchrg
 from tests.test_inputs import CALLS, PATCHES, argument
+from torchrg.metrics import score_clusters, score_labels, score_normals
 from torchrg.normals import ESTIMATORS
 from torchrg.transforms import SegmentDepth
 
@@ -50,6 +51,18 @@ def test_planes_are_those_of_the_cpu(preset, device):
     found = torchrg.segment_planes(room.points.to(device), preset)
     assert found.labels.device.type == torch.device(device).type
     assert (found.labels.cpu() == expected.labels).double().mean() > 0.98
+
+
+def test_scores_are_those_of_the_cpu(device, rng):
+    labels, truth = torch.randint(-1, 9, (2, 500), generator=rng)
+    normals, other = torch.randn(2, 500, 3, generator=rng, dtype=torch.float64)
+    for score, arguments in (
+        (score_labels, (labels, truth)),
+        (score_clusters, (normals, labels)),
+        (score_normals, (normals, other)),
+    ):
+        found = score(*(argument.to(device) for argument in arguments))
+        assert found == pytest.approx(score(*arguments), rel=1e-9)
 
 
 def test_depth_is_that_of_the_cpu(device):

@@ -72,6 +72,21 @@ def test_gradients_change_no_value(method, dtype):
     assert fit.curvature.requires_grad
 
 
+@pytest.mark.parametrize("fit", [fit_normals_pca, fit_jet], ids=["pca", "jet"])
+def test_planes_of_patches_have_the_gradient_of_finite_differences(fit):
+    rows = [*range(0, 24, 2), *range(1, 9, 2)]  # most on the face of the first point
+    patches = torch.stack([bracket(seed, 24)[rows] for seed in (0, 1)])
+    mask = (torch.arange(16) != 6).expand(2, 16)
+
+    def all_parts(points):
+        found = fit(points, mask)._asdict()
+        # Directions of curvature have no sign.
+        names = ("normals", "curvature", "residual_rms", "foot", "principal_curvatures")
+        return tuple(found[name] for name in names if name in found)
+
+    assert gradcheck(all_parts, patches.requires_grad_(), fast_mode=True)
+
+
 def test_gradients_reach_a_sample_and_survive_orientation():
     points = bracket(0, 40).requires_grad_()
     sample = EstimateNormals(method="pca", k=10)({"coord": points})

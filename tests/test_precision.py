@@ -11,7 +11,7 @@ from torchrg import Cloud, estimate_normals, load_config, read_cloud, segment_pl
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.sources import FolderSource
 from torchrg.errors import PrecisionWarning
-from torchrg.precision import _spacing, note_on_steps
+from torchrg.precision import note_on_steps
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -49,16 +49,6 @@ def test_the_line_does_not_depend_on_the_order_of_the_points(places):
         found = {note_on_steps(points[random.permutation(len(points))]) for _ in range(5)}
         assert len(found) == 1
         assert found != {""}
-
-
-def test_the_spacing_is_that_of_the_same_points_in_any_order():
-    random = np.random.default_rng(0)
-    points = random.random((60_000, 3)) * [1, 1, 0]
-    found = {_spacing(points[random.permutation(len(points))], 32 / 60_000**0.5) for _ in range(2)}
-    assert len(found) == 1
-    assert found.pop() == pytest.approx(
-        np.median(KDTree(points).query(points, k=2)[0][:, 1]), rel=0.1
-    )
 
 
 def test_dense_parts_of_a_cloud_count_though_the_whole_is_wide():

@@ -42,8 +42,8 @@ from torchrg.transforms import EstimateNormals, SegmentPlanes
 def normals_of(fit, **settings):
     """Return a function of patches to normals without sign, and curvature."""
 
-    def call(patches):
-        found = fit(patches, **settings)
+    def call(patches, *mask):
+        found = fit(patches, *mask, **settings)
         return found.normals[..., :, None] * found.normals[..., None, :], found.curvature
 
     return call
@@ -202,6 +202,8 @@ def test_masks_travel_with_their_patches(fit, patches):
     assert_close(torch.vmap(fit)(patches, mask)[:6], expected[:6])
     shared = fit(patches, mask[:1].expand(4, -1))
     assert_close(torch.vmap(fit, in_dims=(0, None))(patches, mask[0])[:6], shared[:6])
+    planes = normals_of(fit_normals_pca)
+    assert_close(torch.vmap(planes)(patches, mask), planes(patches, mask))
     compiled = torch.compile(fit, fullgraph=True, backend="eager")
     assert torch.equal(compiled(patches, mask).support, expected.support)
 

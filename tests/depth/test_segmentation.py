@@ -211,13 +211,6 @@ def test_depth_beyond_the_limit_is_left_out():
     assert seg.planes.count.tolist() == [2400]
 
 
-def test_depth_on_a_device(device):
-    depth, truth = corner()
-    seg = segment_depth(depth.to(device), SMALL.to(device))
-    assert seg.labels.device.type == device
-    assert score_labels(seg.labels.flatten().cpu(), truth.flatten()).f1 > 99
-
-
 def test_wrong_input_is_refused():
     with pytest.raises(ShapeError, match=r"segment_depth: expected depth of shape \(H, W\)"):
         segment_depth(torch.ones(1, 4, 4), SMALL)

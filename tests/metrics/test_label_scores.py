@@ -10,7 +10,10 @@ import torch
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import (
     METRICS,
+    ClusterScore,
     LabelScore,
+    NormalScore,
+    PartitionScore,
     score_labels,
 )
 
@@ -112,41 +115,26 @@ def test_means_over_nothing_are_zero_and_the_counts_tell(labels, truth, counts, 
     assert {score._asdict()[name] for name in zeros} == {0.0}
 
 
-def test_one_point_is_a_region_and_a_face():
-    score = score_labels(torch.tensor([4]), torch.tensor([9]))
-    assert (score.f1, score.mean_best_iou, score.ari, score.pairs) == (100, 1, 1, 1)
-
-
-def test_scores_do_not_depend_on_point_order_or_on_names(rng):
-    labels, truth = torch.randint(-1, 9, (2, 500), generator=rng)
-    truth = torch.where(torch.rand(500, generator=rng) < 0.7, labels, truth)
-    order = torch.randperm(500, generator=rng)
-    score = score_labels(labels, truth)
-    assert score_labels(labels[order], truth[order]) == score
-    renamed = torch.where(labels == -1, -1, 3 * labels + 100)
-    assert score_labels(renamed, truth) == score
-
-
-def test_ignored_points_change_nothing(rng):
-    labels, truth = torch.randint(-1, 6, (2, 300), generator=rng)
-    truth = torch.where(torch.rand(300, generator=rng) < 0.7, labels, truth)
-    kept = truth != 3
-    assert score_labels(labels, truth, ignore=3) == score_labels(labels[kept], truth[kept])
-
-
-def test_small_regions_score_as_if_they_were_unlabelled(rng):
+def test_ignored_points_and_small_regions_score_as_if_they_were_not_there(rng):
     truth = torch.randint(0, 6, (300,), generator=rng)
     labels = truth.clone()
     labels[:9] = torch.tensor([20, 20, 20, 20, 21, 21, 21, 22, 23])
-    cleaned = torch.where((labels > 20), -1, labels)
-    assert score_labels(labels, truth, min_size=4) == score_labels(cleaned, truth)
+    cleaned, kept = torch.where(labels > 20, -1, labels), truth != 3
+    expected = score_labels(cleaned[kept], truth[kept])
+    assert score_labels(labels, truth, min_size=4, ignore=3) == expected
 
 
-def test_numpy_and_tensor_input_score_alike(rng):
-    labels, truth = torch.randint(-1, 6, (2, 300), generator=rng)
-    score = score_labels(labels, truth)
-    assert score_labels(labels.numpy().astype(np.int16), truth.numpy()) == score
-    assert score_labels(labels.int(), truth.numpy().astype(">i8")) == score
+@pytest.mark.parametrize(
+    ("part", "score"),
+    [
+        ("labels", LabelScore),
+        ("clusters", ClusterScore),
+        ("normals", NormalScore),
+        ("superpoints", PartitionScore),
+    ],
+)
+def test_fields_of_scores_are_those_of_the_catalog(part, score):
+    assert list(METRICS[part]) == list(score._fields)
 
 
 def test_scores_are_plain_numbers_for_json(rng):
@@ -157,10 +145,6 @@ def test_scores_are_plain_numbers_for_json(rng):
     assert all(math.isfinite(value) for value in score)
 
 
-def test_fields_are_those_of_the_catalog():
-    assert list(METRICS["labels"]) == list(LabelScore._fields)
-
-
 def test_labels_that_do_not_fit_are_refused():
     whole = torch.zeros(4, dtype=torch.int64)
     with pytest.raises(ShapeError, match=r"score_labels: expected truth of shape \(N\) with N=4"):
@@ -169,8 +153,3 @@ def test_labels_that_do_not_fit_are_refused():
         score_labels(whole.float(), whole)
     with pytest.raises(ConfigError, match="score_labels: expected min_size >= 1, got 0"):
         score_labels(whole, whole, min_size=0)
-
-
-def test_labels_on_the_device_score_as_on_the_cpu(device, rng):
-    labels, truth = torch.randint(-1, 9, (2, 500), generator=rng)
-    assert score_labels(labels.to(device), truth.to(device)) == score_labels(labels, truth)

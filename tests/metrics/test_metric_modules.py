@@ -19,7 +19,6 @@ from torchrg.metrics import score_normals as score_errors  # noqa: E402
 from torchrg.metrics.modules import PlaneMetric  # noqa: E402
 
 NO_NAMES = ("points", "invalid", "clusters")  # of several parts, or of a part itself
-INDICES = [(part, name) for part in METRICS for name in METRICS[part] if name not in NO_NAMES]
 
 
 def values_of(metric):
@@ -44,33 +43,24 @@ def scans(part):
 
 
 @pytest.mark.parametrize("part", METRICS)
-def test_compute_is_the_mean_of_the_scores_of_the_scans(part):
+def test_forward_gives_the_score_of_one_scan_and_compute_the_mean_of_all(part):
     metric, scores = PlaneMetric(part), []
     for arguments, score in scans(part):
-        metric.update(*arguments)
+        values = {name: float(value) for name, value in metric(*arguments).items()}
+        assert values == pytest.approx({k: float(v) for k, v in score.items()}, rel=1e-12)
         scores.append(score)
     means = {name: np.mean([score[name] for score in scores]) for name in scores[0]}
     assert values_of(metric) == pytest.approx(means, rel=1e-12)
 
 
 @pytest.mark.parametrize("part", METRICS)
-def test_forward_gives_the_score_of_one_scan_and_keeps_the_mean(part):
-    metric, updated = PlaneMetric(part), PlaneMetric(part)
-    for arguments, score in scans(part):
-        values = {name: float(value) for name, value in metric(*arguments).items()}
-        assert values == pytest.approx({k: float(v) for k, v in score.items()}, rel=1e-12)
-        updated.update(*arguments)
-    assert values_of(metric) == pytest.approx(values_of(updated), rel=1e-12)
-
-
-@pytest.mark.parametrize("part", METRICS)
 def test_each_index_is_the_one_of_the_catalog_that_it_is_named_for(part):
-    singles = {name: PlaneMetric(name) for of, name in INDICES if of == part}
-    whole = PlaneMetric(part)
+    names = [name for name in METRICS[part] if name not in NO_NAMES]
+    whole, *singles = PlaneMetric(part), *map(PlaneMetric, names)
     for arguments, _ in scans(part):
-        for metric in (whole, *singles.values()):
+        for metric in (whole, *singles):
             metric.update(*arguments)
-    for name, single in singles.items():
+    for name, single in zip(names, singles, strict=True):
         assert torch.equal(single.compute(), whole.compute()[name])
         assert single.compute().shape == ()
         assert (single.part, single.index) == (part, name)
@@ -150,17 +140,6 @@ def test_no_scan_gives_nan():
         assert PlaneMetric("f1").compute().isnan()
 
 
-def test_a_tracker_knows_the_best_of_several_results():
-    truth = torch.repeat_interleave(torch.arange(4), 25)
-    tracker = torchmetrics.wrappers.MetricTracker(
-        PlaneMetric("covering"), maximize=PlaneMetric("covering").higher_is_better
-    )
-    for labels in (torch.where(truth == 1, -1, truth), truth, torch.zeros_like(truth) - 1):
-        tracker.increment()
-        tracker.update(labels, truth)
-    assert tracker.best_metric(return_step=True) == (1.0, 1)
-
-
 def test_settings_reach_the_function():
     labels, truth = torch.tensor([0, 0, 0, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 7, 7])
     metric = PlaneMetric("labels", min_size=2, ignore=7)
@@ -204,11 +183,3 @@ def test_reset_forgets_and_copies_remember():
         assert float(twin.compute()) == score["f1"]
     metric.reset()
     assert int(metric.scans.sum()) == 0
-
-
-def test_metrics_on_the_device_compute_as_on_the_cpu(device):
-    metric, there = PlaneMetric("labels"), PlaneMetric("labels").to(device)
-    for arguments, _ in scans("labels"):
-        metric.update(*arguments)
-        there.update(*(tensor.to(device) for tensor in arguments))
-    assert values_of(there) == values_of(metric)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.errors import ShapeError
-from torchrg.metrics import METRICS, NormalScore, score_normals
+from torchrg.metrics import score_normals
 
 
 def turned(truth, degrees, rng):
@@ -123,17 +123,6 @@ def test_blocks_change_nothing(rng, truth, monkeypatch):
     assert score_normals(normals, truth) == whole
 
 
-def test_errors_do_not_depend_on_the_order_of_the_points(rng, truth):
-    normals = turned(truth, 90 * torch.rand(200, generator=rng, dtype=torch.float64), rng)
-    order = torch.randperm(200, generator=rng)
-    there, back = score_normals(normals, truth), score_normals(normals[order], truth[order])
-    assert there == pytest.approx(back, rel=1e-13)
-
-
-def test_fields_are_those_of_the_catalog():
-    assert list(METRICS["normals"]) == list(NormalScore._fields)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -151,9 +140,3 @@ def test_input_that_does_not_fit_is_refused(arguments, message):
     whole = {"normals": torch.ones(4, 3), "truth": torch.ones(4, 3), **arguments}
     with pytest.raises(ShapeError, match=f"score_normals: expected .*{message}"):
         score_normals(**whole)
-
-
-def test_normals_on_the_device_score_as_on_the_cpu(device, dtype, rng, truth):
-    normals = turned(truth, torch.full((200,), 7.0).double(), rng).to(dtype)
-    there = score_normals(normals.to(device), truth.to(dtype).to(device))
-    assert there == pytest.approx(score_normals(normals, truth.to(dtype)), rel=1e-9)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.metrics import METRICS, PartitionScore, score_partition
+from torchrg.metrics import PartitionScore, score_partition
 
 
 def counted_oracle(superpoints, truth, ignored):
@@ -99,10 +99,6 @@ def test_arguments_are_checked():
         score_partition(labels, labels, torch.zeros(2, 2))
     with pytest.raises(ShapeError, match="score_partition: expected truth"):
         score_partition(labels, torch.zeros(3, dtype=torch.int64))
-
-
-def test_every_score_has_a_meaning():
-    assert list(METRICS["superpoints"]) == list(PartitionScore._fields)
 
 
 def row_of_points(count):

@@ -91,43 +91,6 @@ def noisy_bracket():
     return points, consensus(points)
 
 
-def same(a, b):
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
-def test_chunk_size_and_threads_change_nothing(noisy_bracket, set_threads):
-    points, fit = noisy_bracket
-    assert same(fit, consensus(points, chunk_size=701))
-    set_threads(3 - min(torch.get_num_threads(), 2))
-    assert same(fit, consensus(points))
-
-
-def test_order_changes_nothing(noisy_bracket, rng):
-    points, fit = noisy_bracket
-    shuffled = torch.randperm(len(points), generator=rng)
-    other = consensus(points[shuffled])
-    assert torch.equal(fit.sharp[shuffled], other.sharp)
-    assert torch.equal(fit.normals[shuffled], other.normals)
-
-
-@pytest.mark.parametrize("scale", [2.0**-13, 2.0**10])
-def test_the_unit_changes_nothing(noisy_bracket, scale):
-    points, fit = noisy_bracket
-    other = consensus(points * scale)
-    assert torch.equal(fit.sharp, other.sharp)
-    assert float(unsigned_angle_deg(fit.normals, other.normals).max()) < 0.01
-
-
-def test_the_origin_changes_rounding_only(noisy_bracket):
-    points, _ = noisy_bracket
-    # Coordinates that stay exact when moved, so that distances tie in the same way.
-    near = (points.double() * 2**14).round() / 2**14
-    a, b = consensus(near), consensus(near + 2.0**22)
-    assert float((a.sharp == b.sharp).double().mean()) > 0.999
-    angles = unsigned_angle_deg(a.normals, b.normals)
-    assert float((angles < 0.01).double().mean()) > 0.995
-
-
 def test_masked_neighbors_do_not_count(noisy_bracket):
     points, fit = noisy_bracket
     known = search_knn(points, 50).indices

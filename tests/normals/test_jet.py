@@ -127,23 +127,6 @@ def test_query_is_the_first_point_that_counts(rng):
     assert torch.allclose(fit.foot, fit_jet(bowl[7:]).foot)
 
 
-def test_gradients_are_right(rng):
-    patch = torch.randn(2, 12, 3, generator=rng, dtype=torch.float64) * torch.tensor([1, 0.8, 0.2])
-    mask = torch.arange(12) != 4
-
-    def fit(points):
-        found = fit_jet(points, mask.expand(2, 12))
-        return (
-            found.normals,
-            found.foot,
-            found.principal_curvatures,
-            found.curvature,
-            found.residual_rms,
-        )
-
-    assert torch.autograd.gradcheck(fit, patch.requires_grad_())
-
-
 def test_least_squares_is_that_of_numpy(rng):
     columns = torch.randn(4, 6, 25, generator=rng, dtype=torch.float64)
     columns[..., 3] *= 1e3

@@ -135,13 +135,6 @@ def test_rooms_are_seen_from_inside(scanned):
     assert share_right(oriented[shell], scene.normals[shell]) > 0.998
 
 
-def test_thin_plates_are_two_faces_where_normals_are_robust(room):
-    scene = room(30_000, 0.003, 2)
-    fit = estimate_normals(scene.points, method="detmcd", k=30)
-    oriented = orient_normals(scene.points, shuffled_signs(fit.normals))
-    assert share_right(oriented, scene.normals) > 0.985
-
-
 def test_wall_between_two_rooms_faces_both(rng):
     left, into_left = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=3000)
     right, into_right = box_room((3.0, 3.0, 2.5), (4.2, 0.0, 0.0), rng, count=3000)
@@ -222,16 +215,6 @@ def test_both_faces_of_a_thin_plate_look_away_from_it(rng, height):
     truth = torch.cat([inwards, -into])
     oriented = orient_normals(torch.cat([points, plate]), shuffled_signs(truth))
     assert share_right(oriented, truth) > 0.999
-
-
-@pytest.mark.parametrize("unit", [1e-4, 1e3])
-def test_votes_have_no_unit(scanned, unit):
-    points, normals = scanned[0].points[:5000].double(), scanned[1][:5000].double()
-    neighbors = search_knn(points, 20)
-    votes = vote_free_side(points, normals, neighbors)
-    again = vote_free_side(points * unit, normals, neighbors)
-    # Few points change cells by rounding.
-    assert ((votes - again).abs() > 1e-6).double().mean() < 0.05
 
 
 def test_tilted_plane_looks_up_whatever_rounding_says(rng):

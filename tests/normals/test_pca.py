@@ -7,7 +7,6 @@ import torch
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.normals import fit_normals_pca
-from torchrg.structures import NormalFit
 
 
 def random_patches(rng, count=40, k=15, spread=(1.0, 0.7, 0.1)):
@@ -80,29 +79,6 @@ def test_resolution_decides_what_is_rounding(rng):
     size = torch.full((len(patches),), 1e-3, dtype=torch.float64)
     assert not fit_normals_pca(patches, resolution=size).valid.any()
     assert fit_normals_pca(patches, resolution=size * 1e-3).valid.all()
-
-
-def test_gradients_are_right(rng):
-    patches = random_patches(rng, count=3, k=6).requires_grad_()
-    mask = torch.arange(6) < 5
-
-    def fit(points):
-        found = fit_normals_pca(points, mask.expand(3, 6))
-        return found.normals, found.curvature, found.residual_rms
-
-    assert torch.autograd.gradcheck(fit, patches)
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_vmap_is_the_batch(rng, dtype, masked):
-    patches = torch.cat([random_patches(rng), strips(rng, 0.0, torch.float64, k=15)]).to(dtype)
-    mask = torch.rand(patches.shape[:2], generator=rng) < 0.8 if masked else None
-    fit = fit_normals_pca(patches, mask)
-    axes = NormalFit(0, 0, 0, 0, None)
-    mapped = torch.vmap(fit_normals_pca, (0, 0 if masked else None), out_dims=axes)(patches, mask)
-    for name in ("normals", "curvature", "valid", "residual_rms"):
-        assert torch.equal(getattr(mapped, name), getattr(fit, name))
-    assert not fit.valid.all()
 
 
 @pytest.mark.parametrize(

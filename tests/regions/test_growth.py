@@ -251,18 +251,3 @@ def test_wrong_shapes_are_refused():
         grow_regions(points.float(), normals, curvature, neighbors)
     with pytest.raises(ShapeError, match="expected valid of bool"):
         grow_regions(points, normals, curvature, neighbors, valid=curvature)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_angle_deg", 91.0),
-        ("curvature_quantile", 1.1),
-        ("connectivity", -0.1),
-        ("coplanarity_floor", -1.0),
-        ("min_size", 0),
-    ],
-)
-def test_values_out_of_range_are_refused(name, value):
-    with pytest.raises(ConfigError, match=f"GrowingConfig: expected {name} "):
-        papers_growing(**{name: value})

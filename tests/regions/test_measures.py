@@ -106,12 +106,3 @@ def test_a_circle_of_many_corners_takes_no_square_of_them():
     angle = np.linspace(0, 2 * np.pi, 20_001)[:-1]
     sides = rectangles(np.stack([np.cos(angle), np.sin(angle)], axis=1)).sides
     torch.testing.assert_close(sides, torch.full((1, 2), 2.0).double(), rtol=1e-6, atol=0)
-
-
-def test_rectangles_stay_on_their_device(device):
-    places = torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    labels = torch.zeros(100, dtype=torch.int64)
-    found = fit_rectangles(Segments(labels.to(device)), *places.to(device).unbind(1))
-    for one, other in zip(found, fit_rectangles(Segments(labels), *places.unbind(1)), strict=True):
-        assert one.device.type == device
-        torch.testing.assert_close(one.cpu(), other)

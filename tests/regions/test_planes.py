@@ -164,17 +164,6 @@ def test_threads_change_nothing(set_threads):
         assert torch.equal(a, b)
 
 
-def test_a_column_is_curved_and_a_wall_is_not():
-    angle = torch.linspace(0, 2 * math.pi, 200)[:-1].repeat(20)
-    ring = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=1)
-    column = ring + torch.arange(20.0).repeat_interleave(199)[:, None] * torch.tensor([0, 0, 0.1])
-    planes = summarize_planes(column, ring, one_region(column))
-    assert planes.curved.tolist() == [True]
-    gentle = torch.stack([ring[:, 0] * 0.02, ring[:, 1] * 0.02, torch.ones(len(ring))], dim=1)
-    gentle = torch.nn.functional.normalize(gentle, dim=1)
-    assert summarize_planes(column, gentle, one_region(column)).curved.tolist() == [False]
-
-
 @pytest.mark.parametrize(("bend_deg", "curved"), [(26.0, False), (30.0, True)])
 def test_a_bend_is_curved_from_three_to_four_times_the_spread_on(bend_deg, curved):
     angle = torch.deg2rad(torch.linspace(0, bend_deg, 500))
@@ -244,18 +233,6 @@ def test_kinds_follow_the_up_direction():
         kinds("xz")
     assert kinds((1, 0, 0)) == ["wall", "wall", "floor", "ceiling", "wall", "wall"]
     assert summarize_planes(points, normals, labels).kind is None
-
-
-def test_table_tops_and_cabinets_are_neither_floor_nor_wall():
-    rng = np.random.default_rng(11)
-    points, normals, labels = box_of_points(rng, n=800)
-    top = torch.from_numpy(rng.uniform([1, 1, 0.7], [2, 2, 0.7], (500, 3)))
-    side = torch.from_numpy(rng.uniform([1, 1, 0.0], [2, 1, 0.7], (500, 3)))
-    points = torch.cat([points, top, side])
-    normals = torch.cat([normals, torch.eye(3).double()[[2] * 500 + [1] * 500]])
-    labels = torch.cat([labels, torch.tensor([6] * 500 + [7] * 500)])
-    table = summarize_planes(points, normals, labels, up=(0, 0, 1))
-    assert [PLANE_KINDS[kind] for kind in table.kind[6:]] == ["horizontal", "vertical"]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -335,21 +312,6 @@ def test_roles_end_where_the_documentation_says(part, role):
     }
     found = classify_planes(Planes(**columns), torch.tensor([0.0, 0, 1]))
     assert [PLANE_KINDS[kind] for kind in found] == ["floor", "ceiling", "wall", role]
-
-
-def test_what_leans_is_oblique_and_what_is_bent_has_no_role():
-    rng = np.random.default_rng(13)
-    points, normals, labels = box_of_points(rng, n=800)
-    flat = torch.from_numpy(rng.uniform([1, 1, 1], [2, 2, 1], (500, 3)))
-    roof = flat + (flat[:, :1] - 1) * torch.tensor([0, 0, 0.7]).double()
-    angle = torch.from_numpy(rng.uniform(0, np.pi, 500))
-    column = torch.stack([1 + angle.cos() / 3, 1 + angle.sin() / 3, flat[:, 0]], dim=1)
-    lean = torch.tensor([-0.573, 0, 0.819]).double().expand(500, 3)
-    around = torch.stack([angle.cos(), angle.sin(), 0 * angle], dim=1)
-    points, normals = torch.cat([points, roof, column]), torch.cat([normals, lean, around])
-    labels = torch.cat([labels, torch.tensor([6] * 500 + [7] * 500)])
-    table = summarize_planes(points, normals, labels, up="z")
-    assert [PLANE_KINDS[kind] for kind in table.kind[6:]] == ["oblique", "other"]
 
 
 def test_outline_of_a_frame_has_a_hole_and_its_area():

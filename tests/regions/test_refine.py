@@ -6,7 +6,6 @@ import torch
 
 from tests.regions import growing_clouds
 from tests.regions.growing_clouds import papers_growing
-from torchrg.errors import ConfigError
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
@@ -415,19 +414,3 @@ def test_grown_and_refined_labels_do_not_depend_on_order_or_unit(unit, rng):
         moved, normals[order], curvature[order], search_knn(moved, 14), config, chunk_size=100
     )
     assert torch.equal(again, labels[order])
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_plane_residual", 0.0),
-        ("absorb_reach", -1.0),
-        ("absorb_angle_deg", 91.0),
-        ("merge_tolerance", 0.9),
-        ("facet_tolerance", 0.0),
-        ("max_distance", -1.0),
-    ],
-)
-def test_settings_out_of_range_are_refused(name, value):
-    with pytest.raises(ConfigError, match=f"GrowingConfig: expected {name} "):
-        papers_growing(**{name: value})

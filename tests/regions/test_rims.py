@@ -104,12 +104,3 @@ def test_regions_that_are_not_flat_or_nearly_parallel_keep_their_points():
     tilted = np.array([[0.0, 0, 1], [0, np.sin(0.1), np.cos(0.1)]])
     found = refined(points[flat], labels[flat], tilted, reach=1.0)
     assert torch.equal(found, torch.tensor(labels[flat]))
-
-
-def test_order_and_unit_change_nothing(rng):
-    points, _, normals = floor_and_wall(np.random.default_rng(5), 3000)
-    labels = nearest_plane(points, normals)
-    found = refined(points, labels, normals)
-    assert not torch.equal(found, torch.tensor(labels))
-    order = torch.randperm(len(points), generator=rng)
-    assert torch.equal(refined(points[order], labels[order], normals), found[order])

@@ -7,21 +7,14 @@ import torch
 
 import torchrg
 from torchrg.errors import ConfigError
-from torchrg.render import gallery, render_cloud
+
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 @pytest.fixture(scope="module")
 def seg():
     points = torchrg.scenes.make_room(num_points=3000, seed=0).points
     return torchrg.segment_planes(points, torchrg.load_config("classic"))
-
-
-@pytest.fixture(autouse=True)
-def _small_pictures(monkeypatch):
-    def small(*arguments, **settings):
-        return render_cloud(*arguments, **settings, width=80)
-
-    monkeypatch.setattr(gallery, "render_cloud", small)
 
 
 def test_a_notebook_shows_a_picture_and_the_largest_planes(seg):

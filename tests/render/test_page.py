@@ -12,12 +12,11 @@ import torch
 
 pytest.importorskip("pydeck", reason="needs the extra view")
 
-from torchrg.cli import main
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.channels import decode_directions, encode_directions
 from torchrg.render.content import NUM_STRATA
-from torchrg.render.page import make_page
+from torchrg.render.page import Page, make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -74,27 +73,17 @@ def places(page, place=0):
     return local @ np.array(frame["rotation"]) * frame["scale"] + frame["origin"]
 
 
-def test_a_page_holds_every_point_where_it_is():
+def test_a_page_holds_every_point_where_it_is_and_what_the_file_says_of_it():
     cloud, page = room(), page_of_room()
-    step = described(page)["clouds"][0]["step"] * described(page)["frame"]["scale"]
-    found = places(page)
-    order, given = np.lexsort(found.round(2).T), np.lexsort(cloud.coordinates.round(2).T)
-    assert len(order) == len(given)
-    distances = torch.cdist(torch.from_numpy(found), torch.from_numpy(cloud.coordinates).double())
-    assert float(distances.amin(dim=1).max()) <= step
-    assert float(distances.amin(dim=0).max()) <= step
-
-
-def test_a_page_says_of_each_point_what_the_file_says():
-    cloud, page = room(), page_of_room()
-    arrays = unpacked(page)
+    arrays, what = unpacked(page), described(page)
     distances = torch.cdist(
         torch.from_numpy(places(page)), torch.from_numpy(cloud.coordinates).double()
     )
-    rows = distances.argmin(dim=1).numpy()
-    assert (arrays["plane"][:, 0] == cloud.fields["labels"][rows]).all()
-    assert (arrays["superpoint"][:, 0] == cloud.fields["superpoints"][rows]).all()
-    assert (arrays["sharp"][:, 0] == cloud.fields["sharp"][rows]).all()
+    nearest, rows = distances.min(dim=1)
+    assert float(nearest.max()) <= what["clouds"][0]["step"] * what["frame"]["scale"]
+    assert sorted(rows.tolist()) == list(range(len(cloud)))
+    for name, field in (("plane", "labels"), ("superpoint", "superpoints"), ("sharp", "sharp")):
+        assert (arrays[name][:, 0] == cloud.fields[field][rows]).all()
     assert (arrays["color"] == 90).all()
     normals = decode_directions(np.ascontiguousarray(arrays["normals"]))
     assert ((normals * cloud.fields["normals"][rows]).sum(axis=1) > 0.999).all()
@@ -132,17 +121,6 @@ def test_pages_do_not_depend_on_unit_and_origin(factor):
         own = moved.coordinates[cloud.fields["labels"] == one["name"]]
         residuals = own @ other["normal"] - other["offset"]
         assert np.abs(residuals).max() < 0.05 * factor
-
-
-def test_planes_are_those_of_the_labels():
-    cloud = room()
-    planes = described(page_of_room())["clouds"][0]["planes"]
-    counts = np.bincount(cloud.fields["labels"])
-    assert [plane["count"] for plane in planes] == counts.tolist()
-    for plane in planes[:6]:
-        own = cloud.coordinates[cloud.fields["labels"] == plane["name"]]
-        residuals = own @ plane["normal"] - plane["offset"]
-        assert np.sqrt((residuals**2).mean()) == pytest.approx(plane["rms"], rel=1e-3)
 
 
 def test_a_sample_is_stated_and_strata_are_spread_evenly():
@@ -274,13 +252,11 @@ def test_missing_package_is_told_with_its_repair(monkeypatch):
         make_page(Result(room()))
 
 
-def test_view_writes_a_page(tmp_path, capsys):
-    np.savez(tmp_path / "room.npz", points=room().coordinates, **room().fields)
-    out = tmp_path / "room.html"
-    beside = ["--beside", str(tmp_path / "room.npz")]
-    assert main(["view", str(tmp_path / "room.npz"), "--out", str(out), *beside]) == 0
-    assert "1,600 and 1,600 points" in capsys.readouterr().out
-    assert len(described(type("Page", (), {"html": out.read_text()}))["clouds"]) == 2
+def test_view_writes_a_page(tmp_path, run):
+    path, out = tmp_path / "room.npz", tmp_path / "room.html"
+    np.savez(path, points=room().coordinates, **room().fields)
+    assert "1,600 and 1,600 points" in run("view", path, "--out", out, "--beside", path).out
+    assert len(described(Page(out.read_text(), ()))["clouds"]) == 2
 
 
 @pytest.mark.parametrize(
@@ -295,14 +271,13 @@ def test_view_writes_a_page(tmp_path, capsys):
         (["--out", "page.html", "--max-points", "0"], "expected max_points >= 1"),
     ],
 )
-def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments, message):
+def test_view_refuses_in_one_line(tmp_path, monkeypatch, run, arguments, message):
     monkeypatch.chdir(tmp_path)
     np.savez("room.npz", points=np.random.default_rng(0).random((300, 3)))
     np.savez("few.npz", points=np.eye(3))
-    assert main(["view", "room.npz", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+    done = run("view", "room.npz", *arguments)
+    assert done.code == 2
+    assert message in done.error
     assert not list(tmp_path.glob("page.*"))
 
 

@@ -38,14 +38,6 @@ def test_result_does_not_depend_on_chunks_and_batch(estimator, patches):
     )
 
 
-def test_devices_agree(estimator, patches, device):
-    fit, there = estimator(patches), estimator(patches.to(device))
-    close = {"rtol": 1e-3, "atol": 1e-5} if patches.dtype == torch.float32 else {}
-    assert there.location.device.type == device
-    assert torch.equal(there.support.cpu(), fit.support)
-    torch.testing.assert_close(there.covariance.cpu(), fit.covariance, **close)
-
-
 def test_result_does_not_depend_on_threads(patches, set_threads):
     results = []
     for threads in (1, 3):

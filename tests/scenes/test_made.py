@@ -6,7 +6,6 @@ import torch
 from scipy.stats import chisquare, kstest
 
 from tests.made import (
-    KINECT_LAYOUT,
     SHAPES,
     Camera,
     CurvedLayout,
@@ -14,13 +13,10 @@ from tests.made import (
     cameras_around,
     cast_rays,
     drawn_from_triangles,
-    fuse_frames,
     make_kinect_room,
     make_mapped_room,
     make_shape,
-    make_storey,
     render_depth,
-    scan_scene,
 )
 from tests.made.rays import solve_quadratic
 from torchrg.neighbors import search_knn
@@ -139,17 +135,6 @@ def test_points_are_spread_evenly_over_curved_and_cut_faces():
     assert inner.sum() / len(top) == pytest.approx(expected, rel=0.15)
 
 
-def test_ends_of_extruded_parts_follow_their_rounded_outline():
-    plate, bracket = make_shape("plate", 50_000), make_shape("bracket", 50_000)
-    ends = plate.points[plate.labels < 2].double()
-    corner = (ends[:, 0] < 0.15) & (ends[:, 1] < 0.15)
-    assert 0 < (ends[corner, :2] - 0.15).norm(dim=1).max() < 0.15 + 1e-6
-    ends = bracket.points[bracket.labels < 2].double()
-    fillet = (ends[:, 0] > 0.25 + 1e-6) & (ends[:, 1] > 0.25 + 1e-6)
-    assert (ends[fillet, :2] - 0.37).norm(dim=1).min() > 0.12 - 1e-6
-    assert bracket.planar.tolist() == [True] * 8 + [False] * 3
-
-
 def test_noise_of_a_shape_is_a_share_of_the_diagonal():
     exact, noisy = (make_shape("cuboid", 50_000, noise) for noise in (0, 0.006))
     shifts = (noisy.points - exact.points).double().numpy()
@@ -174,12 +159,6 @@ def test_bent_wall_passes_through_its_corners_and_bulges_by_the_bend():
     assert (floor[:, 1] > edge - 1e-5).all()
 
 
-def test_curved_faces_are_those_of_round_things():
-    scene = make_room(2000, 0.0, layout=CURVED)
-    curved = {kind for kind, flat in zip(scene.kinds, scene.planar, strict=True) if not flat}
-    assert curved == {"wall", "column", "table edge", "table post", "ball", "lamp", "lamp post"}
-
-
 def test_points_drawn_from_triangles_lie_on_them(room):
     scene = room(2000, 0.0, 3)
     drawn = drawn_from_triangles(scene, 6000)
@@ -200,14 +179,6 @@ def test_points_drawn_from_triangles_lie_on_them(room):
 # Storeys.
 
 
-def test_storey_has_one_floor_and_a_ceiling_for_each_room():
-    storey = make_storey(1000)
-    ceilings = [row for row, kind in enumerate(storey.kinds) if kind == "ceiling"]
-    assert (storey.kinds.count("floor"), len(ceilings)) == (1, 9)
-    assert storey.face_offsets[ceilings].sort().values.diff().abs().min() > 0.005
-    assert make_storey(1000, rooms_per_side=2).kinds.count("ceiling") == 5
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_every_room_is_reached_from_the_hall_through_its_door(seed):
     model = build_storey(seed)
@@ -220,16 +191,6 @@ def test_every_room_is_reached_from_the_hall_through_its_door(seed):
         # One way lies the hallway of 2.4 m, the other way a room.
         assert distances.min() > 2
         assert distances.max() > 4
-
-
-def test_rooms_of_a_storey_do_not_overlap():
-    cells = build_storey(1).surfaces[0].cells
-    low, high = cells[:, 0], cells[:, 0] + cells[:, 1] + cells[:, 2]
-    overlaps = (np.minimum(high[:, None], high) - np.maximum(low[:, None], low)).min(axis=2)
-    np.fill_diagonal(overlaps, -1)
-    # The hallway, doorways and rooms share edges and no more; rooms are apart by their walls.
-    assert overlaps.max() < 1e-9
-    assert overlaps[1::2, 1::2].max() < -0.3
 
 
 # Rays and scans.
@@ -294,31 +255,6 @@ def test_rays_along_the_sides_of_a_cone_are_solved_without_loss():
     # (1e-20 t^2 - 2 t + 1) has roots near 2e20 and 0.5; the usual formula loses the second.
     roots = solve_quadratic(np.array([1e-20]), np.array([-1.0]), np.array([1.0]))
     assert sorted(root[0] for root in roots) == pytest.approx([0.5, 2e20])
-
-
-def test_blocks_of_rays_miss_nothing():
-    model = build_room(2, layout=CURVED)
-    origin, rays = model.viewpoints[0], cameras_around(model, 1, width=96, height=72)[0].rays()
-    whole = cast_rays(model, origin, rays)
-    for place in map(tuple, np.random.default_rng(0).integers((72, 96), size=(60, 2))):
-        single = cast_rays(model, origin, rays[place][None, None])
-        assert single.faces[0, 0] == whole.faces[place]
-        assert single.distances[0, 0] == whole.distances[place]
-
-
-def test_scans_have_equal_steps_and_see_only_what_is_in_sight():
-    model = build_room(0, layout=RoomLayout(num_viewpoints=3))
-    scan = scan_scene(model, 10_000)
-    assert len(scan.points) == 10_000
-    normals = scan.normals.double().numpy()
-    for start, viewpoint in zip([0, 3333, 6666], model.viewpoints, strict=True):
-        lines = scan.points[start : start + 300].double().numpy() - viewpoint
-        assert np.abs(cast_rays(model, viewpoint, lines[None]).distances - 1).max() < 1e-5
-        assert ((normals[start : start + 300] * lines).sum(axis=1) < 0).all()
-        elevations = np.degrees(np.arcsin(lines[:, 2] / np.linalg.norm(lines, axis=1)))
-        assert elevations.min() > -65
-        steps = np.diff(elevations)
-        assert (np.abs(steps - np.median(steps)) < 1e-2).mean() > 0.9
 
 
 # Depth frames.
@@ -392,16 +328,6 @@ def test_sensors_drop_what_is_out_of_range(sensor):
     assert nearest <= noisy.depth[~dropped].min() <= noisy.depth.max() <= furthest
     assert torch.equal(noisy.labels == UNLABELED, dropped)
     assert (noisy.normals[dropped] == 0).all()
-
-
-def test_fused_frames_come_in_random_order_without_doubles():
-    model = build_room(1, layout=KINECT_LAYOUT)
-    frames = [render_depth(model, c) for c in cameras_around(model, 3, width=64, height=48)]
-    scene, again = (fuse_frames(model, frames, 5000) for _ in range(2))
-    assert torch.equal(scene.points, again.points)
-    assert len(scene.points.unique(dim=0)) == 5000
-    places = scene.points[:, 0].double().numpy()
-    assert kstest(places[:2500], places[2500:]).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(

@@ -25,12 +25,8 @@ from benchmarks import (
 
 from torchrg.scenes import make_room
 
-
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("set_threads")
+"""Benchmarks set their own."""
 
 
 @dataclass(frozen=True)
@@ -188,16 +184,6 @@ def test_libraries_are_timed_by_stage(tmp_path):
     stages = peers.prepare("preset classic", file)()["stages"]
     assert list(stages) == ["neighbors", "normals", "regions", "planes"]
     assert list(peers.prepare("normals", file)()["stages"]) == ["normals"]
-
-
-@pytest.mark.slow
-def test_processes_take_turns(capsys):
-    arguments = ["--work", "classic", "--sizes", "1500", "--rounds", "1", "--threads", "1"]
-    assert bench.main(["steady", *arguments]) == 0
-    *_, row = capsys.readouterr().out.splitlines()
-    cells = row.strip("| ").split(" | ")
-    assert cells[0] == "classic, 1,500 points"
-    assert all(float(cell) > 0 for cell in cells[1:])
 
 
 def test_frames_and_rooms_are_prepared():

@@ -5,6 +5,7 @@ segmented. The shader and the picking of ``page.js`` cut by the bits that each p
 """
 
 import math
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -94,6 +95,8 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
     if labels is None:
         config = load_config("classic").at_angle(_ANGLE_DEG)
+        # Else a few voxels at a corner join two walls, which as one are none.
+        config = replace(config, growing=replace(config.growing, cut_bridges=True))
         labels = segment_planes(centers, config).labels[surface.voxel_of]
     known, of_points = number_labels(labels.clamp(min=UNLABELED))
     of_voxels = of_points[surface.first]

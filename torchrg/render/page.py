@@ -17,7 +17,7 @@ import os
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
@@ -117,21 +118,17 @@ def make_page(
     up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
     frame = frame_of(cloud, up)
-    results = [each for each in (result, beside) if each is not None]
-    shown = [choose_points(each, frame, max_points) for each in results]
     true_fields = {} if truth is None else Result(truth).fields
-    truths: list[Mapping[str, Tensor]] = [true_fields]
-    references: list[Tensor | None] = [None]
+    shown = choose_points(result, frame, max_points)
+    described = [_describe_cloud(result, shown, true_fields, None, frame)]
     if beside is not None:
         same = np.array_equal(cloud.coordinates, beside.cloud.coordinates, equal_nan=True)
-        truths.append(true_fields if same else {})
-        references.append(result.labels if same and "labels" in result.fields else None)
-    scenes: list[dict[str, Any]] = []
-    blobs: list[str] = []
-    for parts in zip(results, shown, truths, references, strict=True):
-        scene, blob = _describe_cloud(*parts, frame)
-        scenes.append(scene)
-        blobs.append(blob)
+        reference = result.labels if same and "labels" in result.fields else None
+        others = choose_points(beside, frame, max_points)
+        described += [
+            _describe_cloud(beside, others, true_fields if same else {}, reference, frame)
+        ]
+    scenes, blobs = [scene for scene, _ in described], [blob for _, blob in described]
     modes = [mode for mode in MODES if any(mode in scene["channels"] for scene in scenes)]
     if color is not None and color not in modes:
         needed = f"{MODES[color][1]} for" if color in MODES else f"one of {', '.join(MODES)} as"
@@ -144,7 +141,7 @@ def make_page(
         "title": title or " and ".join(scene["name"] for scene in scenes),
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
-        "toward": rounded(_direction_of_view(shown[0], view, frame, azimuth_deg)),
+        "toward": rounded(_direction_of_view(shown, view, frame, azimuth_deg)),
         "cut": view in LEAST_FACING,
         "leastFacing": LEAST_FACING["above" if view == "above" else "cutaway"],
         "frame": {
@@ -167,9 +164,7 @@ def _check_settings(
     max_points: int,
 ) -> tuple[float, float, float]:
     """Return the upward direction, or say what is wrong with a setting."""
-    if view not in get_args(View):
-        names = ", ".join(get_args(View))
-        raise ConfigError(f"make_page: expected view to be one of {names}, got {view!r}.")
+    check_choices("make_page", view=(view, View))
     if max_points < 1:
         raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
     if up is not None and not any(up):
@@ -269,16 +264,13 @@ def _palettes(
     result: Result, shown: Shown, reference: Tensor | None
 ) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the colours of planes and superpoints, those that pictures of the cloud have too."""
-    regions = {
-        mode: result.labels
-        if mode == "plane"
-        else result.fields[MODES[mode][1]].long().clamp(min=-1)
-        for mode in ("plane", "superpoint")
-        if MODES[mode][1] in result.fields
-    }
+    regions = {}
+    if "labels" in result.fields:
+        regions["plane"] = result.labels, reference
+    if "superpoints" in result.fields:
+        regions["superpoint"] = result.fields["superpoints"].long().clamp(min=-1), None
     palettes = {}
-    for mode, labels in regions.items():
-        same = reference if mode == "plane" else None
+    for mode, (labels, same) in regions.items():
         rows, colors = palette_of_planes(labels, result.cloud.points, reference=same)
         palettes[mode] = rows[shown.rows], colors
     return palettes

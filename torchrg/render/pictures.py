@@ -3,7 +3,7 @@
 import functools
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, refusing
 from torchrg.metrics.contingency import INTEGERS, check_labels
@@ -217,16 +217,13 @@ def render_cloud(
     if labels is not None:
         (planes,) = check_labels("render_cloud", labels=labels)
         check_shapes("render_cloud", points=(cloud, "N 3"), labels=(planes, "N"))
-    if view not in get_args(View):
-        names = ", ".join(get_args(View))
-        raise ConfigError(f"render_cloud: expected view to be one of {names}, got {view!r}.")
+    check_choices("render_cloud", view=(view, View))
     if not any(up):
         raise ConfigError("render_cloud: expected up to be a direction, got zeros.")
     _check_at_least_one("render_cloud", width=width, height=height, supersampling=supersampling)
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
-        shape = (height or round(0.75 * width), width, 3)
-        return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
+        return _white(height or round(0.75 * width), width, cloud.device)
     near = surface.spacing <= _FAR_APART * surface.spacing.median()
     kept = torch.ones_like(near)
     if view == "sensor":
@@ -281,10 +278,14 @@ def render_points(
     _check_at_least_one("render_points", supersampling=supersampling)
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
-        shape = (int(camera.height), int(camera.width), 3)
-        return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
+        return _white(int(camera.height), int(camera.width), cloud.device)
     kept = torch.ones_like(surface.rows, dtype=torch.bool)
     return draw_picture(camera, surface, kept, paint, slant, supersampling=supersampling)
+
+
+def _white(height: int, width: int, device: torch.device) -> Tensor:
+    """Return a picture of nothing."""
+    return torch.full((height, width, 3), 255, dtype=torch.uint8, device=device)
 
 
 def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:
