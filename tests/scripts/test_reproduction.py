@@ -1,6 +1,8 @@
 """The script that makes the paper's tables and figures again: small, resumed, complete."""
 
+import html
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from torchrg.scenes import make_room
 from torchrg.structures import Neighbors
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
+VARIANTS = ("pca", "irls", "jet", "detmm", "paper", "libra", "consensus")
 METHODS = ("classic", "classic_increment", "detmm", "algorithm2", "paper", "consensus")
 
 pytest.importorskip("matplotlib").use("agg")
@@ -21,6 +24,22 @@ pytest.importorskip("matplotlib").use("agg")
 @pytest.fixture(autouse=True)
 def _scripts_on_the_path(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
+
+
+@pytest.fixture
+def normals(monkeypatch):
+    """The part ``normals`` with a grid that takes seconds."""
+    from reproduction import normal_figures, normals
+
+    small = (
+        normals.Grid(60, ("cuboid", "dodecahedron"), (0.25,), (0,), VARIANTS),
+        normals.Grid(60, ("octahedron",), (0.25,), (0,), VARIANTS),
+    )
+    monkeypatch.setattr(normals, "QUICK", small)
+    monkeypatch.setattr(normals, "_DRAWN_POINTS", 500)
+    monkeypatch.setattr(normals, "_warm_up", lambda variant: None)
+    monkeypatch.setattr(normal_figures, "_WIDTH", 60)
+    return normals
 
 
 @pytest.fixture
@@ -78,6 +97,37 @@ def test_part_alone_makes_a_report_of_itself(small, tmp_path, monkeypatch):
     report = json.loads((tmp_path / "quick" / "report.json").read_text())
     assert list(report["parts"]) == ["method"]
     assert "Figure 5" in (tmp_path / "quick" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_one_call_makes_the_whole_report(small, normals, tmp_path, monkeypatch):
+    call_script(monkeypatch, "--out", tmp_path, "--quick")
+    folder = tmp_path / "quick"
+    report = json.loads((folder / "report.json").read_text())
+    assert list(report["parts"]) == ["method", "normals", "study", "segmentation", "times"]
+    page = (folder / "report.html").read_text()
+    for number in ("Table 1", "Table 2", "Table 3", *(f"Figure {n}" for n in range(1, 10))):
+        assert number in page
+    files = set(re.findall(r"src='([^']*)'", page))
+    assert len(files) >= 14
+    for file in files:
+        assert (folder / file).read_bytes().startswith(b"\x89PNG"), file
+    for claim in report["claims"]:
+        assert f"<td>{html.escape(claim['text'], quote=False)}</td>" in page.replace("&#39;", "'")
+        assert claim["numbers"] or "1,000" in claim["text"], claim["text"]
+    assert page.count("<b>another</b>") == 4
+
+    # A second call computes nothing again, and one that was interrupted goes on.
+    def refuse(*arguments, **settings):
+        raise AssertionError("computed twice")
+
+    from reproduction import segmentations
+
+    monkeypatch.setattr(normals, "_measure", refuse)
+    for name in ("segment_planes", "score_labels", "score_clusters", "score_faces"):
+        monkeypatch.setattr(segmentations, name, refuse)
+    call_script(monkeypatch, "--out", tmp_path, "--quick", "normals", "segmentation", "times")
+    assert json.loads((folder / "report.json").read_text()) == report
 
 
 def test_results_of_another_commit_or_without_their_file_are_computed_again(run, monkeypatch):
@@ -189,6 +239,15 @@ def test_results_of_code_that_is_not_committed_are_refused(monkeypatch):
         report = {"quick": False, "made_with": f"torchrg 0.1.0; commit {commit}; python 3"}
         with pytest.raises(ValueError, match=f"expected a report of one commit, got {commit}"):
             readme.update(report)
+
+
+def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
+    import reproduce_paper
+
+    monkeypatch.setattr(reproduce_paper, "made_with", lambda: {"commit": "2f26e94-dirty"})
+    with pytest.raises(SystemExit, match=r"expected committed code .* got commit 2f26e94-dirty"):
+        call_script(monkeypatch, "--out", tmp_path, "times")
+    assert not list(tmp_path.iterdir())
 
 
 def test_readme_is_updated_between_the_markers_only(tmp_path, monkeypatch):
