@@ -8,9 +8,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
-    {"errors", "version", "_parallel"},
-    {"_optional", "precision"},
-    {"_checks", "_compile", "scratch", "structures"},
+    {"errors", "version", "_display", "_parallel"},
+    {"precision"},
+    {"_checks", "_compile", "_optional", "scratch", "structures"},
     {"_opaque", "linalg", "neighbors", "config", "plane_table"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

@@ -28,7 +28,7 @@ Example:
     (torch.Size([2000]), torch.Size([2000, 3]), True)
 """
 
-from torchrg._optional import register_display
+from torchrg import _display
 from torchrg.version import __version__ as __version__
 
 TYPE_CHECKING = False  # As that of typing, without loading it.
@@ -87,7 +87,7 @@ def _load_display() -> "ModuleType":
     return notebook
 
 
-register_display(_load_display)
+_display.register(_load_display)
 
 __all__ = [
     "UNLABELED", "Cloud", "TorchrgError", "align_axes", "datasets", "depth", "estimate_normals",

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._optional import display
+from torchrg import _display
 from torchrg.errors import PrecisionWarning, ShapeError
 from torchrg.precision import note_on_steps
 
@@ -341,11 +341,11 @@ class Segmentation(NamedTuple):
             ConfigError: If ``points`` is None.
             MissingDependencyError: If pages cannot be made.
         """
-        return display("show", self, **settings)
+        return _display.call("show", self, **settings)
 
     def _repr_html_(self) -> str:
         """Return a picture and the table of planes, as a notebook shows them."""
-        text: str = display("as_html", self)
+        text: str = _display.call("as_html", self)
         return text
 
 
