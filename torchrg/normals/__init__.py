@@ -36,7 +36,7 @@ from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points
 from torchrg.normals.patches import Estimator, at_all_points
-from torchrg.normals.pca import fit_normals_pca
+from torchrg.normals.pca import fit_normals_pca, fit_points_pca
 from torchrg.normals.robust import fit_normals_robust
 from torchrg.normals.sides import orient_cloud
 from torchrg.precision import warn_of_steps
@@ -61,7 +61,9 @@ _MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
 _DETMCD = _MCD | {"scaling": "mcd_scaling", "inliers": "mcd_inliers"}
 
 ESTIMATORS: dict[str, Estimator] = {
-    "pca": at_all_points(fit_normals_pca),
+    "pca": lambda points, neighbors, _, chunk_size: fit_points_pca(
+        points, neighbors, chunk_size=chunk_size
+    ),
     "jet": at_all_points(fit_normals_jet),
     "irls": estimate_irls,
     "fastmcd": at_all_points(partial(fit_normals_robust, estimator=fit_fastmcd), **_MCD),
