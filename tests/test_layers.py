@@ -12,6 +12,7 @@ LAYERS = [
     {"errors", "version", "_display", "_parallel"},
     {"precision"},
     {"_checks", "_compile", "_optional", "scratch", "structures"},
+    {"kernels"},
     {"_opaque", "linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes, has_values
 from torchrg._compile import kernel
-from torchrg._parallel import CHUNK_SIZE
+from torchrg._parallel import CHUNK_SIZE, map_chunks, places_of
 from torchrg.linalg import (
     coordinate_resolution,
     covariance,
@@ -15,7 +16,7 @@ from torchrg.linalg import (
 )
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
 from torchrg.linalg.moments import covariance_of_columns
-from torchrg.normals.patches import fit_points
+from torchrg.normals.patches import fit_points, replace_rows
 from torchrg.structures import Neighbors, NormalFit
 
 _NARROW = 0.03
@@ -110,8 +111,25 @@ def fit_points_pca(
 
     As :func:`torchrg.normals.patches.fit_points` does, whose arguments these are.
     """
+    num_neighbors = neighbors.indices.shape[1]
     fit_patches = fit_normals_pca if points.requires_grad else _fit_without_gradients
-    return fit_points(points, neighbors, fit_patches, chunk_size=chunk_size)
+    if not kernels.serve(points, *neighbors, k=num_neighbors):
+        return fit_points(points, neighbors, fit_patches, chunk_size=chunk_size)
+    places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
+
+    def work(rows: slice) -> tuple[Tensor, ...]:
+        resolution = coordinate_resolution(points[rows])
+        near = neighbors.at(rows)
+        return kernels.call("fit_normals_pca", places, *near, resolution, tolerance, _NARROW)
+
+    parts = map_chunks(work, len(points), chunk_size, points.device)
+    normals, curvature, rms, valid, narrow = map(torch.cat, zip(*parts, strict=True))
+    fit = NormalFit(normals, curvature, valid, rms)
+    rows = places_of(narrow)
+    if len(rows) == 0:
+        return fit
+    again = fit_points(points, neighbors, fit_patches, rows=rows, chunk_size=chunk_size)
+    return replace_rows(fit, rows, again)
 
 
 def _fit_without_gradients(

@@ -4,6 +4,7 @@ The constants make the scales consistent for the standard deviation of normal da
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import comb
 from statistics import NormalDist
 from typing import Literal, NamedTuple
@@ -12,10 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._compile import is_active
 from torchrg._opaque import opaque
-from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks
+from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks, map_rows
 from torchrg.errors import ShapeError
 from torchrg.robust.counting import majority_difference
 
@@ -348,10 +350,21 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
+    if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
+        (found,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
+        endless = found.isnan().nonzero().squeeze(1)
+        if len(endless):
+            found[endless] = _difference_by_lags(sorted_rows[endless])
+        return found
     if is_active.get() and sorted_rows.device.type == "cpu":
         ends = sorted_rows[:, :: max(sorted_rows.shape[1] - 1, 1)]
         if bool(ends.isfinite().all()):
             return majority_difference(sorted_rows)
+    return _difference_by_lags(sorted_rows)
+
+
+def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
+    """Do as :func:`_majority_difference`, for all values and devices."""
     rank = comb(half_size(sorted_rows.shape[1]), 2)
     out = sorted_rows.new_empty(len(sorted_rows))
     _with_lags(sorted_rows, out, lambda lagged, rows: lagged.select(rows, rank))
@@ -376,6 +389,9 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
 
 def _count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
     """Count the differences at lags 1 to h - 1 at or below ``bound`` of each row, int32."""
+    if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
+        count = partial(kernels.call, "count_differences")
+        return map_rows(lambda rows: count(rows, bound), [sorted_rows])[0]
     out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
     _with_lags(sorted_rows, out, lambda lagged, rows: lagged.count(rows, bound))
     return out
