@@ -100,15 +100,15 @@ class _Argument(NamedTuple):
     ) -> Tensor | float | None:
         """Return the argument, contiguous; note the lengths of its axes, which must agree."""
         if not self.axes and not self.optional and self.dtype in "nx":
-            if isinstance(value, int | float):
+            if isinstance(value, int | float):  # bool is one
                 return int(value) if self.dtype == "n" else float(value)
-        elif isinstance(value, Tensor) and value.dtype == _DTYPES[self.dtype]:
+        elif isinstance(value, Tensor) and value.dtype == _DTYPES[self.dtype.lower()]:
             if value.dim() == len(self.axes) and value.device.type == "cpu":
                 agrees = [
                     length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
                     for axis, length in zip(self.axes, value.shape, strict=True)
                 ]
-                if all(agrees):
+                if all(agrees) and (self.dtype.islower() or value.is_contiguous()):
                     return value.contiguous()
         elif value is None and self.optional:
             return None

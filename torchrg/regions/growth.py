@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import scratch
+from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import (
     CHUNK_SIZE,
@@ -33,7 +33,9 @@ from torchrg.regions.edges import (
     first_to_reach,
     is_order_free,
     join_edges,
+    mark_edges,
     neighborhood_radii,
+    promotes_late,
 )
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
 from torchrg.regions.reach import condense, join_condensed
@@ -301,6 +303,9 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     The root of a region is the point it began with. Of a point that is not valid it is -1.
     """
     order = growth_order(cloud.curvature, cloud.valid, config)
+    indices, masked = cloud.neighbors
+    if kernels.serve(indices, masked, cloud.valid, cloud.curvature) and not scratch.is_active():
+        return _grow_by_bits(cloud, config, order, chunk_size)
     if is_order_free(config):
         roots, others = reach_from_seeds(cloud, config, order, chunk_size)
         if config.min_size <= cloud.neighbors.indices.shape[1]:
@@ -313,6 +318,20 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
         valid, lists = cloud.valid.cpu().numpy(), cloud.neighbors.indices.cpu().numpy()
         roots = grow_first_in_first_out(edges, order.rows, valid, claims, lists)
     return torch.from_numpy(roots).to(cloud.points.device)
+
+
+def _grow_by_bits(
+    cloud: GrowingCloud, config: GrowingConfig, order: GrowthOrder, chunk_size: int
+) -> Tensor:
+    """Do as :func:`grow` in a kernel: Algorithm 2 on a bit for each neighbour."""
+    indices, late = cloud.neighbors.indices, promotes_late(config)
+    joins, makes_seed = mark_edges(cloud, config, order.limit, chunk_size=chunk_size)
+    begins, is_seed = order.rows, cloud.curvature <= order.limit
+    if makes_seed is None and config.min_size > indices.shape[1]:
+        # What a point has around it that no seed reaches is too small a region.
+        begins = order.seeds
+    bits = indices, joins, makes_seed, is_seed, cloud.valid
+    return kernels.call("grow_regions", *bits, torch.from_numpy(begins), late)[0]
 
 
 def reach_from_seeds(
