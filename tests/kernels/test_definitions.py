@@ -8,7 +8,7 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.normals.consensus.noise import _neighbor_quantiles, _survey
 from torchrg.normals.pca import fit_points_pca
 from torchrg.regions.edges import GrowingCloud, are_coplanar
-from torchrg.robust.scale import _count_differences, _majority_difference
+from torchrg.robust.scale import _majority_difference
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 
@@ -67,9 +67,6 @@ def special_rows(n):
 def test_differences_are_those_of_the_definition_to_the_bit(n):
     found, expected = both(_majority_difference, special_rows(n))
     assert torch.equal(found.nan_to_num(nan=-1.0), expected.nan_to_num(nan=-1.0))
-    for bound in (0.0, 0.5, 3.0):
-        found, expected = both(_count_differences, special_rows(n), bound)
-        assert torch.equal(found, expected)
 
 
 def test_planes_of_all_neighbors_are_those_of_the_definition(name, points, masked):

@@ -52,12 +52,15 @@ INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
 KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,
                   int64_t width, int64_t height, double x, double y, double z, double size,
                   int32_t* rows, int32_t* cells, double* sorted) {
+  if (width > num_cells || height > num_cells) return TOO_WIDE;
   for (int64_t c = 0; c < num_cells; c++) starts[c] = 0;
   for (int64_t i = 0; i < num_points; i++) {
     const double* p = points + 3 * i;
-    const int64_t u = int64_t((p[0] - x) / size) + 1, v = int64_t((p[1] - y) / size) + 1,
-                  w = int64_t((p[2] - z) / size) + 1, cell = (u * width + v) * height + w;
-    if (u < 1 || v < 1 || w < 1 || cell + 1 >= num_cells) return NO_SUCH_ROW;
+    const double u = (p[0] - x) / size, v = (p[1] - y) / size, w = (p[2] - z) / size;
+    bool inside = u >= 0 && u < num_cells && v >= 0 && v < width - 2 && w >= 0 && w < height - 2;
+    if (!inside) return NO_SUCH_ROW;
+    const int64_t cell = (int64_t(u + 1) * width + int64_t(v + 1)) * height + int64_t(w + 1);
+    if (cell + 1 >= num_cells) return NO_SUCH_ROW;
     cells[i] = int32_t(cell), starts[cell]++;
   }
   int32_t before = 0;
@@ -72,12 +75,12 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
 
 // Writes the k nearest of the asked points in cells `from` to `to` to their rows of `found`, in the
 // order of rows `order` if there is one, and tells which are certain.
-KERNEL search_cells(int64_t, int64_t num_cells, int64_t k, const double* sorted,
-                    const int32_t* rows, const int32_t* starts, const bool* asked,
-                    const int64_t* order, int32_t* found, bool* certain, int64_t from, int64_t to,
-                    int64_t width, int64_t height, int64_t first_row, double x, double y, double z,
-                    double size) {
+KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const double* sorted, Ints rows,
+                    Ints starts, Flagged asked, Longs order, int32_t* found, bool* certain,
+                    int64_t from, int64_t to, int64_t width, int64_t height, int64_t first_row,
+                    double x, double y, double z, double size) {
   if (k < 1 || k > MOST || from < 0 || to > num_cells - 1) return TOO_WIDE;
+  if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
   Candidates all;
   const int64_t step = width * height;
   double guess = 0;
@@ -88,19 +91,24 @@ KERNEL search_cells(int64_t, int64_t num_cells, int64_t k, const double* sorted,
       const int64_t middle = c + (g / 3 - 1) * step + (g % 3 - 1) * height;
       if (middle < 1 || middle + 2 >= num_cells) return NO_SUCH_ROW;
       first[g] = starts[middle - 1], length[g] = starts[middle + 2] - first[g];
+      if (first[g] < 0 || length[g] < 0 || first[g] + length[g] > num_points) return NO_SUCH_ROW;
       number += length[g];
     }
     if (number <= k || number > MOST_CANDIDATES) continue;
     int n = 0;
-    for (int g = 0; g < 9; g++)
+    for (int g = 0; g < 9; g++) {
+      if (!are_rows(rows + first[g], length[g], num_points)) return NO_SUCH_ROW;
       for (int64_t t = first[g]; t < first[g] + length[g]; t++, n++) {
         all.x[n] = sorted[3 * t], all.y[n] = sorted[3 * t + 1], all.z[n] = sorted[3 * t + 2];
         all.row[n] = rows[t];
       }
+    }
     const double u = x + (double(c / step) - 0.5) * size, w = z + (double(c % height) - 0.5) * size,
                  v = y + (double(c / height % width) - 0.5) * size;
     for (int64_t place = starts[c]; place < starts[c + 1]; place++) {
+      if (place < 0 || place >= num_points) return NO_SUCH_ROW;
       const int32_t row = rows[place];
+      if (uint32_t(row) >= uint64_t(num_points)) return NO_SUCH_ROW;
       if (!asked[row]) continue;
       const double *own = sorted + 3 * place, px = own[0], py = own[1], pz = own[2];
       for (int t = 0; t < n; t++) {
@@ -125,7 +133,9 @@ KERNEL search_cells(int64_t, int64_t num_cells, int64_t k, const double* sorted,
           break;
       }
       if (count < k || count > MOST_CHOSEN) continue;
-      int32_t* list = found + k * (order ? order[row] : row);
+      const int64_t to_row = order ? order[row] : row;
+      if (to_row < 0 || to_row >= num_points) return NO_SUCH_ROW;
+      int32_t* list = found + k * to_row;
       const double farthest = sort(all, count, int(k), list);
       // Whether what is beyond could tie with the last one by rounding.
       if (!(farthest * (1 + SURELY) < square_root(within))) continue;

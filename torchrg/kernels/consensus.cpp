@@ -7,20 +7,13 @@ namespace {
 // Of torchrg/normals/consensus/constants.py, in the order of its names here.
 struct Constants {
   float vote_reach, vote_falloff, fit_reach, fit_falloff, gap, corner_limit, corner_share;
-  int num_refits, num_alternations, least;
+  float num_refits, num_alternations, least;
 };
 
 struct Meeting {
   Plane plane;
   float deviation;
 };
-
-INLINE float farthest(const Patch& patch, const float* weights) {
-  Lanes most{};
-  for (int j = 0; j < patch.width; j += LANES)
-    most = larger(most, patch.sq_lengths(j) * load(weights + j));
-  return largest(most);
-}
 
 INLINE float sum(const float* values, int width) {
   Lanes lanes{};
@@ -36,19 +29,6 @@ INLINE float product(const float* a, const float* b, int width) {
 
 INLINE void residuals(const Patch& patch, const Plane& plane, float* rests) {
   for (int j = 0; j < patch.width; j += LANES) store(rests + j, plane.residuals(patch, j));
-}
-
-// hypotheses.support_scores of a plane through the point whose normal is per reach.
-INLINE float support(const Patch& patch, const float* weights, float a, float b, float c,
-                     float offset) {
-  Lanes near{}, over{}, under{};
-  for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes rest = patch.along(a, b, c, j) - offset, weight = load(weights + j);
-    near += positive(1 - rest * rest) * weight;
-    over += where(rest > 1, weight, all(0));
-    under += where(rest < -1, weight, all(0));
-  }
-  return total(near) - smaller(total(over), total(under));
 }
 
 // hypotheses._refitted
@@ -120,89 +100,66 @@ INLINE void near(const Patch& patch, const float* rests, float gap, const float*
 
 INLINE float side(float sum) { return sum >= 0 ? 1 : -1; }
 
-INLINE float deviation(const Patch& patch, const float* outer, int num_planes, int count) {
-  Lanes squares{};
-  for (int j = 0; j < patch.width; j += LANES)
-    squares += load(outer + j) * load(outer + j) * load(patch.weight + j);
-  return square_root(total(squares) / float(larger(count - 3 * num_planes, 1)));
-}
-
-// hypotheses.fit_wedges; leaves the points of the first plane, and signed distances.
-Meeting wedge(const Patch& patch, const Plane& start, float noise, int count, float* first,
-              float* outer, const Constants& constants) {
-  alignas(32) float second[MOST], r[MOST], s[MOST];
-  const int width = patch.width;
-  residuals(patch, start, r);
-  near(patch, r, constants.gap * noise, patch.weight, first);
-  beyond(patch, r, constants.gap * noise, second);
-  bool present = true;
-  Plane one, other;
-  for (int turn = 0; turn < constants.num_alternations; turn++) {
-    present &= smaller(sum(first, width), sum(second, width)) >= constants.least;
-    one = fit_plane(patch, first, width), other = fit_plane(patch, second, width);
-    residuals(patch, one, r), residuals(patch, other, s);
-    const float u = side(product(r, second, width)), v = side(product(s, first, width));
-    for (int j = 0; j < width; j += LANES) {
-      const Lanes e = load(r + j) * u, f = load(s + j) * v, weight = load(patch.weight + j);
-      const Lanes is_first = where(f > e, weight, all(0));
-      store(first + j, is_first), store(second + j, weight - is_first);
-      store(outer + j, smaller(e, f));
-    }
-  }
-  present &= smaller(sum(first, width), sum(second, width)) >= constants.least;
-  return {second[0] > 0 ? other : one, present ? deviation(patch, outer, 2, count) : INFINITE};
-}
-
-// hypotheses.fit_corners
-Meeting corner(const Patch& patch, float* first, float* second, float* third, int count,
-               const Constants& constants) {
-  alignas(32) float outer[MOST], r[MOST], s[MOST], t[MOST];
+// hypotheses.fit_wedges, and fit_corners where there is a third group of points: planes and their
+// points in turn. Leaves the points of each plane, and signed distances from the surface.
+Meeting alternate(const Patch& patch, int count, float* first, float* second, float* third,
+                  float* outer, const Constants& constants) {
+  alignas(32) float r[MOST], s[MOST], t[MOST];
   const int width = patch.width;
   bool present = true;
   float cuts = 0;
   Plane one, other, last;
   for (int turn = 0; turn <= constants.num_alternations; turn++) {
     const float fewest = smaller(sum(first, width), sum(second, width));
-    present &= smaller(fewest, sum(third, width)) >= constants.least;
+    present &= (third ? smaller(fewest, sum(third, width)) : fewest) >= constants.least;
     if (turn == constants.num_alternations) break;
     one = fit_plane(patch, first, width), other = fit_plane(patch, second, width);
-    last = fit_plane(patch, third, width);
-    residuals(patch, one, r), residuals(patch, other, s), residuals(patch, last, t);
+    residuals(patch, one, r), residuals(patch, other, s);
     const float u = side(product(r, second, width)), v = side(product(s, first, width));
-    const float w = side(product(t, first, width) + product(t, second, width));
     for (int j = 0; j < width; j += LANES) {
-      store(r + j, load(r + j) * u), store(s + j, load(s + j) * v), store(t + j, load(t + j) * w);
-      store(outer + j, smaller(load(r + j), load(s + j)));
+      const Lanes e = load(r + j) * u, f = load(s + j) * v, weight = load(patch.weight + j);
+      store(r + j, where(f > e, weight, all(0))), store(outer + j, smaller(e, f));
     }
-    if (cuts == 0) cuts = side(product(outer, third, width));
+    if (third) {
+      last = fit_plane(patch, third, width), residuals(patch, last, t);
+      const float w = side(product(t, first, width) + product(t, second, width));
+      if (cuts == 0) cuts = side(product(outer, third, width));
+      for (int j = 0; j < width; j += LANES) {
+        const Lanes pair = load(outer + j) * cuts, added = load(t + j) * w;
+        store(outer + j, smaller(added, pair) * cuts);
+        store(third + j, where(pair > added, load(patch.weight + j), all(0)));
+      }
+    }
     for (int j = 0; j < width; j += LANES) {
-      const Lanes pair = load(outer + j) * cuts, added = load(t + j), weight = load(patch.weight + j);
-      store(outer + j, smaller(added, pair) * cuts);
-      const Lanes is_third = where(pair > added, weight, all(0));
-      const Lanes is_first = where(load(s + j) > load(r + j), weight - is_third, all(0));
-      store(third + j, is_third), store(first + j, is_first);
-      store(second + j, weight - is_third - is_first);
+      const Lanes weight = load(patch.weight + j);
+      const Lanes left = weight - (third ? load(third + j) : all(0));
+      store(outer + j, load(outer + j) * weight);
+      store(first + j, load(r + j) * left), store(second + j, left - load(first + j));
     }
   }
-  const Plane& own = third[0] > 0 ? last : second[0] > 0 ? other : one;
-  return {own, present ? deviation(patch, outer, 3, count) : INFINITE};
+  const float freedom = count - (third ? 9 : 6), squares = product(outer, outer, width);
+  const Plane& own = third && third[0] > 0 ? last : second[0] > 0 ? other : one;
+  return {own, present ? square_root(squares / larger(freedom, 1.0f)) : INFINITE};
 }
 
 // hypotheses.fit_meeting_planes
 Meeting meet(const Patch& patch, const Plane& voted, float noise, int count, const int64_t* ranks,
              int64_t num_pairs, const Constants& constants) {
   alignas(32) float first[MOST], second[MOST], third[MOST], outer[MOST], rest[MOST];
-  Meeting best = wedge(patch, voted, noise, count, first, outer, constants);
-  if (!(best.deviation > constants.corner_limit * noise)) return best;
   const int width = patch.width;
-  const float gap = constants.gap * noise, least = constants.corner_share * best.deviation;
+  const float gap = constants.gap * noise;
+  residuals(patch, voted, rest);
+  near(patch, rest, gap, patch.weight, first), beyond(patch, rest, gap, second);
+  const Meeting best = alternate(patch, count, first, second, nullptr, outer, constants);
+  if (!(best.deviation > constants.corner_limit * noise)) return best;
+  const float least = constants.corner_share * best.deviation;
   // Three planes from the two and what is off them.
   beyond(patch, outer, gap, third);
   for (int j = 0; j < width; j += LANES) {
     const Lanes on = 1 - load(third + j), is_first = load(first + j);
     store(second + j, (load(patch.weight + j) - is_first) * on), store(first + j, is_first * on);
   }
-  const Meeting by_two = corner(patch, first, second, third, count, constants);
+  const Meeting by_two = alternate(patch, count, first, second, third, outer, constants);
   // Three planes from the voted one and that with the most votes of what it leaves.
   residuals(patch, voted, outer);
   near(patch, outer, gap, patch.weight, first);
@@ -221,7 +178,7 @@ Meeting meet(const Patch& patch, const Plane& voted, float noise, int count, con
   residuals(moved, other, outer);
   near(moved, outer, gap, rest, second);
   for (int j = 0; j < width; j++) third[j] = rest[j] - second[j];
-  const Meeting by_votes = corner(patch, first, second, third, count, constants);
+  const Meeting by_votes = alternate(patch, count, first, second, third, outer, constants);
   Meeting three = by_two.deviation < least ? by_two : Meeting{best.plane, least};
   if (by_votes.deviation < three.deviation) three = by_votes;
   return three.deviation < least ? three : best;
@@ -243,34 +200,30 @@ INLINE int compact(Patch& patch) {
 
 }  // namespace
 
-// The planes of torchrg.normals.consensus.surfaces.fit_surfaces at broken points: that of the votes,
-// and that of two or three which meet. `pairs` are ranks of candidates for `k` counted neighbours.
+// surfaces.broken_planes: the plane of the votes, and that of two or three which meet. `pairs` are ranks of candidates for `k` counted neighbours.
 KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t num_pairs,
-                     int64_t num_constants, const float* points, const int32_t* indices,
-                     const bool* mask, const float* noise, const float* normals,
-                     const int64_t* pairs, const float* numbers, float* voted,
+                     int64_t num_constants, Floats points, Ints indices, Flagged mask, Floats noise,
+                     Floats normals, Longs pairs, Floats numbers, float* voted,
                      float* voted_offsets, float* meeting, float* meeting_offsets,
                      float* deviations) {
-  if (k < 1 || k > MOST || num_constants != 10) return TOO_WIDE;
-  const Constants constants = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4],
-                               numbers[5], numbers[6], int(numbers[7]), int(numbers[8]),
-                               int(numbers[9])};
-  if (constants.num_alternations < 1) return TOO_WIDE;
+  if (k < 1 || k > MOST || 4 * num_constants != sizeof(Constants)) return TOO_WIDE;
+  Constants constants;
+  __builtin_memcpy(&constants, numbers, sizeof constants);
+  const float turns = constants.num_alternations;
+  if (!(turns >= 1 && turns < MOST && constants.num_refits < MOST)) return TOO_WIDE;
+  const Lists lists = {num_points, num_rows, k, points, indices, mask};
   Patch patch;
   for (int64_t i = 0; i < num_rows; i++) {
-    const bool* counted = mask ? mask + i * k : nullptr;
-    if (!gather(points, num_points, indices + i * k, counted, int(k), patch)) return NO_SUCH_ROW;
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
     const int count = compact(patch);
     for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
       if (pairs[rank] < 0 || pairs[rank] >= count) return NO_SUCH_ROW;
     const Plane plane =
         vote(patch, patch.weight, noise[i], normals + 3 * i, pairs, num_pairs, constants);
     const Meeting found = meet(patch, plane, noise[i], count, pairs, num_pairs, constants);
-    voted[3 * i] = plane.a, voted[3 * i + 1] = plane.b, voted[3 * i + 2] = plane.c;
-    voted_offsets[i] = plane.offset;
-    meeting[3 * i] = found.plane.a, meeting[3 * i + 1] = found.plane.b;
-    meeting[3 * i + 2] = found.plane.c;
-    meeting_offsets[i] = found.plane.offset, deviations[i] = found.deviation;
+    write(plane, voted, i), write(found.plane, meeting, i);
+    voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
+    deviations[i] = found.deviation;
   }
   return DONE;
 }

@@ -2,18 +2,15 @@
 #include "plain.h"
 
 // edges._pass of points and normals (3, N) to the neighbours of some rows; limits below 0 are off.
-KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, const float* points,
-                  const float* normals, const bool* valid, const float* reach,
-                  const int32_t* indices, const bool* mask, const int64_t* rows,
+KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
+                  Flagged valid, Floats reach, Ints indices, Flagged mask, Longs rows,
                   double max_sq_chord, double max_sq_distance, int64_t is_signed, bool* joins) {
   const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
   const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
   const float most = float(max_sq_distance);
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
     const int64_t i = rows[q];
-    bool inside = i >= 0 && i < num_points;
-    for (int64_t j = 0; j < k; j++) inside &= uint32_t(indices[j]) < uint64_t(num_points);
-    if (!inside) return NO_SUCH_ROW;
+    if (i < 0 || i >= num_points || !are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     for (int64_t j = 0; j < k; j++) {
       const int32_t t = indices[j];
       const float dot = a[i] * a[t] + b[i] * b[t] + c[i] * c[t];
@@ -39,9 +36,8 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, const float* 
 // A target becomes a seed by the bit of the edge, or where it is one itself. With `late` promotion
 // those that merely join do so when all seeds of the region are known.
 KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t num_roots,
-                    const int32_t* indices, const int64_t* joins, const int64_t* makes_seed,
-                    const bool* is_seed, const bool* valid, const int32_t* order, int64_t late,
-                    int32_t* roots, int32_t* queue) {
+                    Ints indices, Longs joins, Longs makes_seed, Flagged is_seed, Flagged valid,
+                    Ints order, int64_t late, int32_t* roots, int32_t* queue) {
   if (64 * num_words < k) return TOO_WIDE;
   for (int64_t i = 0; i < num_points; i++) roots[i] = -1;
   for (int64_t r = 0; r < num_roots; r++) {

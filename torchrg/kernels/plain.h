@@ -8,6 +8,12 @@
 #define KERNEL extern "C" __attribute__((visibility("default"))) int64_t
 #define INLINE static inline __attribute__((always_inline))
 
+// What kernels read.
+typedef const float* Floats;
+typedef const int32_t* Ints;
+typedef const int64_t* Longs;
+typedef const bool* Flagged;
+
 enum Status { DONE = 0, NO_SUCH_ROW = 1, TOO_WIDE = 2 };
 
 constexpr int LANES = 8;
@@ -49,6 +55,9 @@ INLINE Lanes smaller(Lanes a, Lanes b) { return where(b < a, b, a); }
 INLINE float total(Lanes a) {
   return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));
 }
+INLINE int total(Flags a) {
+  return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));
+}
 INLINE float largest(Lanes a) {
   float most = a[0];
   for (int lane = 1; lane < LANES; lane++) most = larger(most, a[lane]);
@@ -70,12 +79,28 @@ struct Patch {
   }
 };
 
-// Gathers neighbours of points (N, 3) from a list of k rows; false if one is no row.
-INLINE bool gather(const float* points, int64_t num_points, const int32_t* row, const bool* mask,
-                   int k, Patch& patch) {
+// Whether numbers name rows.
+INLINE bool are_rows(const int32_t* numbers, int64_t count, int64_t num_rows) {
   bool inside = true;
-  for (int j = 0; j < k; j++) inside &= uint32_t(row[j]) < uint64_t(num_points);
-  if (!inside) return false;
+  for (int64_t j = 0; j < count; j++) inside &= uint32_t(numbers[j]) < uint64_t(num_rows);
+  return inside;
+}
+
+// Points (N, 3), lists of k of them each, and which of a list count: all where there is no mask.
+struct Lists {
+  int64_t num_points, num_lists, k;
+  const float* points;
+  const int32_t* indices;
+  const bool* mask;
+};
+
+// Gathers the neighbours of a list; false if it is none, or names a point that is not there.
+INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
+  const int k = int(lists.k);
+  const float* points = lists.points;
+  const int32_t* row = lists.indices + i * k;
+  const bool* mask = lists.mask ? lists.mask + i * k : nullptr;
+  if (i < 0 || i >= lists.num_lists || !are_rows(row, k, lists.num_points)) return false;
   const float* first = points + 3 * int64_t(row[0]);
   const float x0 = first[0], y0 = first[1], z0 = first[2];
   for (int j = 0; j < k; j++) {
@@ -100,6 +125,11 @@ struct Plane {
     return patch.along(a, b, c, j) - offset;
   }
 };
+
+// Writes the normal of a plane to row i of (n, 3).
+INLINE void write(const Plane& plane, float* normals, int64_t i) {
+  normals[3 * i] = plane.a, normals[3 * i + 1] = plane.b, normals[3 * i + 2] = plane.c;
+}
 
 struct Vector {
   double x, y, z;
@@ -154,7 +184,8 @@ INLINE void decompose(const float* covariance, Plane& plane) {
   else
     normal = unit(normal);
   const double u = normal.x, v = normal.y, w = normal.z;
-  const double quotient = u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz;
+  const double quotient =
+      u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz;
   const double low = larger(quotient, 0.0), rest = trace - low;
   const double spread = square_root(larger(rest * rest - 4 * (minors - low * rest), 0.0));
   plane.a = u, plane.b = v, plane.c = w;
@@ -183,6 +214,25 @@ INLINE float moments(const Patch& patch, const float* weights, int width, float*
   }
   for (int i = 0; i < 6; i++) covariance[i] = total(s[i]);
   return count;
+}
+
+INLINE float farthest(const Patch& patch, const float* weights) {
+  Lanes most{};
+  for (int j = 0; j < patch.width; j += LANES)
+    most = larger(most, patch.sq_lengths(j) * load(weights + j));
+  return largest(most);
+}
+
+// torchrg.normals.consensus.hypotheses.support_scores of a plane whose numbers are per reach.
+INLINE float support(const Patch& patch, const float* weights, float a, float b, float c,
+                     float offset) {
+  Lanes near{}, over{}, under{};
+  for (int j = 0; j < patch.width; j += LANES) {
+    const Lanes rest = patch.along(a, b, c, j) - offset, weight = load(weights + j);
+    near += positive(1 - rest * rest) * weight;
+    over += where(rest > 1, weight, all(0)), under += where(rest < -1, weight, all(0));
+  }
+  return total(near) - smaller(total(over), total(under));
 }
 
 // As torchrg.linalg.moments.fit_weighted_planes.

@@ -3,15 +3,15 @@
 
 // torchrg.normals.pca.fit_normals_pca of lists of rows. Patches as narrow as their covariance's own
 // rounding are flagged and left to the definition, which looks at them again.
-KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, const float* points,
-                       const int32_t* indices, const bool* mask, const float* resolution,
-                       double tolerance, double narrow_share, float* normals, float* curvature,
-                       float* residual_rms, bool* valid, bool* narrow) {
+KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
+                       Flagged mask, Floats resolution, double tolerance, double narrow_share,
+                       float* normals, float* curvature, float* residual_rms, bool* valid,
+                       bool* narrow) {
   if (k < 1 || k > MOST) return TOO_WIDE;
+  const Lists lists = {num_points, num_rows, k, points, indices, mask};
   Patch patch;
-  for (int64_t i = 0; i < num_rows; i++, normals += 3) {
-    const bool* counted = mask ? mask + i * k : nullptr;
-    if (!gather(points, num_points, indices + i * k, counted, int(k), patch)) return NO_SUCH_ROW;
+  for (int64_t i = 0; i < num_rows; i++) {
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
     float mean[3], covariance[6];
     moments(patch, patch.weight, patch.width, mean, covariance);
     Plane plane;
@@ -20,8 +20,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, const fl
     const float length = square_root(float(plane.high)), width = square_root(float(plane.middle));
     narrow[i] = !(width >= float(narrow_share) * length);
     valid[i] = width > larger(float(tolerance) * length, resolution[i]);
-    normals[0] = valid[i] ? plane.a : 0, normals[1] = valid[i] ? plane.b : 0;
-    normals[2] = valid[i] ? plane.c : 0;
+    write(valid[i] ? plane : Plane{}, normals, i);
     curvature[i] = valid[i] ? smaller(low / (sum > 0 ? sum : 1), 1 / 3.0f) : 0;
     residual_rms[i] = valid[i] ? square_root(low) : 0;
   }
@@ -50,26 +49,24 @@ INLINE float of_few(const Patch& patch, int count, float breadth) {
 
 // What torchrg.normals.consensus.noise.survey_noise takes from each neighbourhood: _deviations, and
 // the deviations of the `few` and the `more` nearest ones.
-KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, const float* points,
-              const int32_t* indices, const bool* mask, const float* normals, const bool* valid,
-              int64_t few, int64_t more, double kurtosis, double breadth, float* offsets,
-              float* radius, float* whole, bool* layered, bool* again, float* of_fewer,
-              float* of_more) {
+KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
+              Flagged mask, Floats normals, Flagged valid, int64_t few, int64_t more,
+              double kurtosis, double breadth, float* offsets, float* radius, float* whole,
+              bool* layered, bool* again, float* of_fewer, float* of_more) {
   if (k < 1 || k > MOST || few < 4 || more < 4) return TOO_WIDE;
+  const Lists lists = {num_points, num_rows, k, points, indices, mask};
   Patch patch;
   for (int64_t i = 0; i < num_rows; i++, normals += 3) {
-    const bool* counted = mask ? mask + i * k : nullptr;
-    if (!gather(points, num_points, indices + i * k, counted, int(k), patch)) return NO_SUCH_ROW;
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
     again[i] = false;
     for (int j = 1; j < k; j++)
       again[i] |= patch.x[j] == patch.x[j - 1] && patch.y[j] == patch.y[j - 1] &&
                   patch.z[j] == patch.z[j - 1];
     const float a = normals[0], b = normals[1], c = normals[2];
-    Lanes number{}, sx{}, sy{}, sz{}, farthest{};
+    Lanes number{}, sx{}, sy{}, sz{};
     for (int j = 0; j < patch.width; j += LANES) {
       number += load(patch.weight + j);
       sx += load(patch.x + j), sy += load(patch.y + j), sz += load(patch.z + j);
-      farthest = larger(farthest, patch.sq_lengths(j));
     }
     const float count = total(number), some = larger(count, 1.0f);
     offsets[i] = total(sx) / some * a + total(sy) / some * b + total(sz) / some * c;
@@ -80,7 +77,7 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, const float* poin
       second += square, fourth += square * square;
     }
     const float s2 = total(second), s4 = total(fourth);
-    radius[i] = square_root(largest(farthest));
+    radius[i] = square_root(farthest(patch, patch.weight));
     whole[i] = valid[i] && count > 3 ? square_root(s2 / larger(count - 3, 1.0f)) : INFINITE;
     layered[i] = s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i]);
     of_fewer[i] = few <= k ? of_few(patch, int(few), float(breadth)) : INFINITE;
@@ -90,17 +87,16 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, const float* poin
 }
 
 // torchrg.normals.consensus.noise._neighbor_quantiles.
-KERNEL neighbor_quantiles(int64_t num_points, int64_t num_rows, int64_t k, const float* values,
-                          const int32_t* indices, const bool* mask, double quantile,
-                          int64_t rank_of_all, float* found) {
+KERNEL neighbor_quantiles(int64_t num_points, int64_t num_rows, int64_t k, Floats values,
+                          Ints indices, Flagged mask, double quantile, int64_t rank_of_all,
+                          float* found) {
   if (k < 1 || k > MOST) return TOO_WIDE;
+  if (!(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
   alignas(32) float near[MOST];
   const int width = padded(int(k));
   for (int64_t i = 0; i < num_rows; i++, indices += k) {
-    bool inside = true;
     int count = 0;
-    for (int j = 0; j < k; j++) inside &= uint32_t(indices[j]) < uint64_t(num_points);
-    if (!inside) return NO_SUCH_ROW;
+    if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     for (int j = 0; j < width; j++) near[j] = j < k ? values[indices[j]] : INFINITE;
     int rank = int(rank_of_all);
     if (mask) {
@@ -110,16 +106,24 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_rows, int64_t k, const
       }
       rank = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
     }
-    // The largest of the values that fewer than `rank` others are below.
-    float best = -INFINITE;
-    for (int l = 0; l < width; l += LANES) {
-      Flags below{};
-      const Lanes some = load(near + l);
-      for (int j = 0; j < k; j++) below -= all(near[j]) < some;
-      for (int lane = 0; lane < LANES; lane++)
-        if (below[lane] < rank) best = larger(best, some[lane]);
+    // Values between those that are known to be too low and too high are tried in turn.
+    float low = -INFINITE, high = INFINITE;
+    for (int j = 0; j < k; j++) {
+      const float value = near[j];
+      if (!(value > low && value < high)) continue;
+      Flags below{}, within{};
+      for (int l = 0; l < width; l += LANES) {
+        below -= load(near + l) < value;
+        within -= load(near + l) <= value;
+      }
+      if (total(below) >= rank)
+        high = value;
+      else if (total(within) < rank)
+        low = value;
+      else
+        low = high = value;
     }
-    found[i] = best;
+    found[i] = high;
   }
   return DONE;
 }

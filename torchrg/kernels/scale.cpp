@@ -16,9 +16,7 @@ INLINE int count_within(const float* row, int n, float pivot) {
   Flags count{};
   for (int lag = 1; lag <= n / 2; lag++)
     for (int i = 0; i < n - lag; i += LANES) count += load(row + i + lag) - load(row + i) <= pivot;
-  int sum = 0;
-  for (int lane = 0; lane < LANES; lane++) sum -= count[lane];
-  return sum;
+  return -total(count);
 }
 
 INLINE Around look_around(const float* row, int n, float pivot) {
@@ -32,12 +30,7 @@ INLINE Around look_around(const float* row, int n, float pivot) {
       below = larger(below, where(within, difference, all(0)));
       above = smaller(above, where(beyond, difference, all(INFINITE)));
     }
-  Around found = {0, largest(below), INFINITE};
-  for (int lane = 0; lane < LANES; lane++) {
-    found.count -= count[lane];
-    found.above = smaller(found.above, above[lane]);
-  }
-  return found;
+  return {-total(count), largest(below), -largest(-above)};
 }
 
 // The C(h, 2)-th smallest difference of a row, of which the last values may be infinite.
@@ -84,32 +77,20 @@ float majority_difference(const float* row, int n) {
   }
 }
 
-// Copies values into a row that ascends, with infinity behind them. None is NaN.
+// Copies values, none of them NaN, into a row that ascends, with infinity behind them.
 INLINE void sort(const float* values, int n, float* row) {
-  alignas(32) float in_lanes[MOST];
-  alignas(32) int32_t rank[MOST];
-  const int width = padded(n);
-  for (int i = 0; i < width; i++) in_lanes[i] = i < n ? values[i] : INFINITE, rank[i] = 0;
-  for (int j = 0; j < n; j++) {
-    const Lanes value = all(values[j]);
-    for (int i = 0; i < width; i += LANES) {
-      Flags ranks;
-      __builtin_memcpy(&ranks, rank + i, sizeof ranks);
-      ranks -= value < load(in_lanes + i);
-      __builtin_memcpy(rank + i, &ranks, sizeof ranks);
-    }
+  for (int i = 0; i < n; i++) {
+    int place = i;
+    for (; place > 0 && row[place - 1] > values[i]; place--) row[place] = row[place - 1];
+    row[place] = values[i];
   }
-  for (int i = 0; i < n + LANES; i++) row[i] = i < n ? __builtin_nanf("") : INFINITE;
-  for (int i = 0; i < n; i++) row[rank[i]] = values[i];
-  // Equal values have one rank, and leave the places behind it free.
-  for (int i = 1; i < n; i++)
-    if (row[i] != row[i]) row[i] = row[i - 1];
+  for (int i = 0; i < LANES; i++) row[n + i] = INFINITE;
 }
 
 }  // namespace
 
 // torchrg.robust.scale._majority_difference of sorted rows; NaN where a difference is not finite.
-KERNEL majority_differences(int64_t num_rows, int64_t n, const float* rows, float* found) {
+KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, float* found) {
   if (n < 2 || n > MOST) return TOO_WIDE;
   alignas(32) float row[MOST + LANES];
   for (int i = 0; i < LANES; i++) row[n + i] = INFINITE;
@@ -121,32 +102,17 @@ KERNEL majority_differences(int64_t num_rows, int64_t n, const float* rows, floa
   return DONE;
 }
 
-// torchrg.robust.scale._count_differences: those at most a bound at lags 1 to h - 1 of sorted rows.
-KERNEL count_differences(int64_t num_rows, int64_t n, const float* rows, double bound,
-                         int32_t* found) {
-  if (n < 2 || n > MOST) return TOO_WIDE;
-  alignas(32) float row[MOST + LANES];
-  for (int i = 0; i < LANES; i++) row[n + i] = INFINITE;
-  for (int64_t i = 0; i < num_rows; i++) {
-    __builtin_memcpy(row, rows + i * n, n * sizeof *row);
-    found[i] = count_within(row, int(n), float(bound));
-  }
-  return DONE;
-}
-
 // torchrg.regions.edges.are_coplanar of points (3, N) and the normals of the points of n lists.
-KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, const float* points,
-                    const int32_t* indices, const bool* mask, const float* normals,
-                    const bool* asked, const bool* compared, double factor, double floor,
-                    bool* coplanar) {
+KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
+                    Flagged mask, Floats normals, Flagged asked, Flagged compared, double factor,
+                    double floor, bool* coplanar) {
   if (k < 1 || k > MOST) return TOO_WIDE;
   alignas(32) float residuals[MOST], values[MOST], row[MOST + LANES];
   const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
   for (int64_t i = 0; i < num_rows; i++, indices += k, asked += k, coplanar += k) {
-    bool needed = false, inside = true;
+    bool needed = false;
     for (int j = 0; j < k; j++) needed |= asked[j], coplanar[j] = false;
-    for (int j = 0; j < k; j++) inside &= uint32_t(indices[j]) < uint64_t(num_points);
-    if (!inside) return NO_SUCH_ROW;
+    if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     if (!needed) continue;
     const float a = normals[3 * i], b = normals[3 * i + 1], c = normals[3 * i + 2];
     const float x0 = x[indices[0]], y0 = y[indices[0]], z0 = z[indices[0]];

@@ -8,7 +8,6 @@ In C the lengths come first, in the order of their letters.
 
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
-    "count_differences": "f[nk] x -> i[n]",
     "are_coplanar": "f[3N] i[nk] b[nk]? f[n3] b[nk] b[nk]? x x -> b[nk]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
     "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x -> f[n] f[n] f[n] b[n] b[n] f[n] f[n]",

@@ -4,22 +4,16 @@
 
 namespace {
 
-INLINE float farthest(const Patch& patch) {
-  Lanes most{};
-  for (int j = 0; j < patch.width; j += LANES) most = larger(most, patch.sq_lengths(j));
-  return largest(most);
-}
-
 // Rows (8) of point, normal, offset and one more number of each point.
 constexpr int ROW = 8, NORMAL = 3, OFFSET = 6, NUMBER = 7;
 
 }  // namespace
 
 // smoothing._smoothed: normals and offsets of some rows; `numbers` of the table are the errors.
-KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, const float* table,
-                     const int32_t* indices, const bool* mask, const float* noise,
-                     const int64_t* rows, double agreement, double reach, double falloff,
-                     double ridge, double max_tilt, float* normals, float* offsets) {
+KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats table, Ints indices,
+                     Flagged mask, Floats noise, Longs rows, double agreement, double reach,
+                     double falloff, double ridge, double max_tilt, float* normals,
+                     float* offsets) {
   if (k < 1 || k > MOST) return TOO_WIDE;
   alignas(32) float x[MOST], y[MOST], z[MOST], a[MOST], b[MOST], c[MOST], rests[MOST], errors[MOST],
       weights[MOST];
@@ -29,9 +23,7 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, const floa
     if (i < 0 || i >= num_points) return NO_SUCH_ROW;
     const int32_t* row = indices + i * k;
     const bool* counted = mask ? mask + i * k : nullptr;
-    bool inside = true;
-    for (int j = 0; j < k; j++) inside &= uint32_t(row[j]) < uint64_t(num_points);
-    if (!inside) return NO_SUCH_ROW;
+    if (!are_rows(row, k, num_points)) return NO_SUCH_ROW;
     const float *own = table + ROW * i, *first = table + ROW * int64_t(row[0]);
     const float own_a = own[NORMAL], own_b = own[NORMAL + 1], own_c = own[NORMAL + 2];
     const float sq_first = first[NUMBER] * first[NUMBER];
@@ -59,7 +51,8 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, const floa
       const Lanes p = load(a + j), q = load(b + j), r = load(c + j), error = load(errors + j);
       const Lanes cosine = p * own_a + q * own_b + r * own_c, sq_error = error * error;
       const Lanes rest = -(p * u + q * v + r * w) - load(rests + j), share = rest * per_reach;
-      Lanes agrees = positive(1 - 2 * (1 - magnitude(cosine)) / (sq_agreement * (sq_error + sq_first)));
+      const Lanes sq_angle = sq_agreement * (sq_error + sq_first);
+      Lanes agrees = positive(1 - 2 * (1 - magnitude(cosine)) / sq_angle);
       agrees *= agrees * (sq_first / sq_error);
       agrees *= positive(1 - share * share);
       agrees *= 1 - float(falloff) * (u * u + v * v + w * w) * per_sq;
@@ -102,20 +95,19 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, const floa
 }
 
 // smoothing._chosen: the best plane for some rows among those of every `step`-th neighbour.
-KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, const float* table,
-                     const int32_t* indices, const bool* mask, const float* points,
-                     const int64_t* rows, int64_t step, double vote_reach, double vote_falloff,
-                     double inlier_reach, double cost, float* normals, float* offsets) {
+KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats table, Ints indices,
+                     Flagged mask, Floats points, Longs rows, int64_t step, double vote_reach,
+                     double vote_falloff, double inlier_reach, double cost, float* normals,
+                     float* offsets) {
   if (k < 1 || k > MOST || step < 1) return TOO_WIDE;
+  const Lists lists = {num_points, num_points, k, points, indices, mask};
   Patch patch;
   alignas(32) float weights[MOST];
   for (int64_t q = 0; q < num_rows; q++) {
     const int64_t i = rows[q];
-    if (i < 0 || i >= num_points) return NO_SUCH_ROW;
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
     const int32_t* row = indices + i * k;
-    const bool* counted = mask ? mask + i * k : nullptr;
-    if (!gather(points, num_points, row, counted, int(k), patch)) return NO_SUCH_ROW;
-    const float far = farthest(patch), per_far = 1 / (far > 0 ? far : 1);
+    const float far = farthest(patch, patch.weight), per_far = 1 / (far > 0 ? far : 1);
     Lanes sum{};
     for (int j = 0; j < patch.width; j += LANES) {
       const Lanes near = patch.sq_lengths(j) * per_far;
@@ -134,14 +126,9 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, const floa
                                            c * (other[2] - first[2]));
       const float own = moved / noise;
       if (!(size_of(own) < float(inlier_reach)) || !(a * a + b * b + c * c > 0)) continue;
-      Lanes near{}, over{}, under{};
-      for (int j = 0; j < patch.width; j += LANES) {
-        const Lanes rest = (patch.along(a, b, c, j) - moved) * per_reach, weight = load(weights + j);
-        near += positive(1 - rest * rest) * weight;
-        over += where(rest > 1, weight, all(0)), under += where(rest < -1, weight, all(0));
-      }
-      const float support = total(near) - smaller(total(over), total(under));
-      const float score = support / all_weights - float(cost) * own * own;
+      const float voted = support(patch, weights, a * per_reach, b * per_reach, c * per_reach,
+                                  moved * per_reach);
+      const float score = voted / all_weights - float(cost) * own * own;
       if (score > highest) highest = score, best = other, best_offset = moved;
     }
     for (int axis = 0; axis < 3; axis++) normals[3 * q + axis] = best[NORMAL + axis];
@@ -151,17 +138,15 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, const floa
 }
 
 // smoothing._inliers: number and covariance eigenvalues of the neighbours near planes.
-KERNEL inliers(int64_t num_points, int64_t k, int64_t num_rows, const float* points,
-               const int32_t* indices, const bool* mask, const float* normals,
-               const float* offsets, const float* noise, const int64_t* rows, double reach,
+KERNEL inliers(int64_t num_points, int64_t k, int64_t num_rows, Floats points, Ints indices,
+               Flagged mask, Floats normals, Floats offsets, Floats noise, Longs rows, double reach,
                float* count, float* values) {
   if (k < 1 || k > MOST) return TOO_WIDE;
+  const Lists lists = {num_points, num_points, k, points, indices, mask};
   Patch patch;
   for (int64_t q = 0; q < num_rows; q++) {
     const int64_t i = rows[q];
-    if (i < 0 || i >= num_points) return NO_SUCH_ROW;
-    const bool* counted = mask ? mask + i * k : nullptr;
-    if (!gather(points, num_points, indices + i * k, counted, int(k), patch)) return NO_SUCH_ROW;
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
     Plane plane = {normals[3 * i], normals[3 * i + 1], normals[3 * i + 2], offsets[i], 0, 0, 0};
     Lanes sum{};
     for (int j = 0; j < patch.width; j += LANES) {
@@ -178,20 +163,19 @@ KERNEL inliers(int64_t num_points, int64_t k, int64_t num_rows, const float* poi
 }
 
 // torchrg.normals.jet.fit_paraboloids of the neighbourhoods of some rows.
-KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, const float* points,
-                       const int32_t* indices, const bool* mask, const float* normals,
-                       const int64_t* rows, double flat_pivot, float* tilted, float* offsets,
-                       float* deviations) {
+KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, Floats points, Ints indices,
+                       Flagged mask, Floats normals, Longs rows, double flat_pivot, float* tilted,
+                       float* offsets, float* deviations) {
   if (k < 1 || k > MOST) return TOO_WIDE;
   constexpr int TERMS = 6;
+  const Lists lists = {num_points, num_points, k, points, indices, mask};
   Patch patch;
   alignas(32) float us[MOST], vs[MOST], heights[MOST];
   for (int64_t q = 0; q < num_rows; q++) {
     const int64_t i = rows[q];
-    if (i < 0 || i >= num_points) return NO_SUCH_ROW;
-    const bool* counted = mask ? mask + i * k : nullptr;
-    if (!gather(points, num_points, indices + i * k, counted, int(k), patch)) return NO_SUCH_ROW;
-    const float radius = square_root(farthest(patch)), scale = radius > 0 ? 1 / radius : 0;
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+    const float radius = square_root(farthest(patch, patch.weight));
+    const float scale = radius > 0 ? 1 / radius : 0;
     const float x = normals[3 * i], y = normals[3 * i + 1], z = normals[3 * i + 2];
     const float sign = z < 0 ? -1 : 1, a = -1 / (sign + z), b = x * y * a;
     const float first[3] = {1 + sign * x * x * a, sign * b, -sign * x};

@@ -116,28 +116,18 @@ def qn(
 
 
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
+    """Tell where ``qn(x, dim=dim, mask=mask) > threshold``.
 
-    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`.
+    ``threshold`` is in the unit of ``x``; the rest is as for :func:`median`.
 
     Returns:
-        The same as ``qn(x, dim=dim, mask=mask) > threshold``, bool; False where Qn is NaN.
+        Shape of ``x`` without ``dim``, bool; False where Qn is NaN.
 
     Example:
         >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
         tensor([False,  True])
     """
-
-    def of_sorted(rows: Tensor) -> Tensor:
-        n = rows.shape[1]
-        if n < 2:
-            return torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
-        bound = _largest_within(threshold, QN_FACTOR, rows.dtype)
-        count = _count_differences(rows, bound)
-        return (count < comb(half_size(n), 2)) & ~rows[:, -1].isnan()
-
-    rows, counted = _rows_along("qn_exceeds", x, dim, mask)
-    return _per_count(rows.detach(), counted, of_sorted)
+    return qn(x.detach(), dim=dim, mask=mask) > threshold
 
 
 def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -330,18 +320,6 @@ def half_size(n: int) -> int:
     return n // 2 + 1
 
 
-def _largest_within(threshold: float, factor: float, dtype: torch.dtype) -> float:
-    """Largest x of ``dtype`` with ``factor * x <= threshold`` in the arithmetic of ``dtype``."""
-    kind = np.float32 if dtype == torch.float32 else np.float64
-    limit, scale = kind(threshold), kind(factor)
-    x = limit / scale
-    while scale * x > limit:
-        x = np.nextafter(x, kind(-np.inf))
-    while scale * np.nextafter(x, kind(np.inf)) <= limit < np.inf:
-        x = np.nextafter(x, kind(np.inf))
-    return float(x)
-
-
 def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
 
@@ -367,7 +345,20 @@ def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
     """Do as :func:`_majority_difference`, for all values and devices."""
     rank = comb(half_size(sorted_rows.shape[1]), 2)
     out = sorted_rows.new_empty(len(sorted_rows))
-    _with_lags(sorted_rows, out, lambda lagged, rows: lagged.select(rows, rank))
+    n = sorted_rows.shape[1]
+    width = sum(n - lag for lag in range(1, half_size(n)))
+    scale = 1 if sorted_rows.device.type == "cpu" else _GPU_SHARE
+    size = max(1, scale * CACHE_BYTES // (width * sorted_rows.element_size()))
+
+    def fill(share: slice) -> None:
+        # With one buffer a thread.
+        rows, into = sorted_rows[share], out[share]
+        lagged = _Lagged(rows, min(size, len(rows)))
+        for chunk in chunks_of(len(rows), size):
+            into[chunk] = lagged.select(rows[chunk], rank)
+
+    num_rows = len(sorted_rows)
+    map_chunks(fill, num_rows, max(num_rows, 1), sorted_rows.device, least=size)
     out[sorted_rows[:, -1].isnan()] = torch.nan
     return out
 
@@ -385,35 +376,6 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     pick = is_pair.flatten(1).to(torch.uint8).argmax(dim=1, keepdim=True)
     low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (own, partners))
     return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)
-
-
-def _count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
-    """Count the differences at lags 1 to h - 1 at or below ``bound`` of each row, int32."""
-    if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
-        count = partial(kernels.call, "count_differences")
-        return map_rows(lambda rows: count(rows, bound), [sorted_rows])[0]
-    out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
-    _with_lags(sorted_rows, out, lambda lagged, rows: lagged.count(rows, bound))
-    return out
-
-
-def _with_lags(
-    sorted_rows: Tensor, out: Tensor, work: Callable[["_Lagged", Tensor], Tensor]
-) -> None:
-    """Fill ``out`` with what ``work`` returns for chunks of rows, with one buffer a thread."""
-    n = sorted_rows.shape[1]
-    width = sum(n - lag for lag in range(1, half_size(n)))
-    scale = 1 if sorted_rows.device.type == "cpu" else _GPU_SHARE
-    size = max(1, scale * CACHE_BYTES // (width * sorted_rows.element_size()))
-
-    def fill(share: slice) -> None:
-        rows, into = sorted_rows[share], out[share]
-        lagged = _Lagged(rows, min(size, len(rows)))
-        for chunk in chunks_of(len(rows), size):
-            into[chunk] = work(lagged, rows[chunk])
-
-    num_rows = len(sorted_rows)
-    map_chunks(fill, num_rows, max(num_rows, 1), sorted_rows.device, least=size)
 
 
 _MOST_LAGS = 8
@@ -462,17 +424,6 @@ class _Lagged:
             differences.numpy().partition(rank - 1, axis=1)
             return differences[:, rank - 1]
         return differences.kthvalue(rank, dim=1).values
-
-    def count(self, rows: Tensor, bound: float) -> Tensor:
-        """The number of differences at or below ``bound`` of each row."""
-        differences = self._fill(rows)
-        if not self.on_cpu:
-            return (differences <= bound).sum(dim=1, dtype=torch.int32)
-        flags = np.less_equal(differences.numpy(), bound).view(np.uint64)
-        # Eight flags at a time: each byte of a sum counts up to 255 of them.
-        parts = [flags[:, part].sum(axis=1) for part in chunks_of(flags.shape[1], 255)]
-        counts = np.stack(parts, axis=1).view(np.uint8).sum(axis=1, dtype=np.int32)
-        return torch.from_numpy(counts)
 
 
 class _Run(NamedTuple):
