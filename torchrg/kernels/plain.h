@@ -96,11 +96,12 @@ struct Lists {
 
 // Gathers the neighbours of a list; false if it is none, or names a point that is not there.
 INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
+  if (i < 0 || i >= lists.num_lists) return false;
   const int k = int(lists.k);
   const float* points = lists.points;
   const int32_t* row = lists.indices + i * k;
   const bool* mask = lists.mask ? lists.mask + i * k : nullptr;
-  if (i < 0 || i >= lists.num_lists || !are_rows(row, k, lists.num_points)) return false;
+  if (!are_rows(row, k, lists.num_points)) return false;
   const float* first = points + 3 * int64_t(row[0]);
   const float x0 = first[0], y0 = first[1], z0 = first[2];
   for (int j = 0; j < k; j++) {
