@@ -61,14 +61,16 @@ class KernelsHook(BuildHookInterface[Any]):
         return [ZIG] if ASKED in WHEELS else []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile in place, where an editable install looks too."""
+        """Compile in place, where an editable install looks too.
+
+        With their usual names Python would take the libraries for modules.
+        """
         folder = Path(self.root, "torchrg", "kernels")
         for old in folder.glob("libkernels-*"):
             old.unlink()
         command, wheel = find_compiler()
-        suffix = "dylib" if "mac" in wheel else "so"
         kinds = {"base": []} | ({"avx2": ["-mavx2"]} if wheel.endswith("x86_64") else {})
-        libraries = {kind: folder / f"libkernels-{kind}.{suffix}" for kind in kinds}
+        libraries = {kind: folder / f"libkernels-{kind}.library" for kind in kinds}
         error = "" if command else "there is no C++ compiler"
         if ASKED not in ("", "0", *WHEELS):
             error = f"TORCHRG_KERNELS is none of 0, {', '.join(WHEELS)}"

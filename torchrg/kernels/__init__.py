@@ -157,7 +157,8 @@ def _library() -> ctypes.CDLL | None:
     """Load the library, or say once that there is none."""
     if os.environ.get("TORCHRG_NO_KERNELS", "0") not in ("", "0"):
         return None
-    for path in sorted(Path(__file__).parent.glob(f"libkernels-{_kind()}.*")):
+    path = Path(__file__).parent / f"libkernels-{_kind()}.library"
+    if path.exists():
         try:
             library = ctypes.CDLL(str(path))
         except OSError as error:
