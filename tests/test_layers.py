@@ -11,6 +11,7 @@ LAYERS = [
     {"errors", "version", "_parallel"},
     {"_optional", "precision"},
     {"_checks", "_compile", "scratch", "structures"},
+    {"kernels"},
     {"_opaque", "linalg", "neighbors", "config", "plane_table"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

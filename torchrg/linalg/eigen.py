@@ -15,8 +15,9 @@ _JACOBI_SWEEPS = 5
 """Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
 dtype."""
 
-_FIRST_STEPS, _MORE_STEPS = 4, 6
-"""Steps of Newton's method for a simple root, and further steps for one that is nearly double."""
+_FIRST_STEPS, _MORE_STEPS = 4, 36
+"""Steps of Newton's method for a simple root, and the most for one that is nearly double, where
+each step halves the distance until the two are apart."""
 
 _CONVERGED = 1e-9
 """A root has converged if the last step moves it by less than this share of the trace."""
@@ -215,9 +216,14 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     moving = step.abs() > _CONVERGED * coefficients[0]
     if torch.compiler.is_compiling():
         root = torch.where(moving, _newton(root, coefficients, _MORE_STEPS)[0], root)
-    elif len(rows := moving.nonzero().squeeze(1)):
-        root[rows] = _newton(root[rows], coefficients[:, rows], _MORE_STEPS)[0]
-    return torch.where(root.isfinite(), root, 0.0).view_as(trace)
+        return root.view_as(trace)
+    rows = moving.nonzero().squeeze(1)
+    for _ in range(_MORE_STEPS):
+        if len(rows) == 0:
+            break
+        root[rows], step = _newton(root[rows], coefficients[:, rows], 1)
+        rows = rows[step.abs() > _CONVERGED * coefficients[0, rows]]
+    return root.view_as(trace)
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
@@ -227,7 +233,8 @@ def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor,
     for _ in range(num_steps):
         value = (root - trace).mul_(root).add_(minors).mul_(root).sub_(determinant)
         slope = (3 * root).sub_(twice).mul_(root).add_(minors)
-        step = value.div_(slope)
+        # At a multiple root both may be nothing.
+        step = value.div_(slope).nan_to_num_(0.0, 0.0, 0.0)
         root = root - step
     return root, step
 

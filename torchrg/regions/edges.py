@@ -15,14 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import scratch
+from torchrg import kernels, scratch
 from torchrg._compile import kernel
-from torchrg._parallel import allowed_threads, chunks_of, map_tasks, places_of
+from torchrg._parallel import allowed_threads, chunks_of, map_chunks, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
+from torchrg.robust.scale import QN_FACTOR
 from torchrg.structures import Neighbors, Rows
 
 _CHUNKS_A_THREAD = 4
@@ -108,6 +109,36 @@ def find_coded_edges(
 
     whole = slice(0, len(cloud.points))
     return _pack(find, cloud, whole, None, chunk_size)[0], claims
+
+
+def mark_edges(
+    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
+) -> tuple[Tensor, Tensor | None]:
+    """Return which neighbours join, and by which edges they become seeds, a bit for each.
+
+    The bits are in words of 64, ``(N, words)``, int64. Where growth is free of order a point
+    becomes a seed by itself, and the second is None. ``limit`` is that of the curvature.
+    """
+    shared, free = _shared_neighbors(cloud, config), is_order_free(config)
+    num_points, k = cloud.neighbors.indices.shape
+    joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
+    seeds = joins if free else np.zeros_like(joins)
+
+    def mark(rows: slice) -> None:
+        accepted, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
+        _write_bits(joins[rows], accepted)
+        if not free:
+            _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
+
+    map_chunks(mark, num_points, chunk_size, cloud.points.device)
+    bits, of_seeds = (torch.from_numpy(part.view(np.int64)) for part in (joins, seeds))
+    return bits, None if free else of_seeds
+
+
+def _write_bits(into: NDArray[np.uint8], flags: Tensor) -> None:
+    """Write flags ``(n, K)`` to the bits of bytes, the first to the lowest."""
+    packed = np.packbits(flags.numpy(), axis=1, bitorder="little")
+    into[:, : packed.shape[1]] = packed
 
 
 def find_edges(
@@ -198,7 +229,13 @@ def accept_edges(
     if max_angle_deg >= 90 and not signed:
         limits[0] = None
     columns = cloud.points.T, cloud.normals.T
-    (joins,) = _pass(*near, own, *columns, cloud.valid, cloud.reach, *limits, signed)
+    if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
+        numbers = [-1.0 if limit is None else float(limit) for limit in limits]
+        (joins,) = kernels.call(
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, own.long(), *numbers, signed
+        )
+    else:
+        (joins,) = _pass(*near, own, *columns, cloud.valid, cloud.reach, *limits, signed)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
         joins &= within_distance(near, own, cloud.colors.T, limit)
@@ -358,6 +395,10 @@ def are_coplanar(
     The limit is taken over the neighbours ``compared``, shape ``(n, K)``, default all; its floor is
     a fraction of the distance to the farthest neighbour.
     """
+    near, columns = cloud.neighbors.at(rows), cloud.points.T
+    if kernels.serve(columns, *near, cloud.normals, asked, compared, k=asked.shape[1]):
+        lists = columns, *near, cloud.normals[rows], asked, compared
+        return kernels.call("are_coplanar", *lists, QN_FACTOR, floor_fraction)[0]
     needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
     indices, counted = cloud.neighbors.at(rows).at(needed)
     patches = gather_patches(cloud.points, indices)

@@ -48,10 +48,9 @@ def vote_planes(
     nearness = sq_distances / torch.where(farthest > 0, farthest, 1.0)
     weights = (1 - constants.VOTE_FALLOFF * nearness) * counted
     reach = constants.VOTE_REACH * noise
-    pairs = _pairs(sq_distances.shape[1], constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
-    ranks = torch.tensor(pairs, dtype=torch.int64, device=noise.device).view(-1, 2)
+    ranks = candidate_ranks(sq_distances.shape[1]).to(noise.device)
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
-    for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(pairs)), 1)):
+    for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
         own = [part[some] for part in (*columns, weights, start, reach)]
         (normals[some],) = _most_supported(*own, ranks)
     no, yes = torch.tensor([False, True], device=noise.device)
@@ -120,6 +119,12 @@ def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
     spanned = sq_area > 0
     length = torch.where(spanned, sq_area, 1.0).sqrt_()
     return torch.stack([x / length, y / length, z / length], dim=-1), spanned
+
+
+def candidate_ranks(num_neighbors: int) -> Tensor:
+    """Return the ranks ``(P, 2)`` of the neighbours that span candidates with the point."""
+    pairs = _pairs(num_neighbors, constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
+    return torch.tensor(pairs, dtype=torch.int64, device="cpu").view(-1, 2)
 
 
 @cache

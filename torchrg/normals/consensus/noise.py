@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._compile import kernel
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg import above, coordinate_resolution
@@ -59,20 +60,21 @@ def survey_noise(
     the one of all neighbours, if they leave 0.35 of its deviation or less. ``fit`` are the planes
     of all neighbours; noise is at least the rounding of the coordinates.
     """
+    points = points.contiguous()
     offsets, radius, whole, layered = (torch.empty_like(points[:, 0]) for _ in range(4))
     small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
 
     def work(block: slice) -> None:
         indices, mask = neighbors.at(block)
-        offsets[block], radius[block], whole[block], low, again = _deviations(
-            points, indices, mask, fit.normals[block], fit.valid[block]
+        offsets[block], radius[block], whole[block], low, again, *nearest = _survey(
+            points, Neighbors(indices, mask), fit.normals[block], fit.valid[block]
         )
         layered[block] = torch.inf
         if len(rows := places_of(low)):
             near, own = Neighbors(indices, mask).at(rows), rows + block.start
             layered[own] = _layered_deviations(points, near, fit.normals[own], whole[own])
-        for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
-            values[block] = _of_nearest(points, Neighbors(indices, mask), size)
+        for values, deviations in zip(small, nearest, strict=True):
+            values[block] = deviations
         if len(rows := places_of(again)):
             patches, counted = _each_place_once(points, Neighbors(indices, mask).at(rows))
             for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
@@ -128,6 +130,16 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
     for _ in range(constants.REGIONAL_STEPS):
         noise = _neighbor_quantiles(noise, neighbors, constants.REGIONAL_QUANTILE)
     return noise
+
+
+def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
+    """Return what :func:`_deviations` does, and :func:`_of_nearest` for both of the counts."""
+    counts = constants.NOISE_COUNTS
+    if kernels.serve(points, *near, normals, valid, k=near.indices.shape[1]):
+        limits = constants.MAX_LAYERED_KURTOSIS, constants.MIN_BREADTH
+        return kernels.call("survey", points, *near, normals, valid, *counts, *limits)
+    of_nearest = [_of_nearest(points, near, count) for count in counts]
+    return *_deviations(points, *near, normals, valid), *of_nearest
 
 
 @kernel("N 3", "n K", "n K", "n 3", "n")
@@ -209,6 +221,10 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
     rank, quantiles = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
 
     def work(block: slice) -> None:
+        if kernels.serve(values, indices, counted, k=indices.shape[1]):
+            lists = neighbors.at(block)
+            (quantiles[block],) = kernels.call("neighbor_quantiles", values, *lists, quantile, rank)
+            return
         if counted is None and values.device.type == "cpu":
             near = np.take(values.numpy(), indices[block].numpy())
             near.partition(rank - 1, axis=1)

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._compile import kernel
 from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
 from torchrg.linalg import signs
@@ -44,15 +45,34 @@ def smooth_planes(
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
+    is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
+    table = _table(points, planes, errors) if is_served else points
+    numbers = (
+        constants.SMOOTHING_AGREEMENT,
+        constants.SMOOTHING_REACH,
+        constants.FIT_FALLOFF,
+        constants.TILT_RIDGE,
+        constants.MAX_TILT,
+    )
 
     def work(block: slice) -> None:
         chosen = rows[block]
+        if is_served:
+            normals[chosen], offsets[chosen] = kernels.call(
+                "smooth_planes", table, *neighbors, noise, chosen, *numbers
+            )
+            return
         normals[chosen], offsets[chosen] = _smoothed(
             points, *neighbors, parts, planes.offsets, noise, errors, chosen
         )
 
     map_chunks(work, len(rows), chunk_size, rows.device)
     return TangentPlanes(normals, offsets)
+
+
+def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
+    """Return rows of point, normal, offset and value ``(N, 8)``: one place in memory for each."""
+    return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
 
 
 @kernel("N 3", "N K", "N K", "3 N", "N", "N", "N", "n")
@@ -112,13 +132,29 @@ def choose_planes(
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
 
+    is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
+    is_served = is_served and len(rows) > 0
+    table = _table(points, planes, noise) if is_served else points
+    numbers = (
+        constants.CHOICE_STEP,
+        constants.VOTE_REACH,
+        constants.VOTE_FALLOFF,
+        constants.INLIER_REACH,
+        constants.CHOICE_COST,
+    )
+
     def work(block: slice) -> None:
         chosen = rows[block]
+        if is_served:
+            normals[chosen], offsets[chosen] = kernels.call(
+                "choose_planes", table, *neighbors, points, chosen, *numbers
+            )
+            return
         normals[chosen], offsets[chosen] = _chosen(
             points, *neighbors, *planes, noise, chosen, ranks
         )
 
-    size = max(min(chunk_size, ROWS_IN_CACHE // len(ranks)), 1)
+    size = max(min(chunk_size, ROWS_IN_CACHE // (1 if is_served else len(ranks))), 1)
     map_chunks(work, len(rows), size, rows.device)
     return TangentPlanes(normals, offsets)
 
@@ -212,8 +248,24 @@ def describe_inliers(
     return curvature, residual_rms
 
 
-@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n")
 def _inliers(
+    points: Tensor,
+    indices: Tensor,
+    valid: Tensor | None,
+    normals: Tensor,
+    offsets: Tensor,
+    noise: Tensor,
+    rows: Tensor,
+) -> tuple[Tensor, ...]:
+    """Do as :func:`_inliers_of`, by a kernel where one serves."""
+    arguments = points, indices, valid, normals, offsets, noise
+    if kernels.serve(*arguments, k=indices.shape[1]):
+        return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
+    return _inliers_of(*arguments, rows)
+
+
+@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n")
+def _inliers_of(
     points: Tensor,
     indices: Tensor,
     valid: Tensor | None,
