@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 LAYERS = [
     {"errors", "version", "_parallel"},
     {"_optional", "precision"},
-    {"_checks", "_compile", "scratch", "structures"},
+    {"_checks", "scratch", "structures"},
     {"kernels"},
     {"_opaque", "linalg", "neighbors", "config", "plane_table"},
     {"robust"},

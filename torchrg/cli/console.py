@@ -21,12 +21,10 @@ from torchrg.cli.ending import say as say
 from torchrg.cli.ending import warn as warn
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
 from torchrg.datasets.folder import folded_name
-from torchrg.depth.segment import prepare_depth_kernels
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, takes_columns
 from torchrg.io.fields import COLUMNS_RULE, notes_on_results
 from torchrg.io.files import check_place, make_folder
-from torchrg.pipeline import prepare_kernels
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
 
@@ -107,16 +105,6 @@ _MOST_THREADS = 1024
 """More than any machine has cores; many more cannot be started, and torch ends with the process."""
 _MOST_GIGABYTES = 1_000_000
 """A petabyte, more than any machine has memory."""
-
-
-CompileFlag = Annotated[
-    bool,
-    Argument(
-        text="Whether a C++ compiler makes kernels, once for all runs on this machine. They are "
-        "faster, and equal to rounding."
-    ),
-]
-"""Type of the argument --compile."""
 
 
 OrientFlag = Annotated[
@@ -229,19 +217,6 @@ def without(target: Path, fields: Collection[str]) -> str:
 def _is_archive(target: Path) -> bool:
     """Whether a result goes to the format that holds it alone, without fields of the cloud."""
     return target.suffix.lower() == ".npz"
-
-
-def prepared(settings: PlaneSettings) -> PlaneSettings:
-    """Compile the kernels that the settings need if they ask for it; a line says so."""
-    with warnings_as_lines():
-        found = prepare_kernels(settings.resolved, announce=say)
-    return dataclasses.replace(settings, resolved=found)
-
-
-def prepared_for_depth(wanted: bool) -> bool:
-    """Compile the kernels of depth images if that is wanted, and tell whether it was done."""
-    with warnings_as_lines():
-        return wanted and prepare_depth_kernels(say)
 
 
 def use_threads(threads: int | None) -> None:

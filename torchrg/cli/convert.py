@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 from tqdm import tqdm
 
@@ -84,10 +84,6 @@ class Arguments:
         """Return the data set, both paths absolute."""
         raise NotImplementedError
 
-    def prepared(self) -> Self:
-        """Compile the kernels that are needed, if they are asked for."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True)
 class CloudArguments(Arguments):
@@ -119,10 +115,6 @@ class CloudArguments(Arguments):
         """What is written of each cloud, as sources take it."""
         names = ("superpoint", "layout", "partition", "level", "orient")
         return {name: getattr(self, name) for name in names}
-
-    def prepared(self) -> Self:
-        """Compile the kernels of clouds if the settings ask for them."""
-        return dataclasses.replace(self, settings=console.prepared(self.settings))
 
 
 @dataclass(frozen=True)
@@ -220,20 +212,15 @@ class RGBDArguments(Arguments):
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
     orient: console.ImageOrientFlag = "auto"
-    compile: console.CompileFlag = False
     unit: ClassVar[str] = "frame"
     seconds_per_million: ClassVar[tuple[float, str]] = (3.0, "pixels")
     """As that of clouds, by the 0.9 s of a frame of 640 x 480 pixels in README.md."""
-
-    def prepared(self) -> Self:
-        """Compile the kernels of depth images if they are asked for."""
-        return dataclasses.replace(self, compile=console.prepared_for_depth(self.compile))
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
         intrinsics = None if self.intrinsics is None else console.parse_intrinsics(self.intrinsics)
         return RGBDSource(
-            *(root, self.depth, self.layout, intrinsics, self.depth_scale, self.compile),
+            *(root, self.depth, self.layout, intrinsics, self.depth_scale),
             orient=self.orient,
         )
 
@@ -273,7 +260,6 @@ def run(argv: list[str]) -> int:
         start["settings"] = console.PlaneSettings.asked_for(rest, chosen.usual_preset)
     arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
-    arguments = arguments if arguments.dry_run else arguments.prepared()
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with console.warnings_as_lines():
         source = arguments.source(root, out)

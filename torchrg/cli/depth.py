@@ -1,7 +1,7 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -65,7 +65,6 @@ class Arguments:
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
     orient: console.ImageOrientFlag = "auto"
-    compile: console.CompileFlag = False
     threads: int | None = None
     """Number of threads. Default: as torch decides, usually one for each core."""
 
@@ -89,7 +88,6 @@ def run(argv: list[str]) -> int:
     console.check_apart([*targets, *drawn], inputs)
     for picture in drawn:
         check_place(picture)
-    arguments = replace(arguments, compile=console.prepared_for_depth(arguments.compile))
     return run_each(_label, arguments, list(map(str, inputs)), inputs, targets, pictures)
 
 
@@ -123,7 +121,7 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
     # Results are about the cloud's origin.
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.from_numpy(cloud.origin)
-    seg = segment_depth(depth, camera, arguments.depth, pose=pose, compile=arguments.compile)
+    seg = segment_depth(depth, camera, arguments.depth, pose=pose)
     points = cloud.points.view(*depth.shape, 3)
     seg = orient_image(seg, points, arguments.orient)
     if _is_png(target):
@@ -179,7 +177,6 @@ def _write_cloud(
         "config": {"depth": asdict(arguments.depth)},
         "intrinsics": camera and ",".join(f"{value:.15g}" for value in camera),
         "depth_scale": arguments.depth_scale,
-        "compile": arguments.compile,
         "orient": arguments.orient,
     }
     images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchrg._compile import compiled
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import console
@@ -55,7 +54,6 @@ class Arguments:
     chunk_size: int = PipelineConfig.chunk_size
     """Number of points that are handled at a time. It bounds the memory and never changes a
     result."""
-    compile: console.CompileFlag = False
     threads: int | None = None
     """Number of threads. Default: as torch decides, usually one for each core."""
     columns: console.ColumnsFlag = None
@@ -74,9 +72,6 @@ def run(argv: list[str]) -> int:
     console.ColumnNames.parse(arguments.columns, arguments.inputs)
     outputs = console.output_paths(arguments.inputs, arguments.out)
     console.check_apart(outputs, arguments.inputs)
-    wanted = PipelineConfig(arguments.normals, compile=arguments.compile)
-    settings = console.prepared(console.PlaneSettings(resolved=wanted))
-    arguments = replace(arguments, compile=settings.resolved.compile)
     return run_each(
         _estimate_file, arguments, list(map(str, arguments.inputs)), arguments.inputs, outputs
     )
@@ -97,15 +92,13 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     settings, size = arguments.normals, arguments.chunk_size
     with console.stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")
-        with compiled(arguments.compile):
-            fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
+        fit = estimate_normals(cloud.points, config=settings, chunk_size=size)
         advance("orientation")
         place = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
         turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=place)
         fit = fit._replace(normals=turned)
     provenance = describe_run(source, settings)
     provenance |= {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
-    provenance |= {"compile": arguments.compile}
     if arguments.columns is not None:
         provenance["columns"] = arguments.columns
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp

@@ -136,7 +136,6 @@ def run(argv: list[str]) -> int:
     pictures = console.picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    arguments = dataclasses.replace(arguments, settings=console.prepared(arguments.settings))
     names = [_name_of(cloud) for cloud in clouds]
     with _sharing(arguments, outputs):
         code = run_each(_segment, arguments, names, clouds, outputs, pictures)

@@ -1,7 +1,8 @@
 // Edges that regions grow along, and growth itself: torchrg/regions/edges.py and growth.py.
 #include "plain.h"
 
-// edges._pass of points and normals (3, N) to the neighbours of some rows; limits below 0 are off.
+// Places and normals in edges.accept_edges, from points and normals (3, N) to the neighbours of
+// some rows; limits below 0 are off.
 KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
                   Flagged valid, Floats reach, Ints indices, Flagged mask, Longs rows,
                   double max_sq_chord, double max_sq_distance, int64_t is_signed, bool* joins) {

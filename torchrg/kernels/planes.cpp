@@ -29,7 +29,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
 
 namespace {
 
-// torchrg.normals.consensus.noise._of_few: deviation of the first neighbours from their own plane.
+// torchrg.normals.consensus.noise._small_deviations: of the first neighbours from their own plane.
 INLINE float of_few(const Patch& patch, int count, float breadth) {
   alignas(32) float weights[MOST], inside[MOST];
   const int width = padded(count);

@@ -3,7 +3,7 @@
 :func:`fit_points` leads from a fit of patches, by whichever method, to the points of a cloud.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes, has_values
-from torchrg._compile import kernel
 from torchrg._parallel import CHUNK_SIZE, map_chunks, places_of
 from torchrg.config import NormalsConfig
 from torchrg.linalg import (
@@ -82,7 +81,7 @@ def fit_plane(
     patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> tuple[NormalFit, PrincipalFrame]:
     """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
-    *parts, total = _frames(*patches.unbind(dim=-1), mask)
+    *parts, total = _frames(patches.unbind(dim=-1), mask)
     frame = PrincipalFrame(*parts)
     fit = _as_fit(patches, mask, resolution, frame.normals, frame.smallest, frame.values, total)
     return fit, frame
@@ -109,10 +108,9 @@ def _as_fit(
     )
 
 
-@kernel("n K", "n K", "n K", "n K")
-def _frames(x: Tensor, y: Tensor, z: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
+def _frames(columns: Sequence[Tensor], mask: Tensor | None) -> tuple[Tensor, ...]:
     """Return the principal frame of patches, by columns, and the trace of their covariance."""
-    _, matrix = covariance_of_columns((x, y, z), mask)
+    _, matrix = covariance_of_columns(columns, mask)
     return *principal_frame(matrix), matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
 
 
@@ -145,14 +143,13 @@ def _fit_without_gradients(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor
 ) -> NormalFit:
     """Do as :func:`fit_normals_pca`, in less time, as only one eigenvector is asked for."""
-    values, normals, total = _smallest(*patches.unbind(dim=-1), mask)
+    values, normals, total = _smallest(patches.unbind(dim=-1), mask)
     return _as_fit(patches, mask, resolution, normals, values[..., 0], values, total)
 
 
-@kernel("n K", "n K", "n K", "n K")
-def _smallest(x: Tensor, y: Tensor, z: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
+def _smallest(columns: Sequence[Tensor], mask: Tensor | None) -> tuple[Tensor, ...]:
     """Return eigenvalues, first eigenvectors and traces of the covariances of patches."""
-    _, matrix = covariance_of_columns((x, y, z), mask)
+    _, matrix = covariance_of_columns(columns, mask)
     return *smallest_eigenvector3(matrix), matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
 
 

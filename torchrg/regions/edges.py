@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._compile import kernel
 from torchrg._parallel import allowed_threads, chunks_of, map_chunks, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, sq_chords
@@ -222,20 +221,25 @@ def accept_edges(
         own = torch.arange(own.start, own.stop, device=cloud.points.device)
     near, signed = cloud.neighbors.at(rows), cloud.signed_normals
     max_angle_deg = cloud.angle_share * config.max_angle_deg
-    limits: list[Tensor | None] = [
-        cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg)),
-        None if config.max_distance is None else cloud.points.new_tensor(config.max_distance**2),
-    ]
-    if max_angle_deg >= 90 and not signed:
-        limits[0] = None
+    angle = distance = None
+    if max_angle_deg < 90 or signed:
+        angle = cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg))
+    if config.max_distance is not None:
+        distance = cloud.points.new_tensor(config.max_distance**2)
     columns = cloud.points.T, cloud.normals.T
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
-        numbers = [-1.0 if limit is None else float(limit) for limit in limits]
+        numbers = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
             "pass_edges", *columns, cloud.valid, cloud.reach, *near, own.long(), *numbers, signed
         )
     else:
-        (joins,) = _pass(*near, own, *columns, cloud.valid, cloud.reach, *limits, signed)
+        joins = are_valid(near, own, cloud.valid)
+        if angle is not None:
+            joins &= within_angle(near, own, columns[1], angle, signed=signed)
+        if distance is not None:
+            joins &= within_distance(near, own, columns[0], distance)
+        if cloud.reach is not None:
+            joins &= on_planes(near, own, *columns, cloud.reach)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
         joins &= within_distance(near, own, cloud.colors.T, limit)
@@ -251,31 +255,6 @@ def accept_edges(
         if config.connectivity_scope == "region":
             joins &= connected
     return joins, connected
-
-
-@kernel("n K", "n K", "n", "3 N", "3 N", "N", "N", "", "", "")
-def _pass(
-    indices: Tensor,
-    mask: Tensor | None,
-    rows: Tensor,
-    points: Tensor,
-    normals: Tensor,
-    valid: Tensor,
-    reach: Tensor | None,
-    max_sq_chord: Tensor | None,
-    max_sq_distance: Tensor | None,
-    signed: bool,
-) -> tuple[Tensor]:
-    """Tell which neighbours of some points pass the criteria of places and normals."""
-    near = Neighbors(indices, mask)
-    joins = are_valid(near, rows, valid)
-    if max_sq_chord is not None:
-        joins &= within_angle(near, rows, normals, max_sq_chord, signed=signed)
-    if max_sq_distance is not None:
-        joins &= within_distance(near, rows, points, max_sq_distance)
-    if reach is not None:
-        joins &= on_planes(near, rows, points, normals, reach)
-    return (joins,)
 
 
 def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], Tensor] | None:

@@ -15,11 +15,9 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._compile import is_active
 from torchrg._opaque import opaque
 from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks, map_rows
 from torchrg.errors import ShapeError
-from torchrg.robust.counting import majority_difference
 
 MAD_FACTOR = 1.4826
 """1 / Phi^-1(3/4), to the digits of the literature."""
@@ -246,8 +244,6 @@ def sum_points(values: Tensor) -> Tensor:
     So a sum is the same, to the last bit, wherever its lane stands. ``torch.sum`` does not promise
     that: it adds the last lanes of a tensor in another order than the first.
     """
-    if torch.compiler.is_compiling():
-        return values.sum(dim=0)  # compiled code adds row by row
     if values.requires_grad:
         total = values.sum(dim=0)
         return sum_points(values.detach()) + (total - total.detach())
@@ -312,10 +308,6 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
         if len(endless):
             found[endless] = _difference_by_lags(sorted_rows[endless])
         return found
-    if is_active.get() and sorted_rows.device.type == "cpu":
-        ends = sorted_rows[:, :: max(sorted_rows.shape[1] - 1, 1)]
-        if bool(ends.isfinite().all()):
-            return majority_difference(sorted_rows)
     return _difference_by_lags(sorted_rows)
 
 

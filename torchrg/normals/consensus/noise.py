@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._compile import kernel
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg import above, coordinate_resolution
 from torchrg.linalg.moments import (
@@ -142,7 +141,6 @@ def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> 
     return *_deviations(points, *near, normals, valid), *of_nearest
 
 
-@kernel("N 3", "n K", "n K", "n 3", "n")
 def _deviations(
     points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
@@ -198,21 +196,19 @@ def _of_nearest(points: Tensor, near: Neighbors, count: int) -> Tensor:
 
 
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
-    """Return deviations of the nearest points from their plane; inf where they span none."""
+    """Return deviations of the nearest points from their plane.
+
+    They are infinite where these points span none, or the last of them does not count.
+    """
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
     columns = split_columns(patches[:, :count])
-    return _of_few(*columns, counted[:, :count])[0]
-
-
-@kernel("n S", "n S", "n S", "n S")
-def _of_few(x: Tensor, y: Tensor, z: Tensor, counted: Tensor) -> tuple[Tensor]:
-    """Return deviations of the points that count from their plane; inf if the last one does not."""
-    normals, offsets, values = fit_weighted_planes((x, y, z), counted)
-    rests = residuals((x, y, z), normals, offsets)
-    spread = (rests * rests).sum(dim=1) / (x.shape[1] - 3)
+    counted = counted[:, :count]
+    normals, offsets, values = fit_weighted_planes(columns, counted)
+    rests = residuals(columns, normals, offsets)
+    spread = (rests * rests).sum(dim=1) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
-    return (torch.where(broad, spread.sqrt_(), torch.inf),)
+    return torch.where(broad, spread.sqrt_(), torch.inf)
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:

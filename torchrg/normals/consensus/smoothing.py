@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._compile import kernel
 from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
 from torchrg.linalg import signs
 from torchrg.linalg.moments import (
@@ -75,7 +74,6 @@ def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
     return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
 
 
-@kernel("N 3", "N K", "N K", "3 N", "N", "N", "N", "n")
 def _smoothed(
     points: Tensor,
     indices: Tensor,
@@ -159,7 +157,6 @@ def choose_planes(
     return TangentPlanes(normals, offsets)
 
 
-@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n", "R")
 def _chosen(
     points: Tensor,
     indices: Tensor,
@@ -257,24 +254,10 @@ def _inliers(
     noise: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Do as :func:`_inliers_of`, by a kernel where one serves."""
+    """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
     arguments = points, indices, valid, normals, offsets, noise
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
-    return _inliers_of(*arguments, rows)
-
-
-@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n")
-def _inliers_of(
-    points: Tensor,
-    indices: Tensor,
-    valid: Tensor | None,
-    normals: Tensor,
-    offsets: Tensor,
-    noise: Tensor,
-    rows: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
     columns = gather_columns(points, indices[rows])
     rests = residuals(columns, normals[rows], offsets[rows]).abs()
     near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._compile import kernel
 from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg.moments import Columns, split_columns
 from torchrg.neighbors import gather_columns, gather_patches
@@ -138,18 +137,10 @@ def _numbers() -> Tensor:
 def _paraboloids(
     points: Tensor, indices: Tensor, valid: Tensor | None, normals: Tensor, rows: Tensor
 ) -> tuple[Tensor, ...]:
-    """Do as :func:`_paraboloids_of`, by a kernel where one serves."""
+    """Return what :func:`torchrg.normals.jet.fit_paraboloids` does, of some points."""
     arguments = points, indices, valid, normals
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("fit_paraboloids", *arguments, rows, FLAT_PIVOT)
-    return _paraboloids_of(*arguments, rows)
-
-
-@kernel("N 3", "N K", "N K", "N 3", "n")
-def _paraboloids_of(
-    points: Tensor, indices: Tensor, valid: Tensor | None, normals: Tensor, rows: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what :func:`torchrg.normals.jet.fit_paraboloids` does, of some points."""
     counted = Neighbors(indices, valid).counted(rows).to(points.dtype)
     return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
