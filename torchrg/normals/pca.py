@@ -3,7 +3,7 @@
 :func:`fit_points` leads from a fit of patches, by whichever method, to the points of a cloud.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -18,7 +18,6 @@ from torchrg.linalg import (
     covariance,
     eigh3,
     rank_tolerance,
-    smallest_eigenvector3,
 )
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
 from torchrg.linalg.moments import covariance_of_columns
@@ -81,37 +80,20 @@ def fit_plane(
     patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> tuple[NormalFit, PrincipalFrame]:
     """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
-    *parts, total = _frames(patches.unbind(dim=-1), mask)
-    frame = PrincipalFrame(*parts)
-    fit = _as_fit(patches, mask, resolution, frame.normals, frame.smallest, frame.values, total)
-    return fit, frame
-
-
-def _as_fit(
-    patches: Tensor,
-    mask: Tensor | None,
-    resolution: Tensor | None,
-    normals: Tensor,
-    smallest: Tensor,
-    values: Tensor,
-    total: Tensor,
-) -> NormalFit:
-    """Return what eigenvalues and traces of covariances say about patches."""
+    _, matrix = covariance_of_columns(patches.unbind(dim=-1), mask)
+    frame = principal_frame(matrix)
+    total = matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
     with torch.no_grad():
-        valid = _spans_plane(patches, mask, values, resolution)
+        valid = _spans_plane(patches, mask, frame.values, resolution)
+    normals, smallest = frame.normals, frame.smallest
     curvature = (smallest / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    return NormalFit(
+    fit = NormalFit(
         torch.where(valid[..., None], normals, 0.0),
         torch.where(valid, curvature, 0.0),
         valid,
         residual_rms=torch.where(valid, root(smallest), 0.0),
     )
-
-
-def _frames(columns: Sequence[Tensor], mask: Tensor | None) -> tuple[Tensor, ...]:
-    """Return the principal frame of patches, by columns, and the trace of their covariance."""
-    _, matrix = covariance_of_columns(columns, mask)
-    return *principal_frame(matrix), matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+    return fit, frame
 
 
 def fit_points_pca(
@@ -119,9 +101,8 @@ def fit_points_pca(
 ) -> NormalFit:
     """Fit the neighbourhoods of a cloud ``(N, 3)``; :func:`fit_points` of least squares."""
     num_neighbors = neighbors.indices.shape[1]
-    fit_patches = fit_normals_pca if points.requires_grad else _fit_without_gradients
     if not kernels.serve(points, *neighbors, k=num_neighbors):
-        return fit_points(points, neighbors, fit_patches, chunk_size=chunk_size)
+        return fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
     places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
 
     def work(rows: slice) -> tuple[Tensor, ...]:
@@ -135,22 +116,8 @@ def fit_points_pca(
     rows = places_of(narrow)
     if len(rows) == 0:
         return fit
-    again = fit_points(points, neighbors, fit_patches, rows=rows, chunk_size=chunk_size)
+    again = fit_points(points, neighbors, fit_normals_pca, rows=rows, chunk_size=chunk_size)
     return replace_rows(fit, rows, again)
-
-
-def _fit_without_gradients(
-    patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor
-) -> NormalFit:
-    """Do as :func:`fit_normals_pca`, in less time, as only one eigenvector is asked for."""
-    values, normals, total = _smallest(patches.unbind(dim=-1), mask)
-    return _as_fit(patches, mask, resolution, normals, values[..., 0], values, total)
-
-
-def _smallest(columns: Sequence[Tensor], mask: Tensor | None) -> tuple[Tensor, ...]:
-    """Return eigenvalues, first eigenvectors and traces of the covariances of patches."""
-    _, matrix = covariance_of_columns(columns, mask)
-    return *smallest_eigenvector3(matrix), matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
 
 
 def check_patches(
