@@ -12,22 +12,35 @@ if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
   exit 2
 fi
 
-stamp=$venv/.torchrg-$(cat pyproject.toml scripts/constraints.txt | cksum | tr ' ' '-')${extras:+-$extras}
+sources=(pyproject.toml scripts/constraints.txt scripts/build_kernels.py torchrg/kernels/*.{cpp,h})
+stamp=$venv/.torchrg-$(cat "${sources[@]}" | cksum | tr ' ' '-')${extras:+-$extras}
 if [ ! -e "$stamp" ]; then
   site=$("$python" -c 'import importlib.util as u; print("--system-site-packages" if u.find_spec("torch") else "")')
   [ -z "$kind" ] || site=
   [ -x "$venv/bin/python" ] || "$python" -m venv $site "$venv"
   install=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check)
+  # Whoever has no compiler gets one for the build alone, a package of 100 MB, or no kernels.
+  target=$("$python" -c 'import platform; print(platform.machine() + {"Linux": "-linux-gnu.2.17"}.get(platform.system(), "-macos.11.0"))')
+  install_torchrg() {
+    if [ -n "${TORCHRG_KERNELS+set}" ] || command -v "${CXX:-c++}" > /dev/null; then
+      "${install[@]}" "$@"
+    elif TORCHRG_KERNELS=${target/arm64/aarch64} "${install[@]}" "$@" 2> /dev/null; then
+      echo "There is no C++ compiler: the kernels of torchrg were compiled by the package ziglang."
+    else
+      TORCHRG_KERNELS=0 "${install[@]}" "$@"
+      echo "There is no C++ compiler, and ziglang cannot be had: torchrg runs without its kernels, slower."
+    fi
+  }
   echo "Installing torchrg into $venv (once; some minutes if PyTorch has to be downloaded) ..."
   if [ -n "$kind" ]; then
     # "laspy[lazrs]>=2.5" becomes laspy==2.5
     grep -oE '"[A-Za-z0-9_-]+(\[[a-z,]+\])?>=[0-9.]+"' pyproject.toml | tr -d '"' |
       sed -E 's/(\[.*\])?>=/==/' | sort -u > "$venv/constraints.txt"
-    "${install[@]}" -c "$venv/constraints.txt" -e ".${extras:+[$extras]}"
+    install_torchrg -c "$venv/constraints.txt" -e ".${extras:+[$extras]}"
   else
     "$venv/bin/python" -c 'import torch' 2>/dev/null ||
       "${install[@]}" -c scripts/constraints.txt torch
-    "${install[@]}" -e ".${extras:+[$extras]}"
+    install_torchrg -e ".${extras:+[$extras]}"
   fi
   rm -f "$venv"/.torchrg-*"${extras:+-$extras}"
   touch "$stamp"

@@ -40,7 +40,7 @@ def trace(preset: str) -> dict[str, list[str]]:
     def note(frame: FrameType, event: str, _: object) -> None:
         code, caller = frame.f_code, frame.f_back
         path = Path(code.co_filename)
-        is_wrapper = re.search(r"<locals>\.call|^Kernel\.__call__$", code.co_qualname)
+        is_wrapper = re.search(r"<locals>\.call", code.co_qualname)
         if event != "call" or PACKAGE not in path.parents or is_wrapper:
             return
         doors = entered.setdefault(path.relative_to(PACKAGE).as_posix(), {})

@@ -9,7 +9,7 @@ from torch.autograd import gradcheck
 import torchrg
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
-from torchrg.linalg import covariance, eigh3
+from torchrg.linalg import covariance, eigh3, unsigned_angle_deg
 from torchrg.normals import (
     ESTIMATORS,
     estimate_normals,
@@ -67,7 +67,15 @@ def test_gradients_change_no_value(method, dtype):
     plain = estimate_normals(points, method=method, k=10, config=FEW_STEPS)
     points.requires_grad_()
     fit = estimate_normals(points, method=method, k=10, config=FEW_STEPS)
-    assert all(torch.equal(a, b) for a, b in zip(fit[:4], plain[:4], strict=True))
+    assert torch.equal(fit.valid, plain.valid)
+    # Kernels serve in single precision, where no gradient is asked for.
+    step = 1e-4 if method in ("pca", "paper") and dtype == torch.float32 else 0
+    assert unsigned_angle_deg(fit.normals, plain.normals).max() <= 60 * step
+    for found, expected in (
+        (fit.curvature, plain.curvature),
+        (fit.residual_rms, plain.residual_rms),
+    ):
+        assert (found - expected).abs().max() <= step
     assert fit.normals.requires_grad
     assert fit.curvature.requires_grad
 

@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import connected_components
 LAYERS = [
     {"errors", "version", "_display", "_parallel"},
     {"precision"},
-    {"_checks", "_compile", "_optional", "scratch", "structures"},
+    {"_checks", "_optional", "scratch", "structures"},
+    {"kernels"},
     {"_opaque", "linalg", "neighbors", "config", "plane_table"},
     {"robust"},
     {"normals", "regions", "metrics", "io", "scenes"},

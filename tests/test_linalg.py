@@ -93,6 +93,18 @@ def test_smallest_eigenvector_of_repeated_eigenvalues_is_one_of_theirs(dtype, di
     assert torch.allclose(matrix @ vector, values[0] * vector, atol=1e-3)
 
 
+@pytest.mark.parametrize("gap", [1e-2, 3e-3, 1e-4, 1e-6])
+def test_normal_beside_a_near_double_root_is_right(rng, gap):
+    turn = torch.linalg.qr(torch.randn(4000, 3, 3, generator=rng, dtype=torch.float64))[0]
+    values = 0.5 + 0.5 * torch.rand(4000, 1, generator=rng, dtype=torch.float64)
+    values = values * torch.tensor([1.0, 1 + gap, 1.1], dtype=torch.float64)
+    values[::2, 2] *= 20
+    found, vectors = smallest_eigenvector3((turn * values[:, None]) @ turn.mT)
+    off = torch.linalg.cross(vectors, turn[..., 0]).norm(dim=1)
+    assert off.max() < 3e-14 / gap**2  # rounding, as of any root beside another
+    assert (found[:, 1] / found[:, 0] - 1 - gap).abs().max() < 1e-6
+
+
 def test_a_matrix_that_is_not_finite_spoils_itself_alone():
     matrices = torch.diag(torch.tensor([3.0, 1.0, 2.0])).repeat(2, 1, 1)
     matrices[1, 0, 2] = torch.nan

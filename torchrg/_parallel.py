@@ -23,7 +23,6 @@ from torch import Tensor
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Other = TypeVar("Other")
 
 CACHE_BYTES = 2**22
 """Bytes of one array that a thread works on at a time, so that it stays in the cache."""
@@ -140,14 +139,6 @@ def map_tasks(
             initargs=(torch.is_grad_enabled(), copy_context()),
         ) as pool:
             return list(pool.map(work, tasks))
-
-
-def run_beside(
-    first: Callable[[], Result], second: Callable[[], Other], device: torch.device
-) -> tuple[Result, Other]:
-    """Return the results of two calls, run side by side if there are threads."""
-    results: list[Any] = map_tasks(lambda call: call(), [first, second], device)
-    return results[0], results[1]
 
 
 @contextmanager

@@ -198,9 +198,6 @@ class PipelineConfig:
     changes a result."""
     planes: PlanesConfig = field(default_factory=PlanesConfig)
     """What the table of planes says."""
-    compile: bool = False
-    """Whether a C++ compiler makes kernels of the stages, once for all runs on this machine. They
-    are faster, and equal to rounding. Without a compiler all runs as without this."""
 
     def __post_init__(self) -> None:
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)

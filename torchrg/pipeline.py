@@ -1,8 +1,6 @@
 """From points to planes, and to superpoints: each in one function."""
 
-import dataclasses
 from collections.abc import Callable
-from contextlib import nullcontext
 from functools import partial
 from typing import NamedTuple
 
@@ -19,7 +17,6 @@ from torchrg._checks import (
     check_shapes,
     of_clouds,
 )
-from torchrg._compile import compiled, prepare
 from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ShapeError
@@ -54,10 +51,6 @@ ask for, they were 0.99 to 1.5 times as many as its own in three depth frames wi
 and 1.5 to 2.5 times in exact ones, where there are 6 to 19."""
 
 
-REHEARSED_POINTS, REHEARSED_NOISE = 4000, 0.003
-"""Points of a room, and metres, that all kernels are needed for."""
-
-
 @of_clouds
 @sequential_operations()
 def segment_planes(
@@ -67,7 +60,6 @@ def segment_planes(
     voxel: float | None = None,
     keep_neighbors: bool = False,
     on_stage: Callable[[str], None] | None = None,
-    compile: bool | None = None,  # noqa: A002 - torch's word
 ) -> Segmentation:
     """Segment a cloud into planes: neighbours, normals, regions, plane table.
 
@@ -90,8 +82,6 @@ def segment_planes(
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
-        compile: Whether to run kernels compiled; see :func:`prepare_kernels`. Default: what
-            ``config`` says.
 
     Returns:
         Labels, normals, curvature and masks in the order of the points, and the table of planes. A
@@ -120,9 +110,6 @@ def segment_planes(
     warn_of_steps("segment_planes", points)
     if not isinstance(config, PipelineConfig):
         config = settings_of("segment_planes", PipelineConfig, config)
-    if compile is not None:
-        config = dataclasses.replace(config, compile=compile)
-    config = prepare_kernels(config, points.dtype)
 
     def begin(stage: str) -> None:
         if scratch.is_active():
@@ -130,39 +117,8 @@ def segment_planes(
         if on_stage is not None:
             on_stage(stage)
 
-    with compiled() if config.compile else nullcontext():
-        seg = _segment(points, config, voxel, begin)
+    seg = _segment(points, config, voxel, begin)
     return seg if keep_neighbors else seg._replace(neighbors=None)
-
-
-def prepare_kernels(
-    config: PipelineConfig,
-    dtype: torch.dtype = torch.float32,
-    announce: Callable[[str], None] = lambda text: None,
-) -> PipelineConfig:
-    """Compile the kernels that clouds of a dtype need, if the settings ask for it.
-
-    That takes three minutes on two cores, and half a gigabyte of memory for each of up to four
-    compilers, the first time on a machine. They are kept in the folder ``$TORCHRG_CACHE_DIR``, by
-    default ``~/.cache/torchrg``, which machines of one kind may share, but no users: a folder that
-    others own or can write to is not used. Results differ from those without them by rounding, and
-    are as independent of order, chunks and threads. ``announce`` is called with a line of text
-    where there is something to compile.
-
-    Returns:
-        The settings, with ``compile`` False after a warning if there is no compiler.
-    """
-    if not config.compile:
-        return config
-    settings = dataclasses.replace(config, compile=False, chunk_size=PipelineConfig.chunk_size)
-
-    def rehearse() -> None:
-        from torchrg.scenes import make_room
-
-        segment_planes(make_room(REHEARSED_POINTS, REHEARSED_NOISE).points.to(dtype), settings)
-
-    is_ready = prepare(repr((settings, dtype)), rehearse, announce)
-    return config if is_ready else dataclasses.replace(config, compile=False)
 
 
 class _CanonicalCloud(NamedTuple):

@@ -54,8 +54,6 @@ class Case(Benchmark):
     """Folder of the programs pclrg and cgaln."""
     scans: tuple[Path, ...] = ()
     """Scans to run on too."""
-    compile: bool = False
-    """Whether torchrg's presets run compiled; what is compiled first is not timed."""
     sizes: tuple[int, ...] = (100_000, 1_000_000, 4_000_000)
     """Points of made rooms, in random order and in that of a space-filling curve."""
 
@@ -66,17 +64,13 @@ class Case(Benchmark):
 
     def contenders(self) -> Mapping[str, Callable[[Path], Figures]]:
         runs: dict[str, Callable[[Path], Figures]] = {
-            f"torchrg-{preset}": partial(_run_warm, f"preset {preset}", self.compile)
-            for preset in PRESETS
+            f"torchrg-{preset}": partial(_run_warm, f"preset {preset}") for preset in PRESETS
         }
-        runs["torchrg-pca"] = partial(_run_warm, "normals", False)
+        runs["torchrg-pca"] = partial(_run_warm, "normals")
         if find_spec("open3d"):
-            runs["open3d-pca"] = partial(_run_warm, "open3d normals", False)
-            runs["open3d-planes"] = partial(_run_warm, "open3d planes", False)
-        runs |= {
-            f"torchrg-{preset}-command": partial(_run_command, preset, self.compile)
-            for preset in PRESETS
-        }
+            runs["open3d-pca"] = partial(_run_warm, "open3d normals")
+            runs["open3d-planes"] = partial(_run_warm, "open3d planes")
+        runs |= {f"torchrg-{preset}-command": partial(_run_command, preset) for preset in PRESETS}
         for name in ("pclrg", "cgaln"):
             if self.programs is not None and (self.programs / name).exists():
                 runs[name] = partial(_run_peer, self.programs / name)
@@ -145,16 +139,16 @@ def _figures(seconds: dict[str, float], whole: float, peak_bytes: int) -> Figure
     }
 
 
-def _run_warm(work: str, compiled: bool, folder: Path) -> Figures:
+def _run_warm(work: str, folder: Path) -> Figures:
     """Run a call of a Python library, warm, in a process of its own."""
-    command = serve_command("benchmarks.peers:prepare", work, str(folder / "cloud.npy"), compiled)
+    command = serve_command("benchmarks.peers:prepare", work, str(folder / "cloud.npy"))
     text, whole, peak = run_program(command, stdin="\n")
     return _figures(json.loads(text.splitlines()[-1])["stages"], whole, peak)
 
 
-def _run_command(preset: str, compiled: bool, folder: Path) -> Figures:
+def _run_command(preset: str, folder: Path) -> Figures:
     """Run ``torchrg segment``."""
-    files = [folder / "cloud.npy", "--out", folder / f"{preset}.npz", *["--compile"] * compiled]
+    files = [folder / "cloud.npy", "--out", folder / f"{preset}.npz"]
     _, whole, peak = run_program(
         [sys.executable, "-m", "torchrg", "segment", *files, "--preset", preset]
     )
@@ -174,7 +168,7 @@ def _run_peer(program: Path, folder: Path) -> Figures:
     return _figures(seconds, whole, peak)
 
 
-def prepare(work: str, file: str, compiled: bool = False) -> Callable[[], Figures]:
+def prepare(work: str, file: str) -> Callable[[], Figures]:
     """Return what times a library on a file of points, run once already on few of them."""
     import numpy as np
 
@@ -209,7 +203,7 @@ def prepare(work: str, file: str, compiled: bool = False) -> Callable[[], Figure
         def run(points: np.ndarray) -> None:
             if kind == "preset":
                 cloud = torch.from_numpy(points)
-                torchrg.segment_planes(cloud, config, on_stage=note, compile=compiled)
+                torchrg.segment_planes(cloud, config, on_stage=note)
             else:
                 note("normals")
                 torchrg.estimate_normals(torch.from_numpy(points), method="pca", k=K)

@@ -38,15 +38,11 @@ class Case(Benchmark):
     """Presets, and kinds of depth frames."""
     sizes: tuple[int, ...] = (200_000,)
     """Points of the room."""
-    compile: bool = False
-    """Whether all runs compiled."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         keys = [(name, size) for name in self.work for size in (self.sizes, (0,))[name in FRAMES]]
         return {
-            f"{name}, {size:,} points" if size else name: partial(
-                Workers, name, size, self.threads, self.compile
-            )
+            f"{name}, {size:,} points" if size else name: partial(Workers, name, size, self.threads)
             for name, size in keys
         }
 
@@ -79,16 +75,16 @@ CONDITIONS = ("twice", "beside one", "beside two", "one thread")
 class Workers(contextlib.ExitStack):
     """Processes that do the same work, each started when it is first asked for."""
 
-    def __init__(self, name: str, size: int, threads: int, compiled: bool) -> None:
+    def __init__(self, name: str, size: int, threads: int) -> None:
         super().__init__()
-        self.name, self.size, self.threads, self.compiled = name, size, threads, compiled
+        self.name, self.size, self.threads = name, size, threads
         self._found: dict[tuple[int, int], Worker] = {}
 
     def get(self, number: int = 0, threads: int | None = None) -> Worker:
         """Return one of several with so many threads."""
         key = (number, threads or self.threads)
         if key not in self._found:
-            work = "benchmarks.steady:prepare", self.name, self.size, self.compiled
+            work = "benchmarks.steady:prepare", self.name, self.size
             worker = Worker(*work, threads=key[1])
             self._found[key] = self.enter_context(worker)
         return self._found[key]
@@ -119,17 +115,17 @@ def _busy(number: int) -> Iterator[None]:
             other.wait()
 
 
-def prepare(name: str, size: int, compiled: bool = False) -> Callable[[], None]:
+def prepare(name: str, size: int) -> Callable[[], None]:
     """Return the work of a process, done once already on little."""
     if name in FRAMES:
         height, sensor = FRAMES[name]
         model = torchrg.scenes.build_room(SEED)
         camera = cameras_around(model, 1, width=height * 4 // 3, height=height)[0]
         depth = render_depth(model, camera, sensor=sensor).depth
-        segment = partial(torchrg.depth.segment_depth, depth, camera.intrinsics, compile=compiled)
+        segment = partial(torchrg.depth.segment_depth, depth, camera.intrinsics)
         segment()
         return lambda: segment() and None
     config = torchrg.load_config(name)
     points: torch.Tensor = torchrg.scenes.make_room(size, noise=NOISE, seed=SEED).points
-    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config, compile=compiled)
-    return lambda: torchrg.segment_planes(points, config, compile=compiled) and None
+    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config)
+    return lambda: torchrg.segment_planes(points, config) and None

@@ -24,7 +24,7 @@ def test_the_record_tells_what_was_made_from_what(faults, tmp_path):
     assert record["inputs"][0]["name"] == "12_a.txt"
     assert set(record["outputs"]) == {"result.txt"}
     assert record["warnings"] == ["was plain"]
-    assert set(record["versions"]) == {"numpy", "scipy", "torch", "torchrg"}
+    assert set(record["versions"]) == {"kernels", "numpy", "scipy", "torch", "torchrg"}
     text = json.dumps(record)
     assert not any(word in text for word in ("seconds", "host", str(tmp_path)))
 

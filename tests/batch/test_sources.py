@@ -33,8 +33,6 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
         "intrinsics": camera,
         "depth_scale": 9.0,
     }
-    compiled = RGBDSource(tmp_path, settings, "images", camera, 9.0, compile=True)
-    assert compiled.describe()["compile"] is True
     turned = RGBDSource(tmp_path, settings, "images", camera, 9.0, orient="up")
     assert turned.describe()["orient"] == "up"
     options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}

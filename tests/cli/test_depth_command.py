@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg import _compile
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.io import read_cloud, write_cloud
@@ -64,20 +63,6 @@ def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth, run):
         provenance = json.loads(str(result["provenance"]))
     assert provenance["intrinsics"] == "50,50,39.5,29.5"
     assert provenance["config"]["depth"]["min_size"] == 100
-
-
-def test_without_a_place_for_kernels_a_line_says_so_and_all_runs_as_written(
-    tmp_path, frame, monkeypatch, run
-):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("TORCHRG_CACHE_DIR", str(tmp_path / "file" / "below"))
-    monkeypatch.setattr(_compile, "_prepared", {})
-    out = tmp_path / "planes.npz"
-    done = run("depth", frame, *CAMERA, "--compile", "--out", out)
-    assert "kernels are not compiled" in done.err
-    assert done.err.count("\n") == 1
-    with np.load(out) as result:
-        assert json.loads(str(result["provenance"]))["compile"] is False
 
 
 @pytest.mark.parametrize("focal", [50.0, 500.0])

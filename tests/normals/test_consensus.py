@@ -10,6 +10,7 @@ from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import canonical_order, search_knn
+from torchrg.normals import estimate_normals
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.jet import fit_normals_jet
 from torchrg.normals.pca import fit_normals_pca, fit_points
@@ -122,7 +123,7 @@ def test_degenerate_clouds_have_documented_answers():
 
 def test_few_neighbors_give_pca():
     points, _ = shape("cube", 300)
-    fit, pca = consensus(points, k=8), fit_all(points, fit_normals_pca, k=8)
+    fit, pca = consensus(points, k=8), estimate_normals(points, method="pca", k=8)
     assert torch.equal(fit.normals, pca.normals)
     assert not fit.sharp.any()
 

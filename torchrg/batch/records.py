@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 import torch
 
-from torchrg import version
+from torchrg import kernels, version
 from torchrg.batch.task import TaskReport
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
@@ -53,6 +53,7 @@ def describe_versions() -> dict[str, str]:
         "torch": str(torch.__version__),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
+        "kernels": "none" if kernels.name_of_library() is None else "C++",
     }
 
 

@@ -337,7 +337,6 @@ class RGBDSource(Source):
         layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
         intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
         depth_scale: Stored value of one metre. Default: the layout's.
-        compile: Whether to run kernels compiled.
         orient: To which side normals point: to the camera, unless it says ``"interior"`` or
             ``"up"``.
     """
@@ -346,7 +345,6 @@ class RGBDSource(Source):
     layout: str
     intrinsics: tuple[float, float, float, float] | None = None
     depth_scale: float | None = None
-    compile: bool = False
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
@@ -357,7 +355,6 @@ class RGBDSource(Source):
             "layout": self.layout,
             "intrinsics": self.intrinsics,
             "depth_scale": self.depth_scale,
-            **({"compile": True} if self.compile else {}),
             **({"orient": self.orient} if self.orient in TURNING else {}),
         }
 
@@ -380,9 +377,7 @@ class RGBDSource(Source):
         if not bool((depth > 0).any()):
             raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
         begin("planes")
-        seg = segment_depth(
-            depth, frame.intrinsics, self.settings, pose=frame.pose, compile=self.compile
-        )
+        seg = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
         points = points_of_image(depth, frame.intrinsics, frame.pose)
         seg = orient_image(seg, points, self.orient)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()

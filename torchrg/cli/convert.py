@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 from tqdm import tqdm
 
@@ -88,10 +88,6 @@ class Arguments:
         """Return the data set, both paths absolute."""
         raise NotImplementedError
 
-    def with_kernels(self) -> Self:
-        """Compile the kernels that are needed, if they are asked for."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True)
 class CloudArguments(Arguments):
@@ -123,12 +119,6 @@ class CloudArguments(Arguments):
         """What is written of each cloud, as sources take it."""
         names = ("superpoint", "layout", "partition", "level", "orient")
         return {name: getattr(self, name) for name in names}
-
-    def with_kernels(self) -> Self:
-        """Compile the kernels of clouds if the settings ask for them."""
-        resolved = flags.with_kernels(self.settings.resolved)
-        settings = dataclasses.replace(self.settings, resolved=resolved)
-        return dataclasses.replace(self, settings=settings)
 
 
 @dataclass(frozen=True)
@@ -221,19 +211,14 @@ class RGBDArguments(Arguments):
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
     orient: flags.ImageOrientFlag = "auto"
-    compile: flags.CompileFlag = False
     unit: ClassVar[str] = "frame"
     seconds_per_million: ClassVar[tuple[float, str]] = (3.0, "pixels")
     """As that of clouds, by the 0.9 s of a frame of 640 x 480 pixels in README.md."""
 
-    def with_kernels(self) -> Self:
-        """Compile the kernels of depth images if they are asked for."""
-        return dataclasses.replace(self, compile=flags.with_depth_kernels(self.compile))
-
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
-        options = (self.layout, camera, self.depth_scale, self.compile, self.orient)
+        options = (self.layout, camera, self.depth_scale, self.orient)
         return RGBDSource(root, self.depth, *options)
 
 
@@ -272,7 +257,6 @@ def run(argv: list[str]) -> int:
         start["settings"] = flags.PlaneSettings.asked_for(rest, chosen.usual_preset)
     arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
-    arguments = arguments if arguments.dry_run else arguments.with_kernels()
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with warnings_as_lines():
         source = arguments.source(root, out)

@@ -1,7 +1,7 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -67,7 +67,6 @@ class Arguments:
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
     orient: flags.ImageOrientFlag = "auto"
-    compile: flags.CompileFlag = False
     threads: flags.ThreadsFlag = None
 
 
@@ -88,7 +87,6 @@ def run(argv: list[str]) -> int:
     check_apart([*targets, *drawn], inputs)
     for picture in drawn:
         check_place(picture)
-    arguments = replace(arguments, compile=flags.with_depth_kernels(arguments.compile))
     return run_each(_label, arguments, list(map(str, inputs)), inputs, targets, pictures)
 
 
@@ -117,7 +115,7 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
     # Results are about the cloud's origin.
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.from_numpy(cloud.origin)
-    seg = segment_depth(depth, camera, arguments.depth, pose=pose, compile=arguments.compile)
+    seg = segment_depth(depth, camera, arguments.depth, pose=pose)
     points = cloud.points.view(*depth.shape, 3)
     seg = orient_image(seg, points, arguments.orient)
     num_planes = len(seg.planes.count)
@@ -168,7 +166,6 @@ def _write_cloud(
         "config": {"depth": asdict(arguments.depth)},
         "intrinsics": camera and ",".join(f"{value:.15g}" for value in camera),
         "depth_scale": arguments.depth_scale,
-        "compile": arguments.compile,
         "orient": arguments.orient,
     }
     images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}

@@ -12,13 +12,10 @@ from typing import Annotated, Literal
 import torch
 
 from torchrg.cli.arguments import Argument
-from torchrg.cli.ending import say, warnings_as_lines
 from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
-from torchrg.depth.segment import prepare_depth_kernels
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
-from torchrg.pipeline import prepare_kernels
 
 _MOST_THREADS = 1024
 """More than any machine has cores; many more cannot be started, and torch ends with the process."""
@@ -49,13 +46,6 @@ ColumnsFlag = Annotated[
 ThreadsFlag = Annotated[
     int | None,
     Argument(text="Number of threads. Default: as torch decides, usually one for each core."),
-]
-CompileFlag = Annotated[
-    bool,
-    Argument(
-        text="Whether a C++ compiler makes kernels, once for all runs on this machine. They are "
-        "faster, and equal to rounding."
-    ),
 ]
 _Side = Literal["auto", "interior", "viewpoint", "up", "none"]
 OrientFlag = Annotated[
@@ -121,18 +111,6 @@ class PlaneSettings:
 
 SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]
 """Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
-
-
-def with_kernels(settings: PipelineConfig) -> PipelineConfig:
-    """Compile the kernels that settings ask for, or return settings without; a line says so."""
-    with warnings_as_lines():
-        return prepare_kernels(settings, announce=say)
-
-
-def with_depth_kernels(is_wanted: bool) -> bool:
-    """Compile the kernels of depth images if that is wanted, and tell whether it was done."""
-    with warnings_as_lines():
-        return is_wanted and prepare_depth_kernels(say)
 
 
 def split_columns(columns: str | None) -> tuple[str, ...] | None:

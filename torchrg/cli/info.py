@@ -6,6 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
+from torchrg import kernels
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say
 from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
@@ -20,7 +21,7 @@ millimetres at a thousand kilometres."""
 
 @dataclass(frozen=True)
 class Arguments:
-    """Say what a file holds: points, extent, spacing, duplicates, fields.
+    """Say what a file holds: points, extent, spacing, duplicates, fields; and what kernels run.
 
     Examples:
         torchrg info scan.ply
@@ -41,6 +42,7 @@ def run(argv: list[str]) -> int:
         say(f"{name:<12}{value}")
     for note in filter(None, (*cloud.notes, cloud.precision_note)):
         say(f"{'note':<12}{note}")
+    say(f"{'kernels':<12}{kernels.name_of_library() or 'none: torchrg runs without, slower'}")
     return 0
 
 

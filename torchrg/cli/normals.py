@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchrg._compile import compiled
 from torchrg.batch.records import describe_run
 from torchrg.batch.scans import check_finite
 from torchrg.cli import flags
@@ -56,7 +55,6 @@ class Arguments:
     chunk_size: int = PipelineConfig.chunk_size
     """Number of points that are handled at a time. It bounds the memory and never changes a
     result."""
-    compile: flags.CompileFlag = False
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
 
@@ -74,8 +72,6 @@ def run(argv: list[str]) -> int:
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
     check_apart(outputs, arguments.inputs)
-    wanted = PipelineConfig(arguments.normals, compile=arguments.compile)
-    arguments = replace(arguments, compile=flags.with_kernels(wanted).compile)
     return run_each(
         _estimate_file, arguments, list(map(str, arguments.inputs)), arguments.inputs, outputs
     )
@@ -94,15 +90,14 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")
-        with compiled(arguments.compile):
-            fit = estimate_normals(
-                cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size
-            )
+        fit = estimate_normals(
+            cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size
+        )
         advance("orientation")
         scanner = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
         turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=scanner)
     provenance = describe_run(source, arguments.normals)
-    names = ("orient", "viewpoint", "compile", *["columns"] * (arguments.columns is not None))
+    names = ("orient", "viewpoint", *["columns"] * (arguments.columns is not None))
     provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     results = zip(RESULTS, (turned, fit.curvature, sharp, fit.valid), strict=True)

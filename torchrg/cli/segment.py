@@ -137,9 +137,6 @@ def run(argv: list[str]) -> int:
     pictures = picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    resolved = flags.with_kernels(arguments.settings.resolved)
-    settings = dataclasses.replace(arguments.settings, resolved=resolved)
-    arguments = dataclasses.replace(arguments, settings=settings)
     names = [_name_of(cloud) for cloud in clouds]
     with _sharing(arguments, outputs):
         code = run_each(_segment, arguments, names, clouds, outputs, pictures)

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
 from torchrg._parallel import map_rows, map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import hidden_contacts, join_strips
@@ -143,7 +142,6 @@ def _joins(
     return joins
 
 
-@kernel("n", "n", "P", "P", "P", "P", "P 3", "2 P", "2 P", "W", "H", "3")
 def _are_on_one_surface(
     here: Tensor,
     there: Tensor,
@@ -383,7 +381,6 @@ def move_to_creases(
     return labels
 
 
-@kernel("n", "n 8", "n", "n 8", "P", "P", "P", "M 3", "M 2", "M")
 def _regions_across(
     rows: Tensor,
     around: Tensor,

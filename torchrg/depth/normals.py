@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
 from torchrg._parallel import map_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
@@ -308,7 +307,6 @@ def _tables(planes: WindowPlanes, reach: Tensor) -> list[Tensor]:
     return [part.flatten() for part in parts]
 
 
-@kernel("n", "C", "T", "T", "T", "T", "P", "W", "H", "2")
 def _chosen_windows(
     pixels: Tensor,
     places: Tensor,
@@ -401,7 +399,6 @@ def _tolerances(
     return _Tolerances(*(part.view(planes.mean.shape) for part in limits))
 
 
-@kernel("n", "n", "n", "n", "4", "4")
 def _tolerances_of_planes(
     u_slope: Tensor, v_slope: Tensor, origin: Tensor, mean: Tensor, noise: Tensor, view: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:

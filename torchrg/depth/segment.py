@@ -1,15 +1,12 @@
 """From one depth image to planes."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._compile import compiled, kernel, prepare
 from torchrg._parallel import map_rows, sequential_operations
 from torchrg.config import DepthConfig
-from torchrg.depth.camera import has_depth, make_intrinsics, points_of_image, read_intrinsics
+from torchrg.depth.camera import has_depth, points_of_image, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import PixelPlanes, fit_pixels
 from torchrg.regions import summarize_planes
@@ -25,7 +22,6 @@ def segment_depth(
     config: DepthConfig | None = None,
     *,
     pose: Tensor | None = None,
-    compile: bool = False,  # noqa: A002 - torch's word
 ) -> Segmentation:
     """Segment a depth image into planes.
 
@@ -45,7 +41,6 @@ def segment_depth(
         config: Settings. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
             the world. Default: they are in camera coordinates.
-        compile: Whether to run kernels compiled; see :func:`prepare_depth_kernels`.
 
     Returns:
         A segmentation whose fields are images, of ``(H, W)`` or ``(H, W, 3)``. Sharp are the pixels
@@ -73,24 +68,7 @@ def segment_depth(
         pose=(pose, "4 4"),
     )
     check_floating("segment_depth", depth=depth)
-    with compiled(compile and prepare_depth_kernels()):
-        return _segment(depth, intrinsics, config or DepthConfig(), pose)
-
-
-def prepare_depth_kernels(announce: Callable[[str], None] = lambda text: None) -> bool:
-    """Compile the kernels of :func:`segment_depth`, and tell whether that can be done.
-
-    That takes a minute on two cores the first time on a machine; see
-    :func:`torchrg.pipeline.prepare_kernels`. A warning says why there is no compiler.
-    """
-
-    def rehearse() -> None:
-        u, v = torch.linspace(-1, 1, 96), torch.linspace(-0.7, 0.7, 72)[:, None]
-        corner_of_a_room = torch.maximum(0.4 + 0.3 * u.abs(), 0.3 + 0.6 * v)
-        ripples = 0.001 * torch.sin(1000 * u) * torch.cos(700 * v)
-        segment_depth(1 / (corner_of_a_room + ripples), make_intrinsics(48, 48, 48, 36))
-
-    return prepare("depth", rehearse, announce)
+    return _segment(depth, intrinsics, config or DepthConfig(), pose)
 
 
 def _segment(
@@ -156,7 +134,6 @@ def _normals_and_curvature(
     return torch.stack(normals, dim=1).view(*shape, 3), curvature.view(shape)
 
 
-@kernel(*["n"] * 10, "2")
 def _shape_of_planes(
     u_slope: Tensor,
     v_slope: Tensor,

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
 from torchrg._parallel import map_rows, map_tasks
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
@@ -141,7 +140,6 @@ def _fit_planes(sums: Sequence[Tensor], sides: tuple[int, int]) -> WindowPlanes:
     return WindowPlanes(*(part.view(sums[0].shape) for part in columns))
 
 
-@kernel(*["n"] * 10, "2")
 def _planes_of_sums(
     count: Tensor,
     u: Tensor,

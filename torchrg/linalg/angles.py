@@ -102,8 +102,6 @@ def above(values: Tensor, bounds: Tensor | float) -> Tensor:
         >>> above(torch.tensor([1.0, 2.0, 3.0]), 2.0)
         tensor([0., 0., 1.])
     """
-    if torch.compiler.is_compiling():
-        return (values > bounds).to(values.dtype)
     return torch.gt(values.detach(), bounds, out=torch.empty_like(values, requires_grad=False))
 
 
@@ -114,8 +112,6 @@ def at_most(values: Tensor, bounds: Tensor | float) -> Tensor:
         >>> at_most(torch.tensor([1.0, 2.0, 3.0]), 2.0)
         tensor([1., 1., 0.])
     """
-    if torch.compiler.is_compiling():
-        return (values <= bounds).to(values.dtype)
     return torch.le(values.detach(), bounds, out=torch.empty_like(values, requires_grad=False))
 
 

@@ -15,8 +15,9 @@ _JACOBI_SWEEPS = 5
 """Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
 dtype."""
 
-_FIRST_STEPS, _MORE_STEPS = 4, 6
-"""Steps of Newton's method for a simple root, and further steps for one that is nearly double."""
+_FIRST_STEPS, _MORE_STEPS = 4, 36
+"""Steps of Newton's method for a simple root, and the most for one that is nearly double, where
+each step halves the distance until the two are apart."""
 
 _CONVERGED = 1e-9
 """A root has converged if the last step moves it by less than this share of the trace."""
@@ -146,22 +147,9 @@ def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
             _rotate(a, v, p, q, r)
     values = torch.stack([a[i][i] for i in range(3)], dim=-1)
     vectors = torch.stack([torch.stack(row, dim=-1) for row in v], dim=-2)
-    values, order = _sort3(values) if torch.compiler.is_compiling() else values.sort(dim=-1)
+    values, order = values.sort(dim=-1)
     vectors = vectors.gather(-1, order[..., None, :].expand_as(vectors))
     return values * safe.squeeze(-1), vectors
-
-
-def _sort3(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Sort values ``(*, 3)`` by comparisons and say whence they are, as ``sort`` does."""
-    a, b, c = values.unbind(dim=-1)
-    i, j, k = (torch.full_like(a, place, dtype=torch.int64) for place in range(3))
-    swap = a > b
-    a, b, i, j = (torch.where(swap, *pair) for pair in ((b, a), (a, b), (j, i), (i, j)))
-    swap = b > c
-    b, c, j, k = (torch.where(swap, *pair) for pair in ((c, b), (b, c), (k, j), (j, k)))
-    swap = a > b
-    a, b, i, j = (torch.where(swap, *pair) for pair in ((b, a), (a, b), (j, i), (i, j)))
-    return torch.stack([a, b, c], dim=-1), torch.stack([i, j, k], dim=-1)
 
 
 def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -213,11 +201,13 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
     # Convergence is quadratic but near a double root: few need the other steps.
     moving = step.abs() > _CONVERGED * coefficients[0]
-    if torch.compiler.is_compiling():
-        root = torch.where(moving, _newton(root, coefficients, _MORE_STEPS)[0], root)
-    elif len(rows := moving.nonzero().squeeze(1)):
-        root[rows] = _newton(root[rows], coefficients[:, rows], _MORE_STEPS)[0]
-    return torch.where(root.isfinite(), root, 0.0).view_as(trace)
+    rows = moving.nonzero().squeeze(1)
+    for _ in range(_MORE_STEPS):
+        if len(rows) == 0:
+            break
+        root[rows], step = _newton(root[rows], coefficients[:, rows], 1)
+        rows = rows[step.abs() > _CONVERGED * coefficients[0, rows]]
+    return root.view_as(trace)
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
@@ -227,7 +217,8 @@ def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor,
     for _ in range(num_steps):
         value = (root - trace).mul_(root).add_(minors).mul_(root).sub_(determinant)
         slope = (3 * root).sub_(twice).mul_(root).add_(minors)
-        step = value.div_(slope)
+        # At a multiple root both may be nothing.
+        step = value.div_(slope).nan_to_num_(0.0, 0.0, 0.0)
         root = root - step
     return root, step
 
@@ -251,10 +242,7 @@ def _kernel(
     length = (u * u + v * v + w * w).sqrt()
     u, v, w = u / length, v / length, w / length
     rank_one = best < _NEARLY_EQUAL
-    if torch.compiler.is_compiling():
-        across = _across((x, xy, xz), (xy, y, yz), (xz, yz, z))
-        u, v, w = (torch.where(rank_one, a, b) for a, b in zip(across, (u, v, w), strict=True))
-    elif bool(rank_one.any()):
+    if bool(rank_one.any()):
         x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *beside))
         u[rank_one], v[rank_one], w[rank_one] = _across((x, xy, xz), (xy, y, yz), (xz, yz, z))
     return u, v, w

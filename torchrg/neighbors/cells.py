@@ -65,13 +65,13 @@ def search_cells(
     """
     left = rows
     if _MIN_CANDIDATES * (k + _SPARE) <= _MAX_CANDIDATES:
-        for size in _cell_sizes(reach):
+        for size in cell_sizes(reach):
             if len(left) >= MIN_FOR_CELLS:
                 left = _search_level(points, k, size, left, store)
     return left
 
 
-def _cell_sizes(reach: NDArray[np.float64]) -> list[float]:
+def cell_sizes(reach: NDArray[np.float64]) -> list[float]:
     """Return ascending sizes of cells that together answer for nearly all of a sample."""
     sizes: list[float] = []
     reach = np.sort(reach[reach > 0])

@@ -9,12 +9,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import scratch
+from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._parallel import ROWS_AT_ONCE, allowed_threads, chunks_of, sequential_operations
+from torchrg._parallel import (
+    ROWS_AT_ONCE,
+    ROWS_IN_CACHE,
+    allowed_threads,
+    chunks_of,
+    sequential_operations,
+)
 from torchrg.errors import ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
+from torchrg.neighbors.grid import search_grid
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
@@ -198,7 +205,18 @@ def _search_cloud(
     left = np.arange(first, last + 1)
     if len(places) >= MIN_FOR_CELLS:
         sample = places[left[:: -(-len(left) // _SAMPLE_SIZE)]]
-        left = search_cells(places, k, left, tree.query(sample, [k])[0][:, 0], store)
+        reach = tree.query(sample, [k])[0][:, 0]
+        if outside is not None or not kernels.serve(k=k):
+            left = search_cells(places, k, left, reach, store)
+        elif len(places) == len(points):
+            left = search_grid(places, left, reach, indices, order, first_row)
+        else:
+            near, wanted = np.empty((len(places), k), dtype=np.int32), left
+            left = search_grid(places, wanted, reach, near)
+            answered = np.setdiff1d(wanted, left, assume_unique=True)
+            for chunk in chunks_of(len(answered), ROWS_IN_CACHE):
+                some = answered[chunk]
+                store(some, np.broadcast_to(0.0, (len(some), k)), near[some])
     for chunk in chunks_of(len(left), ROWS_AT_ONCE):
         store(left[chunk], *_query(tree, places[left[chunk]], width))
 

@@ -119,12 +119,3 @@ def spread_bits(values: Tensor) -> Tensor:
     for shift, pattern in _SPREADS:
         values = (values | values << shift) & pattern
     return values
-
-
-def gather_bits(codes: Tensor) -> Tensor:
-    """Return every third bit of codes, the inverse of :func:`spread_bits`."""
-    codes = codes & _SPREADS[-1][1]
-    patterns = [pattern for _, pattern in _SPREADS[-2::-1]] + [2**MORTON_BITS - 1]
-    for (shift, _), pattern in zip(reversed(_SPREADS), patterns, strict=True):
-        codes = (codes | codes >> shift) & pattern
-    return codes

@@ -35,7 +35,7 @@ from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
-from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca
+from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
 from torchrg.normals.sides import orient_cloud
 from torchrg.precision import warn_of_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
@@ -59,7 +59,9 @@ _MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
 _DETMCD = _MCD | {"scaling": "mcd_scaling", "inliers": "mcd_inliers"}
 
 ESTIMATORS: dict[str, Estimator] = {
-    "pca": at_all_points(fit_normals_pca),
+    "pca": lambda points, neighbors, _, chunk_size: fit_points_pca(
+        points, neighbors, chunk_size=chunk_size
+    ),
     "jet": at_all_points(fit_normals_jet),
     "irls": estimate_irls,
     "fastmcd": at_all_points(partial(fit_normals_robust, estimator=fit_fastmcd), **_MCD),

@@ -22,7 +22,7 @@ from torchrg.structures import NormalFit
 _NUM_TERMS = 6
 """Terms of a quadratic function of two coordinates, which fewer points do not determine."""
 
-_FLAT_PIVOT = 1e-5
+FLAT_PIVOT = 1e-5
 """Share of its squared length that a term of a paraboloid must keep beside the terms before it.
 Normal equations in float32 then give a share of the length, which is the root of this, three parts
 in a thousand, to within one percent."""
@@ -301,7 +301,7 @@ def _solve(matrix: dict[tuple[int, int], Tensor], right: list[Tensor]) -> list[T
             scaled = lower[j, k] * inverse[k]
             for i in range(j, size):
                 column[i] = column[i] - lower[i, k] * scaled
-        usable = column[j] > _FLAT_PIVOT * matrix[j, j]
+        usable = column[j] > FLAT_PIVOT * matrix[j, j]
         inverse.append(torch.where(usable, 1 / torch.where(usable, column[j], 1.0), 0.0))
         lower.update({(i, j): column[i] for i in range(j, size)})
     forward: list[Tensor] = []

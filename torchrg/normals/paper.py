@@ -11,7 +11,13 @@ from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
-from torchrg.normals.pca import check_patches, fit_normals_pca, fit_points, replace_rows
+from torchrg.normals.pca import (
+    check_patches,
+    fit_normals_pca,
+    fit_points,
+    fit_points_pca,
+    replace_rows,
+)
 from torchrg.robust import RobustFit, fit_detmcd
 from torchrg.robust.scale import QN_FACTOR, qn_exceeds
 from torchrg.structures import Neighbors, NormalFit
@@ -141,7 +147,7 @@ def estimate_paper(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
     """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at those."""
-    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
     sharp = find_sharp_points(
         fit.normals,
         neighbors,

@@ -9,11 +9,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes, has_values
-from torchrg._compile import kernel
-from torchrg._parallel import CHUNK_SIZE, map_chunks
+from torchrg._parallel import CHUNK_SIZE, map_chunks, places_of
 from torchrg.config import NormalsConfig
-from torchrg.linalg import coordinate_resolution, covariance, eigh3, rank_tolerance
+from torchrg.linalg import (
+    coordinate_resolution,
+    covariance,
+    eigh3,
+    rank_tolerance,
+)
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
 from torchrg.linalg.moments import covariance_of_columns
 from torchrg.neighbors import gather_patches
@@ -75,8 +80,9 @@ def fit_plane(
     patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> tuple[NormalFit, PrincipalFrame]:
     """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
-    *parts, total = _frames(*patches.unbind(dim=-1), mask)
-    frame = PrincipalFrame(*parts)
+    _, matrix = covariance_of_columns(patches.unbind(dim=-1), mask)
+    frame = principal_frame(matrix)
+    total = matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
     with torch.no_grad():
         valid = _spans_plane(patches, mask, frame.values, resolution)
     normals, smallest = frame.normals, frame.smallest
@@ -90,11 +96,28 @@ def fit_plane(
     return fit, frame
 
 
-@kernel("n K", "n K", "n K", "n K")
-def _frames(x: Tensor, y: Tensor, z: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
-    """Return the principal frame of patches, by columns, and the trace of their covariance."""
-    _, matrix = covariance_of_columns((x, y, z), mask)
-    return *principal_frame(matrix), matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+def fit_points_pca(
+    points: Tensor, neighbors: Neighbors, *, chunk_size: int = CHUNK_SIZE
+) -> NormalFit:
+    """Fit the neighbourhoods of a cloud ``(N, 3)``; :func:`fit_points` of least squares."""
+    num_neighbors = neighbors.indices.shape[1]
+    if not kernels.serve(points, *neighbors, k=num_neighbors):
+        return fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
+
+    def work(rows: slice) -> tuple[Tensor, ...]:
+        resolution = coordinate_resolution(points[rows])
+        near = neighbors.at(rows)
+        return kernels.call("fit_normals_pca", places, *near, resolution, tolerance, _NARROW)
+
+    parts = map_chunks(work, len(points), chunk_size, points.device)
+    normals, curvature, rms, valid, narrow = map(torch.cat, zip(*parts, strict=True))
+    fit = NormalFit(normals, curvature, valid, rms)
+    rows = places_of(narrow)
+    if len(rows) == 0:
+        return fit
+    again = fit_points(points, neighbors, fit_normals_pca, rows=rows, chunk_size=chunk_size)
+    return replace_rows(fit, rows, again)
 
 
 def check_patches(

@@ -15,14 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import scratch
-from torchrg._compile import kernel
-from torchrg._parallel import allowed_threads, chunks_of, map_tasks, places_of
+from torchrg import kernels, scratch
+from torchrg._parallel import allowed_threads, chunks_of, map_chunks, map_tasks, places_of
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
+from torchrg.robust.scale import QN_FACTOR
 from torchrg.structures import Neighbors, Rows
 
 _CHUNKS_A_THREAD = 4
@@ -110,6 +110,36 @@ def find_coded_edges(
     return _pack(find, cloud, whole, None, chunk_size)[0], claims
 
 
+def mark_edges(
+    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
+) -> tuple[Tensor, Tensor | None]:
+    """Return which neighbours join, and by which edges they become seeds, a bit for each.
+
+    The bits are in words of 64, ``(N, words)``, int64. Where growth is free of order a point
+    becomes a seed by itself, and the second is None. ``limit`` is that of the curvature.
+    """
+    shared, free = _shared_neighbors(cloud, config), is_order_free(config)
+    num_points, k = cloud.neighbors.indices.shape
+    joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
+    seeds = joins if free else np.zeros_like(joins)
+
+    def mark(rows: slice) -> None:
+        accepted, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
+        _write_bits(joins[rows], accepted)
+        if not free:
+            _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
+
+    map_chunks(mark, num_points, chunk_size, cloud.points.device)
+    bits, of_seeds = (torch.from_numpy(part.view(np.int64)) for part in (joins, seeds))
+    return bits, None if free else of_seeds
+
+
+def _write_bits(into: NDArray[np.uint8], flags: Tensor) -> None:
+    """Write flags ``(n, K)`` to the bits of bytes, the first to the lowest."""
+    packed = np.packbits(flags.numpy(), axis=1, bitorder="little")
+    into[:, : packed.shape[1]] = packed
+
+
 def find_edges(
     cloud: GrowingCloud,
     config: GrowingConfig,
@@ -191,14 +221,25 @@ def accept_edges(
         own = torch.arange(own.start, own.stop, device=cloud.points.device)
     near, signed = cloud.neighbors.at(rows), cloud.signed_normals
     max_angle_deg = cloud.angle_share * config.max_angle_deg
-    limits: list[Tensor | None] = [
-        cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg)),
-        None if config.max_distance is None else cloud.points.new_tensor(config.max_distance**2),
-    ]
-    if max_angle_deg >= 90 and not signed:
-        limits[0] = None
+    angle = distance = None
+    if max_angle_deg < 90 or signed:
+        angle = cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg))
+    if config.max_distance is not None:
+        distance = cloud.points.new_tensor(config.max_distance**2)
     columns = cloud.points.T, cloud.normals.T
-    (joins,) = _pass(*near, own, *columns, cloud.valid, cloud.reach, *limits, signed)
+    if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
+        numbers = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
+        (joins,) = kernels.call(
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, own.long(), *numbers, signed
+        )
+    else:
+        joins = are_valid(near, own, cloud.valid)
+        if angle is not None:
+            joins &= within_angle(near, own, columns[1], angle, signed=signed)
+        if distance is not None:
+            joins &= within_distance(near, own, columns[0], distance)
+        if cloud.reach is not None:
+            joins &= on_planes(near, own, *columns, cloud.reach)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
         joins &= within_distance(near, own, cloud.colors.T, limit)
@@ -214,31 +255,6 @@ def accept_edges(
         if config.connectivity_scope == "region":
             joins &= connected
     return joins, connected
-
-
-@kernel("n K", "n K", "n", "3 N", "3 N", "N", "N", "", "", "")
-def _pass(
-    indices: Tensor,
-    mask: Tensor | None,
-    rows: Tensor,
-    points: Tensor,
-    normals: Tensor,
-    valid: Tensor,
-    reach: Tensor | None,
-    max_sq_chord: Tensor | None,
-    max_sq_distance: Tensor | None,
-    signed: bool,
-) -> tuple[Tensor]:
-    """Tell which neighbours of some points pass the criteria of places and normals."""
-    near = Neighbors(indices, mask)
-    joins = are_valid(near, rows, valid)
-    if max_sq_chord is not None:
-        joins &= within_angle(near, rows, normals, max_sq_chord, signed=signed)
-    if max_sq_distance is not None:
-        joins &= within_distance(near, rows, points, max_sq_distance)
-    if reach is not None:
-        joins &= on_planes(near, rows, points, normals, reach)
-    return (joins,)
 
 
 def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], Tensor] | None:
@@ -358,6 +374,10 @@ def are_coplanar(
     The limit is taken over the neighbours ``compared``, shape ``(n, K)``, default all; its floor is
     a fraction of the distance to the farthest neighbour.
     """
+    near, columns = cloud.neighbors.at(rows), cloud.points.T
+    if kernels.serve(columns, *near, cloud.normals, asked, compared, k=asked.shape[1]):
+        lists = columns, *near, cloud.normals[rows], asked, compared
+        return kernels.call("are_coplanar", *lists, QN_FACTOR, floor_fraction)[0]
     needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
     indices, counted = cloud.neighbors.at(rows).at(needed)
     patches = gather_patches(cloud.points, indices)

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import scratch
+from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import (
     CHUNK_SIZE,
@@ -32,7 +32,9 @@ from torchrg.regions.edges import (
     first_to_reach,
     is_order_free,
     join_edges,
+    mark_edges,
     neighborhood_radii,
+    promotes_late,
 )
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
 from torchrg.regions.reach import condense, join_condensed
@@ -277,12 +279,15 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
 
     The root of a region is the point it began with. Of a point that is not valid it is -1.
     """
-    valid, growing = cloud.valid.cpu().numpy(), cloud.curvature[cloud.valid]
+    growing = cloud.curvature[cloud.valid]
     order = cloud.curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
-    order = order[valid[order]]
+    order = order[cloud.valid.cpu().numpy()[order]]
     limit = curvature_limit(growing, config.curvature_quantile)
+    seeds = order[: int(torch.count_nonzero(growing <= limit))]
+    indices, masked = cloud.neighbors
+    if kernels.serve(indices, masked, cloud.valid, cloud.curvature) and not scratch.is_active():
+        return _grow_by_bits(cloud, config, order, seeds, limit, chunk_size)
     if is_order_free(config):
-        seeds = order[: int(torch.count_nonzero(growing <= limit))]
         roots, others = reach_from_seeds(cloud, config, seeds, limit, chunk_size)
         if config.min_size <= cloud.neighbors.indices.shape[1]:
             # Points that no seed reaches may make regions with free neighbours of their own.
@@ -291,9 +296,28 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
             roots = np.where(free, left, roots)
     else:
         edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        lists = cloud.neighbors.indices.cpu().numpy()
+        valid, lists = cloud.valid.cpu().numpy(), indices.cpu().numpy()
         roots = grow_first_in_first_out(edges, order, valid, claims, lists)
     return torch.from_numpy(roots).to(cloud.points.device)
+
+
+def _grow_by_bits(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    order: NDArray[np.int32],
+    seeds: NDArray[np.int32],
+    limit: Tensor,
+    chunk_size: int,
+) -> Tensor:
+    """Do as :func:`grow` in a kernel: Algorithm 2 on a bit for each neighbour."""
+    indices, late = cloud.neighbors.indices, promotes_late(config)
+    joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
+    begins, is_seed = order, cloud.curvature <= limit
+    if makes_seed is None and config.min_size > indices.shape[1]:
+        # What a point has around it that no seed reaches is too small a region.
+        begins = seeds
+    bits = indices, joins, makes_seed, is_seed, cloud.valid
+    return kernels.call("grow_regions", *bits, torch.from_numpy(begins), late)[0]
 
 
 def reach_from_seeds(

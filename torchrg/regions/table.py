@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._optional import require
-from torchrg._parallel import run_beside
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments
@@ -117,23 +116,12 @@ def summarize_planes(
     fit = fit_planes(segments, points, normals)
     first, second = _plane_axes(fit)
 
-    def measure() -> list[tuple[list[Tensor], _Outlines]]:
-        parts, start = [], 0
-        for some in segments.split(POINTS_AT_ONCE):
-            rows = slice(start, start + len(some.counts))
-            frame = (fit.center[rows], first[rows], second[rows])
-            parts.append(_measure(points, some, frame, outline=outline))
-            start = rows.stop
-        return parts
-
-    def meet() -> PlaneAdjacency | None:
-        if neighbors is None:
-            return None
-        return find_adjacency(
-            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
-        )
-
-    measures, meeting = run_beside(measure, meet, points.device)
+    measures, start = [], 0
+    for some in segments.split(POINTS_AT_ONCE):
+        rows = slice(start, start + len(some.counts))
+        frame = (fit.center[rows], first[rows], second[rows])
+        measures.append(_measure(points, some, frame, outline=outline))
+        start = rows.stop
     numbers, outlines = zip(*measures, strict=True)
     mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
@@ -157,7 +145,10 @@ def summarize_planes(
         planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
     if outline:
         planes = planes._replace(outline=sum(outlines, ()))
-    if meeting is not None:
+    if neighbors is not None:
+        meeting = find_adjacency(
+            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
+        )
         lengths, angles = own(meeting.boundary_length), own(meeting.dihedral_deg)
         planes = planes._replace(adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
-from torchrg._compile import kernel
 from torchrg._parallel import chunks_of
 from torchrg.errors import ConfigError
 from torchrg.robust.lanes import (
@@ -346,7 +345,6 @@ def _concentrate(
     return _Concentrated(final.reshape(num_points, *shape), best.reshape(shape))
 
 
-@kernel("K n", "", "n", "K n", "K n", "K n")
 def _to_sets(
     members: Tensor, size: Tensor, floor: Tensor, *columns: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ The constants make the scales consistent for the standard deviation of normal da
 """
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import partial
 from math import comb
 from statistics import NormalDist
 from typing import Literal, NamedTuple
@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._compile import is_active
 from torchrg._opaque import opaque
-from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks
+from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks, map_rows
 from torchrg.errors import ShapeError
-from torchrg.robust.counting import majority_difference
 
 MAD_FACTOR = 1.4826
 """1 / Phi^-1(3/4), to the digits of the literature."""
@@ -99,26 +98,15 @@ def qn(
 
 
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """Tell where ``qn(x) > threshold``, by counting differences and selecting none.
+    """Tell where ``qn(x, dim=dim, mask=mask) > threshold``.
 
-    ``threshold`` is at least 0 and in the unit of ``x``; the rest is as for :func:`median`. False
-    where Qn is NaN.
+    ``threshold`` is in the unit of ``x``; the rest is as for :func:`median`. False where Qn is NaN.
 
     Example:
         >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
         tensor([False,  True])
     """
-
-    def of_sorted(rows: Tensor) -> Tensor:
-        n = rows.shape[1]
-        if n < 2:
-            return torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
-        bound = _largest_within(threshold, QN_FACTOR, rows.dtype)
-        count = _count_differences(rows, bound)
-        return (count < comb(half_size(n), 2)) & ~rows[:, -1].isnan()
-
-    rows, counted = _rows_along("qn_exceeds", x, dim, mask)
-    return _per_count(rows.detach(), counted, of_sorted)
+    return qn(x.detach(), dim=dim, mask=mask) > threshold
 
 
 def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -256,8 +244,6 @@ def sum_points(values: Tensor) -> Tensor:
     So a sum is the same, to the last bit, wherever its lane stands. ``torch.sum`` does not promise
     that: it adds the last lanes of a tensor in another order than the first.
     """
-    if torch.compiler.is_compiling():
-        return values.sum(dim=0)  # compiled code adds row by row
     if values.requires_grad:
         total = values.sum(dim=0)
         return sum_points(values.detach()) + (total - total.detach())
@@ -308,18 +294,6 @@ def half_size(n: int) -> int:
     return n // 2 + 1
 
 
-def _largest_within(threshold: float, factor: float, dtype: torch.dtype) -> float:
-    """Largest x of ``dtype`` with ``factor * x <= threshold`` in the arithmetic of ``dtype``."""
-    kind = np.float32 if dtype == torch.float32 else np.float64
-    limit, scale = kind(threshold), kind(factor)
-    x = limit / scale
-    while scale * x > limit:
-        x = np.nextafter(x, kind(-np.inf))
-    while scale * np.nextafter(x, kind(np.inf)) <= limit < np.inf:
-        x = np.nextafter(x, kind(np.inf))
-    return float(x)
-
-
 def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
 
@@ -328,13 +302,33 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
-    if is_active.get() and sorted_rows.device.type == "cpu":
-        ends = sorted_rows[:, :: max(sorted_rows.shape[1] - 1, 1)]
-        if bool(ends.isfinite().all()):
-            return majority_difference(sorted_rows)
+    if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
+        (found,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
+        endless = found.isnan().nonzero().squeeze(1)
+        if len(endless):
+            found[endless] = _difference_by_lags(sorted_rows[endless])
+        return found
+    return _difference_by_lags(sorted_rows)
+
+
+def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
+    """Do as :func:`_majority_difference`, for all values and devices."""
     rank = comb(half_size(sorted_rows.shape[1]), 2)
     out = sorted_rows.new_empty(len(sorted_rows))
-    _with_lags(sorted_rows, out, lambda lagged, rows: lagged.select(rows, rank), sorts=True)
+    n = sorted_rows.shape[1]
+    width = sum(n - lag for lag in range(1, half_size(n)))
+    scale = 1 if sorted_rows.device.type == "cpu" else _GPU_SHARE
+    size = max(1, scale * CACHE_BYTES // (width * sorted_rows.element_size()))
+
+    def fill(share: slice) -> None:
+        # With one buffer a thread.
+        rows, into = sorted_rows[share], out[share]
+        lagged = _Lagged(rows, min(size, len(rows)))
+        for chunk in chunks_of(len(rows), size):
+            into[chunk] = lagged.select(rows[chunk], rank)
+
+    num_rows = len(sorted_rows)
+    map_chunks(fill, num_rows, max(num_rows, 1), sorted_rows.device, least=size)
     out[sorted_rows[:, -1].isnan()] = torch.nan
     return out
 
@@ -354,37 +348,6 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)
 
 
-def _count_differences(sorted_rows: Tensor, bound: float) -> Tensor:
-    """Count the differences at lags 1 to h - 1 at or below ``bound`` of each row, int32."""
-    out = torch.empty(len(sorted_rows), dtype=torch.int32, device=sorted_rows.device)
-    _with_lags(sorted_rows, out, lambda lagged, rows: lagged.count(rows, bound), sorts=False)
-    return out
-
-
-def _with_lags(
-    sorted_rows: Tensor, out: Tensor, work: Callable[["_Lagged", Tensor], Tensor], *, sorts: bool
-) -> None:
-    """Fill ``out`` with what ``work`` returns for chunks of rows, with one buffer a thread."""
-    n = sorted_rows.shape[1]
-    width = max(2 * _NETWORK, sum(n - lag for lag in range(1, half_size(n))))
-    scale = 1 if sorted_rows.device.type == "cpu" else _GPU_SHARE
-    size = max(1, scale * CACHE_BYTES // (width * sorted_rows.element_size()))
-
-    def fill(share: slice) -> None:
-        rows, into = sorted_rows[share], out[share]
-        lagged = _Lagged(rows, min(size, len(rows)), sorts=sorts)
-        for chunk in chunks_of(len(rows), size):
-            into[chunk] = work(lagged, rows[chunk])
-
-    num_rows = len(sorted_rows)
-    map_chunks(fill, num_rows, max(num_rows, 1), sorted_rows.device, least=size)
-
-
-_NETWORK = 512
-"""Values of 4 bytes that NumPy sorts without a branch (AVX-512), far faster than it partitions
-them. They are sorted as integers, whose order is that of non-negative floats, in two thirds of the
-time."""
-
 _MOST_LAGS = 8
 """Lags of one subtraction at most; all become as wide as the first of them."""
 
@@ -393,33 +356,24 @@ _GPU_SHARE = 256
 
 
 class _Lagged:
-    """A buffer for the differences at lags 1 to h - 1 of the rows of a chunk, side by side.
+    """A buffer for the differences at lags 1 to h - 1 of the rows of a chunk, side by side."""
 
-    With ``sorts``, differences that fill one or two sorting networks go to these.
-    """
-
-    def __init__(self, rows: Tensor, size: int, *, sorts: bool) -> None:
+    def __init__(self, rows: Tensor, size: int) -> None:
         n = rows.shape[1]
         pitch = n + half_size(n)
         self.on_cpu = rows.device.type == "cpu"
-        self.finite = bool(rows[:, :: max(n - 1, 1)].isfinite().all())
-        runs = _runs_in_networks(n) if sorts and self.on_cpu and rows.element_size() == 4 else []
-        self.num_networks = -(-runs[-1].stop // _NETWORK) if runs else 0
-        runs = runs or _lay_out(n, _MOST_LAGS, room=None)
-        width = self.num_networks * _NETWORK or -(-runs[-1].stop // 8) * 8
+        runs = _lay_out(n)
+        width = -(-runs[-1].stop // 8) * 8
         # Windows that reach beyond the end of a row find infinity there.
         self.rows = rows.new_full((size, pitch), torch.inf)
-        self.differences = rows.new_empty(size, width)
+        self.differences = rows.new_full((size, width), torch.inf)
         self._steps: list[tuple[Tensor, Tensor, Tensor]] = []
-        self._pads: list[Tensor] = []
-        for run, following in zip(runs, [*runs[1:], None], strict=True):
+        for run in runs:
             shape = (size, run.num_lags, run.width)
             far = self.rows.as_strided(shape, (pitch, 1, 1), run.lag)
             out = self.differences[:, run.start : run.stop].view(shape)
             self._steps.append((far, self.rows[:, None, : run.width], out))
-            end = width if following is None else following.start
-            if run.stop < end:
-                self._pads.append(self.differences[:, run.stop : end])
+        self._pad = self.differences[:, runs[-1].stop :]
 
     def _fill(self, rows: Tensor) -> Tensor:
         """Write the differences of up to a chunk of sorted rows."""
@@ -430,42 +384,16 @@ class _Lagged:
         self.rows[:count, :n] = rows
         for far, near, out in steps:
             torch.sub(far, near, out=out)
-        for pad in self._pads:
-            pad.fill_(torch.inf)
+        self._pad.fill_(torch.inf)
         return self.differences[:count]
 
     def select(self, rows: Tensor, rank: int) -> Tensor:
         """The ``rank``-th smallest difference of each row."""
         differences = self._fill(rows)
-        if self.num_networks:
-            if not self.finite:
-                differences.abs_()  # inf - inf may be a NaN with a sign, which would sort first
-            bits = differences.view(torch.int32)
-            if self.num_networks == 1:
-                bits.numpy().sort(axis=1)
-                return bits[:, rank - 1].view(torch.float32)
-            second = bits[:, _NETWORK:]
-            torch.bitwise_not(second, out=second)
-            bits.view(-1, _NETWORK).numpy().sort(axis=1)
-            # Of two ascending rows, min(a_i, b_(r-1-i)) are the r smallest values together. The
-            # second network has them inverted, so that they descend.
-            mirrored = bits[:, 2 * _NETWORK - rank :].bitwise_not()
-            return torch.minimum(bits[:, :rank], mirrored).amax(dim=1).view(torch.float32)
         if self.on_cpu:
             differences.numpy().partition(rank - 1, axis=1)
             return differences[:, rank - 1]
         return differences.kthvalue(rank, dim=1).values
-
-    def count(self, rows: Tensor, bound: float) -> Tensor:
-        """The number of differences at or below ``bound`` of each row."""
-        differences = self._fill(rows)
-        if not self.on_cpu:
-            return (differences <= bound).sum(dim=1, dtype=torch.int32)
-        flags = np.less_equal(differences.numpy(), bound).view(np.uint64)
-        # Eight flags at a time: each byte of a sum counts up to 255 of them.
-        parts = [flags[:, part].sum(axis=1) for part in chunks_of(flags.shape[1], 255)]
-        counts = np.stack(parts, axis=1).view(np.uint8).sum(axis=1, dtype=np.int32)
-        return torch.from_numpy(counts)
 
 
 class _Run(NamedTuple):
@@ -482,29 +410,11 @@ class _Run(NamedTuple):
         return self.start + self.num_lags * self.width
 
 
-def _lay_out(n: int, most_lags: int, room: int | None) -> list[_Run]:
-    """Lay lags 1 to h - 1 out in runs, none of which crosses a multiple of ``room``."""
+def _lay_out(n: int) -> list[_Run]:
+    """Lay lags 1 to h - 1 out in runs."""
     runs: list[_Run] = []
-    lag, start = 1, 0
-    while lag < half_size(n):
-        width = n - lag
-        num_lags = min(most_lags, half_size(n) - lag)
-        if room is not None:
-            left = room - start % room
-            if left < width:
-                start += left
-                left = room
-            num_lags = min(num_lags, left // width)
-        runs.append(_Run(lag, num_lags, width, start))
-        lag, start = lag + num_lags, runs[-1].stop
+    start = 0
+    for lag in range(1, half_size(n), _MOST_LAGS):
+        runs.append(_Run(lag, min(_MOST_LAGS, half_size(n) - lag), n - lag, start))
+        start = runs[-1].stop
     return runs
-
-
-@lru_cache(maxsize=256)
-def _runs_in_networks(n: int) -> list[_Run]:
-    """The fewest runs that fit two sorting networks, none if they do not."""
-    for most_lags in range(_MOST_LAGS, 0, -1) if n <= _NETWORK else ():
-        runs = _lay_out(n, most_lags, _NETWORK)
-        if runs and runs[-1].stop <= 2 * _NETWORK:
-            return runs
-    return []

@@ -135,7 +135,6 @@ class SegmentDepth(DepthTransform):
     Args:
         config: Settings.
         planes: Whether to add the table.
-        compile: Whether to run kernels compiled; see :func:`segment_depth`.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -150,18 +149,17 @@ class SegmentDepth(DepthTransform):
         config: DepthConfig | None = None,
         *,
         planes: bool = False,
-        compile: bool = False,  # noqa: A002 - torch's word
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keys=keys)
         self.config = config or DepthConfig()
-        self.planes, self.is_compiled = planes, compile
+        self.planes = planes
 
     @of_clouds
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
-        segment = partial(segment_depth, config=self.config, compile=self.is_compiled)
+        segment = partial(segment_depth, config=self.config)
         found = [
             segment(image, camera, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))

@@ -220,9 +220,6 @@ class SegmentPlanes(CloudTransform):
     Reads ``coord`` ``(N, 3)``; adds ``plane`` ``(N,)``, int64, -1 for none, ``normal`` ``(N, 3)``
     and ``curvature`` ``(N,)``.
 
-    Args:
-        compile: Whether to run kernels compiled; see :func:`torchrg.segment_planes`.
-
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
         >>> SegmentPlanes("classic")({"coord": floor})["plane"].unique()
@@ -233,14 +230,11 @@ class SegmentPlanes(CloudTransform):
         self,
         config: PipelineConfig | str = DEFAULT_PRESET,
         *,
-        compile: bool | None = None,  # noqa: A002 - torch's word
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keep_neighbors=keep_neighbors, keys=keys)
-        config = settings_of("SegmentPlanes", PipelineConfig, config)
-        is_compiled = config.compile if compile is None else compile
-        self.config = dataclasses.replace(config, compile=is_compiled)
+        self.config = settings_of("SegmentPlanes", PipelineConfig, config)
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return plane labels, normals and curvature of a cloud."""

@@ -19,7 +19,7 @@ from torchrg.normals.consensus.smoothing import (
     standard_errors,
 )
 from torchrg.normals.consensus.surfaces import fit_surfaces
-from torchrg.normals.pca import fit_normals_pca, fit_points
+from torchrg.normals.pca import fit_points_pca
 from torchrg.structures import Neighbors, NormalFit
 
 
@@ -65,7 +65,7 @@ def estimate_consensus(
         True
     """
     size = min(chunk_size, ROWS_IN_CACHE)
-    fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
     if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = survey_noise(points, neighbors, fit, chunk_size=size)
@@ -73,7 +73,7 @@ def estimate_consensus(
         count = wanted_neighbors(_share_of_noise(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
-            fit = fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+            fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
             survey = survey_noise(points, neighbors, fit, chunk_size=size)
     noise = survey.noise
     if config.noise_scope == "regional":

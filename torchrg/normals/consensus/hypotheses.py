@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.linalg import above, at_most
 from torchrg.linalg.moments import (
@@ -48,19 +47,17 @@ def vote_planes(
     nearness = sq_distances / torch.where(farthest > 0, farthest, 1.0)
     weights = (1 - constants.VOTE_FALLOFF * nearness) * counted
     reach = constants.VOTE_REACH * noise
-    pairs = _pairs(sq_distances.shape[1], constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
-    ranks = torch.tensor(pairs, dtype=torch.int64, device=noise.device).view(-1, 2)
+    ranks = candidate_ranks(sq_distances.shape[1]).to(noise.device)
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
-    for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(pairs)), 1)):
-        own = [part[some] for part in (*columns, weights, start, reach)]
-        (normals[some],) = _most_supported(*own, ranks)
-    no, yes = torch.tensor([False, True], device=noise.device)
+    for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
+        own = columns[0][some], columns[1][some], columns[2][some]
+        normals[some] = _most_supported(own, weights[some], start[some], reach[some], ranks)
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, no)
+        normals, offsets = _refitted(*columns, weights, normals, offsets, reach)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
     reach = constants.FIT_REACH * noise
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, yes)
+        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, bisquare=True)
     return normals, offsets
 
 
@@ -72,18 +69,18 @@ def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
     return support - torch.minimum(over, under)
 
 
-@kernel("n K", "n K", "n K", "n K", "n 3", "n", "P 2")
 def _most_supported(
-    x: Tensor, y: Tensor, z: Tensor, weights: Tensor, start: Tensor, reach: Tensor, ranks: Tensor
-) -> tuple[Tensor]:
+    columns: Columns, weights: Tensor, start: Tensor, reach: Tensor, ranks: Tensor
+) -> Tensor:
     """Return the normals of the best planes through the points: the first ones, or by ranks."""
-    candidates, spanned = _planes_through((x, y, z), ranks)
+    candidates, spanned = _planes_through(columns, ranks)
     candidates = torch.cat([start[:, None], candidates], dim=1)
+    x, y, z = columns
     rests = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
     scores = support_scores(rests, weights[:, None])
     spanned = torch.cat([torch.ones_like(spanned[:, :1]), spanned], dim=1)
     best = torch.where(spanned, scores, -torch.inf).argmax(dim=1, keepdim=True)
-    return (candidates.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1),)
+    return candidates.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
 
 
 def _within(rests: Tensor, reach: Tensor) -> Tensor:
@@ -92,7 +89,6 @@ def _within(rests: Tensor, reach: Tensor) -> Tensor:
     return (1 - rests * rests).clamp_(min=0)
 
 
-@kernel("n K", "n K", "n K", "n K", "n 3", "n", "n", "")
 def _refitted(
     x: Tensor,
     y: Tensor,
@@ -101,11 +97,13 @@ def _refitted(
     normals: Tensor,
     offsets: Tensor,
     reach: Tensor,
-    bisquare: Tensor,
+    *,
+    bisquare: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return planes fitted to the points near planes; those where these points span none."""
     near = _within(residuals((x, y, z), normals, offsets), reach)
-    near *= torch.where(bisquare, near, 1.0)
+    if bisquare:
+        near *= near
     fitted, moved, values = fit_weighted_planes((x, y, z), weights * near)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
     return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
@@ -120,6 +118,12 @@ def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
     spanned = sq_area > 0
     length = torch.where(spanned, sq_area, 1.0).sqrt_()
     return torch.stack([x / length, y / length, z / length], dim=-1), spanned
+
+
+def candidate_ranks(num_neighbors: int) -> Tensor:
+    """Return the ranks ``(P, 2)`` of the neighbours that span candidates with the point."""
+    pairs = _pairs(num_neighbors, constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
+    return torch.tensor(pairs, dtype=torch.int64, device="cpu").view(-1, 2)
 
 
 @cache
@@ -217,7 +221,6 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     return Wedge(_summary(pairs, (first, second), outer, present), first, outer)
 
 
-@kernel("n K", "n K", "n K", "n K", "n K", "n")
 def _wedge(
     x: Tensor, y: Tensor, z: Tensor, first: Tensor, second: Tensor, present: Tensor
 ) -> tuple[Tensor, ...]:
@@ -253,7 +256,6 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
     return _summary(pairs, (first, second, third), outer, present)
 
 
-@kernel("n K", "n K", "n K", "n K", "n K", "n K", "n", "n")
 def _corner(
     x: Tensor,
     y: Tensor,

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
+from torchrg import kernels
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg import above, coordinate_resolution
 from torchrg.linalg.moments import (
@@ -59,20 +59,21 @@ def survey_noise(
     the one of all neighbours, if they leave 0.35 of its deviation or less. ``fit`` are the planes
     of all neighbours; noise is at least the rounding of the coordinates.
     """
+    points = points.contiguous()
     offsets, radius, whole, layered = (torch.empty_like(points[:, 0]) for _ in range(4))
     small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
 
     def work(block: slice) -> None:
         indices, mask = neighbors.at(block)
-        offsets[block], radius[block], whole[block], low, again = _deviations(
-            points, indices, mask, fit.normals[block], fit.valid[block]
+        offsets[block], radius[block], whole[block], low, again, *nearest = _survey(
+            points, Neighbors(indices, mask), fit.normals[block], fit.valid[block]
         )
         layered[block] = torch.inf
         if len(rows := places_of(low)):
             near, own = Neighbors(indices, mask).at(rows), rows + block.start
             layered[own] = _layered_deviations(points, near, fit.normals[own], whole[own])
-        for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
-            values[block] = _of_nearest(points, Neighbors(indices, mask), size)
+        for values, deviations in zip(small, nearest, strict=True):
+            values[block] = deviations
         if len(rows := places_of(again)):
             patches, counted = _each_place_once(points, Neighbors(indices, mask).at(rows))
             for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
@@ -130,7 +131,16 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
     return noise
 
 
-@kernel("N 3", "n K", "n K", "n 3", "n")
+def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
+    """Return what :func:`_deviations` does, and :func:`_of_nearest` for both of the counts."""
+    counts = constants.NOISE_COUNTS
+    if kernels.serve(points, *near, normals, valid, k=near.indices.shape[1]):
+        limits = constants.MAX_LAYERED_KURTOSIS, constants.MIN_BREADTH
+        return kernels.call("survey", points, *near, normals, valid, *counts, *limits)
+    of_nearest = [_of_nearest(points, near, count) for count in counts]
+    return *_deviations(points, *near, normals, valid), *of_nearest
+
+
 def _deviations(
     points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
@@ -186,21 +196,19 @@ def _of_nearest(points: Tensor, near: Neighbors, count: int) -> Tensor:
 
 
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
-    """Return deviations of the nearest points from their plane; inf where they span none."""
+    """Return deviations of the nearest points from their plane.
+
+    They are infinite where these points span none, or the last of them does not count.
+    """
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
     columns = split_columns(patches[:, :count])
-    return _of_few(*columns, counted[:, :count])[0]
-
-
-@kernel("n S", "n S", "n S", "n S")
-def _of_few(x: Tensor, y: Tensor, z: Tensor, counted: Tensor) -> tuple[Tensor]:
-    """Return deviations of the points that count from their plane; inf if the last one does not."""
-    normals, offsets, values = fit_weighted_planes((x, y, z), counted)
-    rests = residuals((x, y, z), normals, offsets)
-    spread = (rests * rests).sum(dim=1) / (x.shape[1] - 3)
+    counted = counted[:, :count]
+    normals, offsets, values = fit_weighted_planes(columns, counted)
+    rests = residuals(columns, normals, offsets)
+    spread = (rests * rests).sum(dim=1) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
-    return (torch.where(broad, spread.sqrt_(), torch.inf),)
+    return torch.where(broad, spread.sqrt_(), torch.inf)
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
@@ -209,6 +217,10 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
     rank, quantiles = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
 
     def work(block: slice) -> None:
+        if kernels.serve(values, indices, counted, k=indices.shape[1]):
+            lists = neighbors.at(block)
+            (quantiles[block],) = kernels.call("neighbor_quantiles", values, *lists, quantile, rank)
+            return
         if counted is None and values.device.type == "cpu":
             near = np.take(values.numpy(), indices[block].numpy())
             near.partition(rank - 1, axis=1)

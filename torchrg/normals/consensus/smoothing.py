@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
+from torchrg import kernels
 from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
 from torchrg.linalg import signs
 from torchrg.linalg.moments import (
@@ -44,9 +44,23 @@ def smooth_planes(
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
+    is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
+    table = _table(points, planes, errors) if is_served else points
+    numbers = (
+        constants.SMOOTHING_AGREEMENT,
+        constants.SMOOTHING_REACH,
+        constants.FIT_FALLOFF,
+        constants.TILT_RIDGE,
+        constants.MAX_TILT,
+    )
 
     def work(block: slice) -> None:
         chosen = rows[block]
+        if is_served:
+            normals[chosen], offsets[chosen] = kernels.call(
+                "smooth_planes", table, *neighbors, noise, chosen, *numbers
+            )
+            return
         normals[chosen], offsets[chosen] = _smoothed(
             points, *neighbors, parts, planes.offsets, noise, errors, chosen
         )
@@ -55,7 +69,11 @@ def smooth_planes(
     return TangentPlanes(normals, offsets)
 
 
-@kernel("N 3", "N K", "N K", "3 N", "N", "N", "N", "n")
+def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
+    """Return rows of point, normal, offset and value ``(N, 8)``: one place in memory for each."""
+    return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
+
+
 def _smoothed(
     points: Tensor,
     indices: Tensor,
@@ -112,18 +130,33 @@ def choose_planes(
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
 
+    is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
+    is_served = is_served and len(rows) > 0
+    table = _table(points, planes, noise) if is_served else points
+    numbers = (
+        constants.CHOICE_STEP,
+        constants.VOTE_REACH,
+        constants.VOTE_FALLOFF,
+        constants.INLIER_REACH,
+        constants.CHOICE_COST,
+    )
+
     def work(block: slice) -> None:
         chosen = rows[block]
+        if is_served:
+            normals[chosen], offsets[chosen] = kernels.call(
+                "choose_planes", table, *neighbors, points, chosen, *numbers
+            )
+            return
         normals[chosen], offsets[chosen] = _chosen(
             points, *neighbors, *planes, noise, chosen, ranks
         )
 
-    size = max(min(chunk_size, ROWS_IN_CACHE // len(ranks)), 1)
+    size = max(min(chunk_size, ROWS_IN_CACHE // (1 if is_served else len(ranks))), 1)
     map_chunks(work, len(rows), size, rows.device)
     return TangentPlanes(normals, offsets)
 
 
-@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n", "R")
 def _chosen(
     points: Tensor,
     indices: Tensor,
@@ -212,7 +245,6 @@ def describe_inliers(
     return curvature, residual_rms
 
 
-@kernel("N 3", "N K", "N K", "N 3", "N", "N", "n")
 def _inliers(
     points: Tensor,
     indices: Tensor,
@@ -221,8 +253,11 @@ def _inliers(
     offsets: Tensor,
     noise: Tensor,
     rows: Tensor,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
+    arguments = points, indices, valid, normals, offsets, noise
+    if kernels.serve(*arguments, k=indices.shape[1]):
+        return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
     columns = gather_columns(points, indices[rows])
     rests = residuals(columns, normals[rows], offsets[rows]).abs()
     near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]

@@ -5,14 +5,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._compile import kernel
+from torchrg import kernels
 from torchrg._parallel import map_chosen, map_chunks
 from torchrg.linalg.moments import Columns, split_columns
 from torchrg.neighbors import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.hypotheses import fit_meeting_planes, vote_planes
+from torchrg.normals.consensus.hypotheses import (
+    MeetingPlanes,
+    candidate_ranks,
+    fit_meeting_planes,
+    vote_planes,
+)
 from torchrg.normals.consensus.noise import Survey
-from torchrg.normals.jet import fit_paraboloids
+from torchrg.normals.jet import FLAT_PIVOT, fit_paraboloids
 from torchrg.structures import Neighbors, NormalFit
 
 _PARABOLOID_PARAMETERS = 6
@@ -45,7 +50,7 @@ def fit_surfaces(
     those of all neighbours by PCA. Returns the tangent planes of all points, which points are
     sharp, as their neighbourhood is broken, and which of them took the plane of the votes.
     """
-    noise = survey.noise
+    noise, points = survey.noise, points.contiguous()
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
     bent = survey.deviations.clone()
 
@@ -62,9 +67,8 @@ def fit_surfaces(
     by_votes, meeting = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
 
     def split(rows: Tensor) -> None:
-        columns, scale = _gather_counted(points, neighbors, rows), noise[rows]
-        voted = vote_planes(columns, scale, fit.normals[rows], torch.ones_like(columns[0]))
-        planes = fit_meeting_planes(columns, *voted, scale)
+        scale = noise[rows]
+        voted, planes = broken_planes(points, neighbors.at(rows), scale, fit.normals[rows])
         by_votes.normals[rows], by_votes.offsets[rows] = voted
         meeting.normals[rows], meeting.offsets[rows] = planes.normals, planes.offsets
         explained[rows] = planes.deviations <= constants.MEETING_LIMIT * scale
@@ -72,7 +76,10 @@ def fit_surfaces(
         rest = torch.where(known, planes.deviations, scale)
         unit = torch.maximum(scale, rest)
         drop = (bent[rows] / unit).square() - (rest / unit).square()
-        drop *= columns[0].shape[1] - _PARABOLOID_PARAMETERS
+        num_neighbors: int | Tensor = neighbors.indices.shape[1]
+        if neighbors.valid is not None:
+            num_neighbors = neighbors.valid[rows].sum(dim=1)
+        drop *= num_neighbors - _PARABOLOID_PARAMETERS
         most = constants.MAX_GAIN
         gain[rows] = torch.where(known, drop, -most).clamp_(-most, most)
 
@@ -88,11 +95,52 @@ def fit_surfaces(
     return TangentPlanes(normals, offsets), voted | meets, voted
 
 
-@kernel("N 3", "N K", "N K", "N 3", "n")
+def broken_planes(
+    points: Tensor, near: Neighbors, noise: Tensor, normals: Tensor
+) -> tuple[TangentPlanes, MeetingPlanes]:
+    """Return the planes of the votes and those that meet, of points with equally many neighbours.
+
+    ``near`` are the neighbours of the points, which have this noise ``(n,)`` and these normals
+    ``(n, 3)`` by PCA; see :func:`torchrg.normals.consensus.hypotheses.vote_planes` and
+    :func:`torchrg.normals.consensus.hypotheses.fit_meeting_planes`.
+    """
+    if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
+        count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
+        found = kernels.call(
+            "broken_planes", points, *near, noise, normals, candidate_ranks(count), _numbers()
+        )
+        return TangentPlanes(*found[:2]), MeetingPlanes(*found[2:])
+    columns = _gather_counted(points, near)
+    voted = vote_planes(columns, noise, normals, torch.ones_like(columns[0]))
+    return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
+
+
+def _numbers() -> Tensor:
+    """Return the constants that the kernel of :func:`broken_planes` reads, in its order."""
+    return torch.tensor(
+        [
+            constants.VOTE_REACH,
+            constants.VOTE_FALLOFF,
+            constants.FIT_REACH,
+            constants.FIT_FALLOFF,
+            constants.MEETING_GAP,
+            constants.CORNER_LIMIT,
+            constants.CORNER_SHARE,
+            constants.NUM_REFITS,
+            constants.NUM_ALTERNATIONS,
+            constants.MIN_PLANE_POINTS,
+        ],
+        dtype=torch.float32,
+    )
+
+
 def _paraboloids(
     points: Tensor, indices: Tensor, valid: Tensor | None, normals: Tensor, rows: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Return what :func:`torchrg.normals.jet.fit_paraboloids` does, of some points."""
+    arguments = points, indices, valid, normals
+    if kernels.serve(*arguments, k=indices.shape[1]):
+        return kernels.call("fit_paraboloids", *arguments, rows, FLAT_PIVOT)
     counted = Neighbors(indices, valid).counted(rows).to(points.dtype)
     return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
@@ -105,11 +153,11 @@ def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
     return [chosen & (count == number) for number in torch.unique(count[chosen]).tolist()]
 
 
-def _gather_counted(points: Tensor, neighbors: Neighbors, rows: Tensor) -> Columns:
+def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
     """Return columns of the neighbours that count, equally many for all of these points."""
-    patches = gather_patches(points, neighbors.indices[rows])
-    if neighbors.valid is not None:
-        counted = neighbors.valid[rows]
+    patches = gather_patches(points, near.indices)
+    if near.valid is not None:
+        counted = near.valid
         order = (~counted).to(torch.uint8).argsort(dim=1, stable=True)
         order = order[:, : int(counted[0].sum())]
         patches = patches.gather(1, order[:, :, None].expand(-1, -1, 3))

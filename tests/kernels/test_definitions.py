@@ -1,0 +1,123 @@
+"""Every kernel does what the function of torch does that stands beside it."""
+
+import pytest
+import torch
+
+from tests.kernels.clouds import clouds, definitions, lists, needs_library
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.normals.consensus.noise import _neighbor_quantiles, _survey
+from torchrg.normals.pca import fit_points_pca
+from torchrg.regions.edges import GrowingCloud, are_coplanar
+from torchrg.robust.scale import _majority_difference
+
+pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+
+CLOUDS = clouds()
+
+
+@pytest.fixture(params=CLOUDS)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def points(name):
+    return CLOUDS[name]
+
+
+@pytest.fixture(params=[False, True], ids=["all", "masked"])
+def masked(request):
+    return request.param
+
+
+def both(function, *arguments, **settings):
+    """Return what a function returns by kernels and by definition."""
+    found = function(*arguments, **settings)
+    with definitions():
+        return found, function(*arguments, **settings)
+
+
+def assert_close(found, expected, unit, tolerance=1e-5):
+    """Compare values, infinite ones and all, to a share of a unit for each row."""
+    infinite = ~expected.isfinite()
+    assert torch.equal(found[infinite], expected[infinite])
+    error = torch.where(infinite, 0.0, (found - expected).abs())
+    while unit.dim() < error.dim():
+        unit = unit[:, None]
+    assert (error <= tolerance * unit).all(), (error / unit).max()
+
+
+def special_rows(n):
+    """Sorted rows of n values: random, tied, constant, mixed magnitudes, infinite, with NaN."""
+    generator = torch.Generator().manual_seed(n)
+    rows = torch.randn(60, n, generator=generator)
+    rows[10:20] = rows[10:20].round()
+    rows[20:25] = 3.0
+    rows[25:30] *= 10.0 ** torch.randint(-30, 30, (5, n), generator=generator)
+    rows[30, 0] = torch.inf
+    rows[31, -1] = -torch.inf
+    rows[32, : n // 2] = torch.inf
+    rows[33, 0] = torch.nan
+    rows[34] = torch.tensor([-3e38, 3e38]).repeat(n)[:n]
+    rows[35:40] *= 1e-42
+    return rows.sort(dim=1).values
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 8, 9, 15, 16, 17, 50, 51, 300])
+def test_differences_are_those_of_the_definition_to_the_bit(n):
+    found, expected = both(_majority_difference, special_rows(n))
+    assert torch.equal(found.nan_to_num(nan=-1.0), expected.nan_to_num(nan=-1.0))
+
+
+def test_planes_of_all_neighbors_are_those_of_the_definition(name, points, masked):
+    near = lists(points, 50, masked)
+    found, expected = both(fit_points_pca, points, near)
+    assert torch.equal(found.valid, expected.valid)
+    values = torch.stack([expected.curvature, found.curvature])
+    assert (values[0] - values[1]).abs().max() < 1e-5
+    radius = (points[near.indices.long()] - points[:, None]).norm(dim=2).amax(dim=1)
+    assert_close(found.residual_rms, expected.residual_rms, radius)
+    # Where two directions are as thin as one another nothing tells them apart.
+    clear = expected.valid & (expected.curvature < 0.2)
+    angle = unsigned_angle_deg(found.normals, expected.normals)
+    assert not (angle[clear] > 0.05).any()
+
+
+def test_survey_is_that_of_the_definition(points, masked):
+    near = lists(points, 50, masked)
+    fit = fit_points_pca(points, near)
+    found, expected = both(_survey, points, near, fit.normals, fit.valid)
+    radius = torch.where(expected[1] > 0, expected[1], 1.0)
+    for place in (0, 1, 2):
+        assert_close(found[place], expected[place], radius)
+    for place in (5, 6):
+        # Of neighbours spread alike along two directions any plane across them is the thinnest.
+        alike = (found[place] - expected[place]).abs() <= 1e-5 * radius
+        alike |= found[place].isinf() & expected[place].isinf()
+        assert alike.float().mean() > 0.95
+    assert torch.equal(found[4], expected[4])
+    assert (found[3] == expected[3]).float().mean() > 0.999
+
+
+def test_quantiles_of_neighbors_are_those_of_the_definition_to_the_bit(points, masked):
+    near = lists(points, 50, masked)
+    values = torch.randn(len(points), generator=torch.Generator().manual_seed(2))
+    values[::3] = values[0]
+    values[::7] = torch.inf
+    for quantile in (0.1, 0.35, 1.0):
+        found, expected = both(_neighbor_quantiles, values, near, quantile)
+        assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("compares", [False, True])
+def test_coplanar_neighbors_are_those_of_the_definition_to_the_bit(points, masked, compares):
+    near = lists(points, 50, masked)
+    fit = fit_points_pca(points, near)
+    cloud = GrowingCloud(points.T.contiguous().T, fit.normals, fit.curvature, near, fit.valid)
+    generator = torch.Generator().manual_seed(3)
+    asked = (torch.rand(near.indices.shape, generator=generator) < 0.5) & near.counted()
+    asked[::5] = False
+    compared = torch.rand(near.indices.shape, generator=generator) < 0.5 if compares else None
+    rows = slice(0, len(points))
+    found, expected = both(are_coplanar, cloud, rows, asked, compared, 0.01)
+    assert torch.equal(found & asked, expected & asked)

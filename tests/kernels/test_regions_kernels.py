@@ -1,0 +1,101 @@
+"""Neighbours, edges and growth by kernels are those of the definitions to the bit."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.kernels.clouds import clouds, definitions, lists, needs_library
+from torchrg.config import GrowingConfig, load_config
+from torchrg.neighbors import canonical_order, search_knn
+from torchrg.normals.pca import fit_points_pca
+from torchrg.regions.edges import GrowingCloud, accept_edges
+from torchrg.regions.growth import by_column, grow
+from torchrg.scenes import make_room
+
+pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+
+CLOUDS = clouds()
+ROOM = make_room(num_points=9000, noise=0.003, seed=4).points
+MANY = {
+    "room": ROOM,
+    "tiny": ROOM * 1e-18,
+    "huge": ROOM * 1e10,
+    "far": ROOM.double() + 5e6,
+    "grid": torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0), torch.arange(4.0)),
+    "doubled": torch.cat([ROOM[:4000], ROOM[:3000], ROOM[:2000]]),
+    "outliers": torch.cat([ROOM, 1e5 * torch.eye(3)]),
+    "line": torch.linspace(0, 1, 5000)[:, None] * torch.tensor([1.0, 0, 0]),
+}
+
+
+@pytest.mark.parametrize("k", [1, 2, 30, 120])
+@pytest.mark.parametrize("name", MANY)
+def test_neighbors_are_those_of_the_definition(name, k):
+    found = search_knn(MANY[name], k).indices
+    with definitions():
+        assert torch.equal(found, search_knn(MANY[name], k).indices)
+
+
+def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition():
+    batch, ends = torch.cat([ROOM, ROOM[:3000] + 1]), torch.tensor([9000, 12000])
+    ordered = ROOM[canonical_order(ROOM)]
+    found = search_knn(batch, 20, offset=ends), search_knn(ordered, 20, canonical=True)
+    with definitions():
+        expected = search_knn(batch, 20, offset=ends), search_knn(ordered, 20, canonical=True)
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one.indices, other.indices)
+
+
+def growing_cloud(points, k, masked, reach=None, **settings):
+    points = points[canonical_order(points)]
+    near = lists(points, k, masked)
+    with definitions():
+        fit = fit_points_pca(points, near)
+    valid = fit.valid.clone()
+    valid[::17] = False
+    if reach is not None:
+        reach = reach * fit.residual_rms
+        reach[::5] = torch.inf
+    columns = by_column(points), by_column(fit.normals)
+    return GrowingCloud(*columns, fit.curvature, near, valid, reach, **settings)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_edges_are_those_of_the_definition(name, signed, masked):
+    for reach, distance, angle in ((None, None, 5.0), (2.0, None, 90.0), (2.0, 0.3, 15.0)):
+        cloud = growing_cloud(CLOUDS[name], 50, masked, reach, signed_normals=signed)
+        config = GrowingConfig(
+            max_angle_deg=angle, max_distance=distance, coplanarity=False, connectivity=None
+        )
+        for rows in (slice(0, len(cloud.points)), torch.arange(0, len(cloud.points), 3)):
+            found, _ = accept_edges(cloud, config, rows, None)
+            with definitions():
+                expected, _ = accept_edges(cloud, config, rows, None)
+            assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("k", [9, 50, 70])
+@pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
+@pytest.mark.parametrize("name", ["room", "grid", "doubled"])
+def test_regions_are_those_of_the_definition(name, preset, k):
+    config = load_config(preset).growing
+    late = {"connectivity": 0.3, "connectivity_scope": "seed"}
+    by_region = {
+        "curvature_scope": "neighborhood",
+        "connectivity": 0.2,
+        "connectivity_scope": "region",
+    }
+    for changes in ({}, {"min_size": 5}, {"seed_rule": "increment"}, late, by_region):
+        settings = dataclasses.replace(config, **changes)
+        cloud = growing_cloud(CLOUDS[name], k, masked=k == 9, reach=3.0)
+        found = grow(cloud, settings, 700)
+        with definitions():
+            expected = grow(cloud, settings, 700)
+        # Which of their points a region too small to count begins with does not matter.
+        counts = torch.bincount(expected + 1, minlength=len(expected) + 1)[1:]
+        large = (expected >= 0) & (counts[expected] >= settings.min_size)
+        assert torch.equal(found[large], expected[large])
+        assert torch.equal(found.cpu() >= 0, expected >= 0)

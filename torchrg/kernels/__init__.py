@@ -1,0 +1,175 @@
+"""Loops over neighbourhoods in C++, beside their definitions in torch.
+
+A kernel does what the function of its name does, in one pass over memory. It works on ordinary
+tensors of a CPU in single precision; for gradients, ``vmap``, other devices and types, and where
+the library is absent, the definition runs. Calls hold no lock of the interpreter.
+
+The library is built with the package (``scripts/build_kernels.py``), once for any processor and
+once for those with AVX2. Both give the same bits.
+"""
+
+import ctypes
+import os
+import warnings
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg._checks import has_values
+from torchrg.kernels.signatures import SIGNATURES
+
+MOST_NEIGHBORS = 512
+"""Values of a row that kernels have room for, ``MOST`` in ``plain.h``. Longer ones are left to the
+definitions."""
+
+_DTYPES = {
+    "f": torch.float32,
+    "d": torch.float64,
+    "i": torch.int32,
+    "l": torch.int64,
+    "b": torch.bool,
+}
+"""Of a tensor, by its letter in a signature."""
+
+
+def name_of_library() -> str | None:
+    """Return which library is in use, ``"base"`` or ``"avx2"``, None where there is none."""
+    return None if _library() is None else _kind()
+
+
+def serve(*tensors: Tensor | None, k: int = 1) -> bool:
+    """Tell whether kernels work on tensors, rows of ``k`` values among them.
+
+    That is on what has values, on the CPU, of no gradient, and in single precision.
+
+    Example:
+        >>> serve(torch.zeros(3, dtype=torch.float64))
+        False
+    """
+    given = [tensor for tensor in tensors if tensor is not None]
+    return (
+        _library() is not None
+        and 0 < k <= MOST_NEIGHBORS
+        and has_values(*given)
+        and all(
+            tensor.device.type == "cpu"
+            and not tensor.requires_grad
+            and tensor.dtype in (torch.float32, torch.int32, torch.bool)
+            for tensor in given
+        )
+    )
+
+
+def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
+    """Return what a kernel makes of tensors and numbers, in the order of its signature.
+
+    Raises:
+        ValueError: If the arguments are not those of :data:`SIGNATURES`.
+        IndexError: If a list names a row that is not there.
+    """
+    signature, library = _signature(name), _library()
+    if library is None or len(arguments) != len(signature.inputs):
+        raise ValueError(f"{name}: expected {len(signature.inputs)} arguments and a library.")
+    lengths: dict[str, int] = {}
+    taken: list[Tensor | float | None] = []
+    for argument, kind in zip(arguments, signature.inputs, strict=True):
+        taken.append(kind.check(name, argument, lengths))
+    outputs = tuple(kind.allocate(lengths) for kind in signature.outputs)
+    passed: list[object] = [ctypes.c_int64(length) for length in lengths.values()]
+    passed += [_pass(value) for value in (*taken, *outputs)]
+    status = getattr(library, name)(*passed)
+    if status == 1:
+        raise IndexError(f"{name}: a list of neighbors names a row that is not there.")
+    if status:
+        raise ValueError(f"{name}: expected rows of 1 to {MOST_NEIGHBORS} values, got {lengths}.")
+    return outputs
+
+
+class _Argument(NamedTuple):
+    """What a signature says of an argument: its dtype, axes, and whether it may be left out."""
+
+    dtype: str
+    axes: str
+    optional: bool
+
+    def check(
+        self, name: str, value: Tensor | float | None, lengths: dict[str, int]
+    ) -> Tensor | float | None:
+        """Return the argument, contiguous; note the lengths of its axes, which must agree."""
+        if not self.axes and not self.optional and self.dtype in "nx":
+            if isinstance(value, int | float):  # bool is one
+                return int(value) if self.dtype == "n" else float(value)
+        elif isinstance(value, Tensor) and value.dtype == _DTYPES[self.dtype.lower()]:
+            if value.dim() == len(self.axes) and value.device.type == "cpu":
+                agrees = [
+                    length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
+                    for axis, length in zip(self.axes, value.shape, strict=True)
+                ]
+                if all(agrees) and (self.dtype.islower() or value.is_contiguous()):
+                    return value.contiguous()
+        elif value is None and self.optional:
+            return None
+        shape = tuple(value.shape) if isinstance(value, Tensor) else value
+        raise ValueError(f"{name}: expected {self.dtype}[{self.axes}], got {shape}, {lengths}.")
+
+    def allocate(self, lengths: dict[str, int]) -> Tensor:
+        """Return a tensor for what a kernel writes."""
+        shape = [int(axis) if axis.isdigit() else lengths[axis] for axis in self.axes]
+        return torch.empty(shape, dtype=_DTYPES[self.dtype], device="cpu")
+
+
+class _Signature(NamedTuple):
+    inputs: list[_Argument]
+    outputs: list[_Argument]
+
+
+@cache
+def _signature(name: str) -> _Signature:
+    inputs, outputs = SIGNATURES[name].split("->")
+
+    def read(text: str) -> list[_Argument]:
+        return [
+            _Argument(word[0], word[1:].strip("[]?"), word.endswith("?")) for word in text.split()
+        ]
+
+    return _Signature(read(inputs), read(outputs))
+
+
+def _pass(value: object) -> object:
+    if isinstance(value, Tensor):
+        return ctypes.c_void_p(value.data_ptr())
+    if isinstance(value, int):
+        return ctypes.c_int64(value)
+    return ctypes.c_double(value) if isinstance(value, float) else None
+
+
+def _kind() -> str:
+    """Return the library for this processor, by what torch says of it."""
+    is_wide = torch.backends.cpu.get_cpu_capability().startswith("AVX")
+    return "avx2" if is_wide else "base"
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL | None:
+    """Load the library, or say once that there is none."""
+    if os.environ.get("TORCHRG_NO_KERNELS", "0") not in ("", "0"):
+        return None
+    path = Path(__file__).parent / f"libkernels-{_kind()}.library"
+    if path.exists():
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError as error:
+            warnings.warn(f"torchrg cannot load its kernels: {error}", stacklevel=2)
+            return None
+        for name in SIGNATURES:
+            getattr(library, name).restype = ctypes.c_int64
+        return library
+    warnings.warn(
+        "torchrg runs without its kernels, several times slower: install it where a C++ compiler "
+        "is, or with TORCHRG_KERNELS set as the guide says.",
+        stacklevel=2,
+    )
+    return None

@@ -1,0 +1,149 @@
+// Nearest neighbours by cells: torchrg/neighbors/grid.py.
+#include "plain.h"
+
+namespace {
+
+constexpr int MOST_CANDIDATES = 4096;  // points of a cell and those around it
+constexpr int MOST_CHOSEN = 1024;      // of these, the ones that are sorted
+constexpr double SURELY = 1e-6;        // rounding of which cell a point at a border is in
+
+struct Candidates {
+  alignas(32) double x[MOST_CANDIDATES], y[MOST_CANDIDATES], z[MOST_CANDIDATES],
+      square[MOST_CANDIDATES];
+  int32_t row[MOST_CANDIDATES], chosen[MOST_CHOSEN + 1];
+  alignas(32) double distance[MOST_CHOSEN];
+  alignas(32) int64_t rank[MOST_CHOSEN];
+  int32_t row_of[MOST_CHOSEN];
+};
+
+// Sorts chosen candidates by distance, then row; returns the distance of the last of k.
+INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
+  const int width = padded(count);
+  for (int i = 0; i < width; i++) {
+    const int place = all.chosen[i < count ? i : 0];
+    all.distance[i] = square_root(all.square[place]), all.row_of[i] = all.row[place];
+    all.rank[i] = 0;
+  }
+  for (int j = 0; j < count; j++) {
+    const double distance = all.distance[j];
+    for (int i = 0; i < width; i++) all.rank[i] += distance < all.distance[i];
+  }
+  double farthest = 0;
+  bool is_tied = false;
+  for (int i = 0; i < k; i++) sorted[i] = -1;
+  for (int i = 0; i < count; i++) {
+    if (all.rank[i] >= k) continue;
+    is_tied |= sorted[all.rank[i]] != -1;
+    sorted[all.rank[i]] = all.row_of[i];
+    farthest = larger(farthest, all.distance[i]);
+  }
+  for (int i = 0; is_tied && i < count; i++) {
+    int64_t rank = all.rank[i];
+    for (int j = 0; j < count; j++)
+      rank += all.distance[j] == all.distance[i] && all.row_of[j] < all.row_of[i];
+    if (rank < k) sorted[rank] = all.row_of[i];
+  }
+  return farthest;
+}
+
+}  // namespace
+
+// Sorts points by cells: `starts` gets the first place of each cell, of which the last is the end.
+KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,
+                  int64_t width, int64_t height, double x, double y, double z, double size,
+                  int32_t* rows, int32_t* cells, double* sorted) {
+  if (width > num_cells || height > num_cells) return TOO_WIDE;
+  for (int64_t c = 0; c < num_cells; c++) starts[c] = 0;
+  for (int64_t i = 0; i < num_points; i++) {
+    const double* p = points + 3 * i;
+    const double u = (p[0] - x) / size, v = (p[1] - y) / size, w = (p[2] - z) / size;
+    bool inside = u >= 0 && u < num_cells && v >= 0 && v < width - 2 && w >= 0 && w < height - 2;
+    if (!inside) return NO_SUCH_ROW;
+    const int64_t cell = (int64_t(u + 1) * width + int64_t(v + 1)) * height + int64_t(w + 1);
+    if (cell + 1 >= num_cells) return NO_SUCH_ROW;
+    cells[i] = int32_t(cell), starts[cell]++;
+  }
+  int32_t before = 0;
+  for (int64_t c = 0; c < num_cells; c++) before += starts[c], starts[c] = before;
+  for (int64_t i = num_points - 1; i >= 0; i--) {
+    const int32_t place = --starts[cells[i]];
+    rows[place] = int32_t(i);
+    for (int axis = 0; axis < 3; axis++) sorted[3 * place + axis] = points[3 * i + axis];
+  }
+  return DONE;
+}
+
+// Writes the k nearest of the asked points in cells `from` to `to` to their rows of `found`, in the
+// order of rows `order` if there is one, and tells which are certain.
+KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const double* sorted, Ints rows,
+                    Ints starts, Flagged asked, Longs order, int32_t* found, bool* certain,
+                    int64_t from, int64_t to, int64_t width, int64_t height, int64_t first_row,
+                    double x, double y, double z, double size) {
+  if (k < 1 || k > MOST || from < 0 || to > num_cells - 1) return TOO_WIDE;
+  if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
+  Candidates all;
+  const int64_t step = width * height;
+  double guess = 0;
+  for (int64_t c = from; c < to; c++) {
+    if (starts[c] == starts[c + 1]) continue;
+    int64_t number = 0, first[9], length[9];
+    for (int g = 0; g < 9; g++) {
+      const int64_t middle = c + (g / 3 - 1) * step + (g % 3 - 1) * height;
+      if (middle < 1 || middle + 2 >= num_cells) return NO_SUCH_ROW;
+      first[g] = starts[middle - 1], length[g] = starts[middle + 2] - first[g];
+      if (first[g] < 0 || length[g] < 0 || first[g] + length[g] > num_points) return NO_SUCH_ROW;
+      number += length[g];
+    }
+    if (number <= k || number > MOST_CANDIDATES) continue;
+    int n = 0;
+    for (int g = 0; g < 9; g++) {
+      if (!are_rows(rows + first[g], length[g], num_points)) return NO_SUCH_ROW;
+      for (int64_t t = first[g]; t < first[g] + length[g]; t++, n++) {
+        all.x[n] = sorted[3 * t], all.y[n] = sorted[3 * t + 1], all.z[n] = sorted[3 * t + 2];
+        all.row[n] = rows[t];
+      }
+    }
+    const double u = x + (double(c / step) - 0.5) * size, w = z + (double(c % height) - 0.5) * size,
+                 v = y + (double(c / height % width) - 0.5) * size;
+    for (int64_t place = starts[c]; place < starts[c + 1]; place++) {
+      if (place < 0 || place >= num_points) return NO_SUCH_ROW;
+      const int32_t row = rows[place];
+      if (uint32_t(row) >= uint64_t(num_points)) return NO_SUCH_ROW;
+      if (!asked[row]) continue;
+      const double *own = sorted + 3 * place, px = own[0], py = own[1], pz = own[2];
+      for (int t = 0; t < n; t++) {
+        const double a = all.x[t] - px, b = all.y[t] - py, d = all.z[t] - pz;
+        all.square[t] = a * a + b * b + d * d;
+      }
+      const double off = larger(larger(size_of(px - u), size_of(py - v)), size_of(pz - w));
+      const double border = (1.5 * size - off) * (1 - SURELY), most = border * border;
+      double within = guess > 0 && guess < most ? guess : most;
+      int count = 0;
+      for (int turn = 0; turn < 8; turn++) {
+        count = 0;
+        for (int t = 0; t < n; t++) {
+          all.chosen[count < MOST_CHOSEN ? count : MOST_CHOSEN] = t;
+          count += all.square[t] < within;
+        }
+        if (count > MOST_CHOSEN)
+          within *= 0.7;
+        else if (count < k && within < most)
+          within = smaller(within * 1.6, most);
+        else
+          break;
+      }
+      if (count < k || count > MOST_CHOSEN) continue;
+      const int64_t to_row = order ? order[row] : row;
+      if (to_row < 0 || to_row >= num_points) return NO_SUCH_ROW;
+      int32_t* list = found + k * to_row;
+      const double farthest = sort(all, count, int(k), list);
+      // Whether what is beyond could tie with the last one by rounding.
+      if (!(farthest * (1 + SURELY) < square_root(within))) continue;
+      for (int j = 0; j < k; j++)
+        list[j] = int32_t((order ? order[list[j]] : int64_t(list[j])) + first_row);
+      certain[row] = true;
+      guess = farthest * farthest * 1.35;
+    }
+  }
+  return DONE;
+}

@@ -1,0 +1,229 @@
+// The inner loops of consensus normals: one neighbourhood stays in the cache for all steps on it.
+// torchrg/normals/consensus/ defines and explains them, torchrg/normals/jet.py the paraboloids.
+#include "plain.h"
+
+namespace {
+
+// Of torchrg/normals/consensus/constants.py, in the order of its names here.
+struct Constants {
+  float vote_reach, vote_falloff, fit_reach, fit_falloff, gap, corner_limit, corner_share;
+  float num_refits, num_alternations, least;
+};
+
+struct Meeting {
+  Plane plane;
+  float deviation;
+};
+
+INLINE float sum(const float* values, int width) {
+  Lanes lanes{};
+  for (int j = 0; j < width; j += LANES) lanes += load(values + j);
+  return total(lanes);
+}
+
+INLINE float product(const float* a, const float* b, int width) {
+  Lanes lanes{};
+  for (int j = 0; j < width; j += LANES) lanes += load(a + j) * load(b + j);
+  return total(lanes);
+}
+
+INLINE void residuals(const Patch& patch, const Plane& plane, float* rests) {
+  for (int j = 0; j < patch.width; j += LANES) store(rests + j, plane.residuals(patch, j));
+}
+
+// hypotheses._refitted
+INLINE void refit(const Patch& patch, const float* weights, float reach, bool bisquare,
+                  Plane& plane) {
+  alignas(32) float shares[MOST];
+  const float inverse = 1 / reach;
+  for (int j = 0; j < patch.width; j += LANES) {
+    const Lanes rest = plane.residuals(patch, j) * inverse;
+    Lanes near = positive(1 - rest * rest);
+    if (bisquare) near *= near;
+    store(shares + j, load(weights + j) * near);
+  }
+  const Plane fitted = fit_plane(patch, shares, patch.width);
+  if (float(fitted.middle) > 1e-6f * float(fitted.high)) plane = fitted;
+}
+
+// hypotheses.vote_planes
+Plane vote(const Patch& patch, const float* counted, float noise, const float* start,
+           const int64_t* ranks, int64_t num_pairs, const Constants& constants) {
+  alignas(32) float weights[MOST], nearness[MOST];
+  const float far = farthest(patch, counted), inverse = far > 0 ? 1 / far : 1;
+  for (int j = 0; j < patch.width; j += LANES) {
+    const Lanes near = patch.sq_lengths(j) * inverse;
+    store(nearness + j, near);
+    store(weights + j, (1 - constants.vote_falloff * near) * load(counted + j));
+  }
+  const float reach = constants.vote_reach * noise, per_reach = 1 / reach;
+  Plane plane = {start[0], start[1], start[2], 0, 0, 0, 0};
+  float best = support(patch, weights, plane.a * per_reach, plane.b * per_reach,
+                       plane.c * per_reach, 0);
+  for (int64_t pair = 0; pair < num_pairs; pair++) {
+    const int64_t p = ranks[2 * pair], q = ranks[2 * pair + 1];
+    float a = patch.y[p] * patch.z[q] - patch.z[p] * patch.y[q];
+    float b = patch.z[p] * patch.x[q] - patch.x[p] * patch.z[q];
+    float c = patch.x[p] * patch.y[q] - patch.y[p] * patch.x[q];
+    const float sq_area = a * a + b * b + c * c;
+    if (!(sq_area > 0)) continue;
+    const float length = square_root(sq_area);
+    a /= length, b /= length, c /= length;
+    const float score = support(patch, weights, a * per_reach, b * per_reach, c * per_reach, 0);
+    if (score > best) best = score, plane.a = a, plane.b = b, plane.c = c;
+  }
+  for (int i = 0; i < constants.num_refits; i++) refit(patch, weights, reach, false, plane);
+  for (int j = 0; j < patch.width; j += LANES)
+    store(weights + j, (1 - constants.fit_falloff * load(nearness + j)) * load(counted + j));
+  for (int i = 0; i < constants.num_refits; i++)
+    refit(patch, weights, constants.fit_reach * noise, true, plane);
+  return plane;
+}
+
+// hypotheses._beyond: the points off a surface, on the side with more; all of them count.
+INLINE void beyond(const Patch& patch, const float* rests, float gap, float* flags) {
+  Lanes over{}, under{};
+  for (int j = 0; j < patch.width; j += LANES) {
+    over += where(load(rests + j) > gap, load(patch.weight + j), all(0));
+    under += where(load(rests + j) < -gap, load(patch.weight + j), all(0));
+  }
+  const float sign = total(under) <= total(over) ? 1 : -1;
+  for (int j = 0; j < patch.width; j += LANES)
+    store(flags + j, where(load(rests + j) * sign > gap, load(patch.weight + j), all(0)));
+}
+
+INLINE void near(const Patch& patch, const float* rests, float gap, const float* counted,
+                 float* flags) {
+  for (int j = 0; j < patch.width; j += LANES)
+    store(flags + j, where(magnitude(load(rests + j)) <= gap, load(counted + j), all(0)));
+}
+
+INLINE float side(float sum) { return sum >= 0 ? 1 : -1; }
+
+// hypotheses.fit_wedges, and fit_corners where there is a third group of points: planes and their
+// points in turn. Leaves the points of each plane, and signed distances from the surface.
+Meeting alternate(const Patch& patch, int count, float* first, float* second, float* third,
+                  float* outer, const Constants& constants) {
+  alignas(32) float r[MOST], s[MOST], t[MOST];
+  const int width = patch.width;
+  bool present = true;
+  float cuts = 0;
+  Plane one, other, last;
+  for (int turn = 0; turn <= constants.num_alternations; turn++) {
+    const float fewest = smaller(sum(first, width), sum(second, width));
+    present &= (third ? smaller(fewest, sum(third, width)) : fewest) >= constants.least;
+    if (turn == constants.num_alternations) break;
+    one = fit_plane(patch, first, width), other = fit_plane(patch, second, width);
+    residuals(patch, one, r), residuals(patch, other, s);
+    const float u = side(product(r, second, width)), v = side(product(s, first, width));
+    for (int j = 0; j < width; j += LANES) {
+      const Lanes e = load(r + j) * u, f = load(s + j) * v, weight = load(patch.weight + j);
+      store(r + j, where(f > e, weight, all(0))), store(outer + j, smaller(e, f));
+    }
+    if (third) {
+      last = fit_plane(patch, third, width), residuals(patch, last, t);
+      const float w = side(product(t, first, width) + product(t, second, width));
+      if (cuts == 0) cuts = side(product(outer, third, width));
+      for (int j = 0; j < width; j += LANES) {
+        const Lanes pair = load(outer + j) * cuts, added = load(t + j) * w;
+        store(outer + j, smaller(added, pair) * cuts);
+        store(third + j, where(pair > added, load(patch.weight + j), all(0)));
+      }
+    }
+    for (int j = 0; j < width; j += LANES) {
+      const Lanes weight = load(patch.weight + j);
+      const Lanes left = weight - (third ? load(third + j) : all(0));
+      store(outer + j, load(outer + j) * weight);
+      store(first + j, load(r + j) * left), store(second + j, left - load(first + j));
+    }
+  }
+  const float freedom = count - (third ? 9 : 6), squares = product(outer, outer, width);
+  const Plane& own = third && third[0] > 0 ? last : second[0] > 0 ? other : one;
+  return {own, present ? square_root(squares / larger(freedom, 1.0f)) : INFINITE};
+}
+
+// hypotheses.fit_meeting_planes
+Meeting meet(const Patch& patch, const Plane& voted, float noise, int count, const int64_t* ranks,
+             int64_t num_pairs, const Constants& constants) {
+  alignas(32) float first[MOST], second[MOST], third[MOST], outer[MOST], rest[MOST];
+  const int width = patch.width;
+  const float gap = constants.gap * noise;
+  residuals(patch, voted, rest);
+  near(patch, rest, gap, patch.weight, first), beyond(patch, rest, gap, second);
+  const Meeting best = alternate(patch, count, first, second, nullptr, outer, constants);
+  if (!(best.deviation > constants.corner_limit * noise)) return best;
+  const float least = constants.corner_share * best.deviation;
+  // Three planes from the two and what is off them.
+  beyond(patch, outer, gap, third);
+  for (int j = 0; j < width; j += LANES) {
+    const Lanes on = 1 - load(third + j), is_first = load(first + j);
+    store(second + j, (load(patch.weight + j) - is_first) * on), store(first + j, is_first * on);
+  }
+  const Meeting by_two = alternate(patch, count, first, second, third, outer, constants);
+  // Three planes from the voted one and that with the most votes of what it leaves.
+  residuals(patch, voted, outer);
+  near(patch, outer, gap, patch.weight, first);
+  int anchor = 0;
+  for (int j = 0; j < width; j++) rest[j] = patch.weight[j] - first[j];
+  while (anchor < width && rest[anchor] == 0) anchor++;
+  if (anchor == width) anchor = 0;
+  Patch moved = patch;
+  for (int j = 0; j < width; j++) {
+    moved.x[j] -= patch.x[anchor], moved.y[j] -= patch.y[anchor], moved.z[j] -= patch.z[anchor];
+    if (patch.weight[j] == 0) moved.x[j] = moved.y[j] = moved.z[j] = 0;
+  }
+  const Plane start = fit_plane(moved, rest, width);
+  const float normal[3] = {start.a, start.b, start.c};
+  const Plane other = vote(moved, rest, noise, normal, ranks, num_pairs, constants);
+  residuals(moved, other, outer);
+  near(moved, outer, gap, rest, second);
+  for (int j = 0; j < width; j++) third[j] = rest[j] - second[j];
+  const Meeting by_votes = alternate(patch, count, first, second, third, outer, constants);
+  Meeting three = by_two.deviation < least ? by_two : Meeting{best.plane, least};
+  if (by_votes.deviation < three.deviation) three = by_votes;
+  return three.deviation < least ? three : best;
+}
+
+// Moves the points that count to the front, where nothing else is left; returns their number.
+INLINE int compact(Patch& patch) {
+  int count = 0;
+  for (int j = 0; j < patch.width; j++) {
+    if (patch.weight[j] == 0) continue;
+    patch.x[count] = patch.x[j], patch.y[count] = patch.y[j], patch.z[count] = patch.z[j];
+    patch.weight[count++] = 1;
+  }
+  for (int j = count; j < patch.width; j++)
+    patch.x[j] = patch.y[j] = patch.z[j] = patch.weight[j] = 0;
+  patch.width = padded(larger(count, 1));
+  return count;
+}
+
+}  // namespace
+
+// surfaces.broken_planes: the plane of the votes, and that of two or three which meet. `pairs` are ranks of candidates for `k` counted neighbours.
+KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t num_pairs,
+                     int64_t num_constants, Floats points, Ints indices, Flagged mask, Floats noise,
+                     Floats normals, Longs pairs, Floats numbers, float* voted,
+                     float* voted_offsets, float* meeting, float* meeting_offsets,
+                     float* deviations) {
+  if (k < 1 || k > MOST || 4 * num_constants != sizeof(Constants)) return TOO_WIDE;
+  Constants constants;
+  __builtin_memcpy(&constants, numbers, sizeof constants);
+  const float turns = constants.num_alternations;
+  if (!(turns >= 1 && turns < MOST && constants.num_refits < MOST)) return TOO_WIDE;
+  const Lists lists = {num_points, num_rows, k, points, indices, mask};
+  Patch patch;
+  for (int64_t i = 0; i < num_rows; i++) {
+    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+    const int count = compact(patch);
+    for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
+      if (pairs[rank] < 0 || pairs[rank] >= count) return NO_SUCH_ROW;
+    const Plane plane =
+        vote(patch, patch.weight, noise[i], normals + 3 * i, pairs, num_pairs, constants);
+    const Meeting found = meet(patch, plane, noise[i], count, pairs, num_pairs, constants);
+    write(plane, voted, i), write(found.plane, meeting, i);
+    voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
+    deviations[i] = found.deviation;
+  }
+  return DONE;
+}

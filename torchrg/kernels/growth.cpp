@@ -1,0 +1,72 @@
+// Edges that regions grow along, and growth itself: torchrg/regions/edges.py and growth.py.
+#include "plain.h"
+
+// Places and normals in edges.accept_edges, from points and normals (3, N) to the neighbours of
+// some rows; limits below 0 are off.
+KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
+                  Flagged valid, Floats reach, Ints indices, Flagged mask, Longs rows,
+                  double max_sq_chord, double max_sq_distance, int64_t is_signed, bool* joins) {
+  const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
+  const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
+  const float most = float(max_sq_distance);
+  for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
+    const int64_t i = rows[q];
+    if (i < 0 || i >= num_points || !are_rows(indices, k, num_points)) return NO_SUCH_ROW;
+    for (int64_t j = 0; j < k; j++) {
+      const int32_t t = indices[j];
+      const float dot = a[i] * a[t] + b[i] * b[t] + c[i] * c[t];
+      const float sign = is_signed ? 1 : __builtin_copysignf(1, dot);
+      const float da = a[t] - a[i] * sign, db = b[t] - b[i] * sign, dc = c[t] - c[i] * sign;
+      bool passes = valid[i] & valid[t] & (t != i);
+      passes &= !(max_sq_chord >= 0) | (da * da + db * db + dc * dc <= float(max_sq_chord));
+      const float u = x[t] - x[i], v = y[t] - y[i], w = z[t] - z[i];
+      passes &= !(max_sq_distance >= 0) | (u * u + v * v + w * w <= most);
+      if (reach) {
+        passes &= size_of(u * a[i] + v * b[i] + w * c[i]) <= reach[i];
+        passes &= size_of(u * a[t] + v * b[t] + w * c[t]) <= reach[t];
+      }
+      joins[j] = passes;
+    }
+    for (int64_t j = 0; mask && j < k; j++) joins[j] &= mask[q * k + j];
+  }
+  return DONE;
+}
+
+// growth.grow_first_in_first_out, with a bit for each neighbour that joins, in words of 64.
+//
+// A target becomes a seed by the bit of the edge, or where it is one itself. With `late` promotion
+// those that merely join do so when all seeds of the region are known.
+KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t num_roots,
+                    Ints indices, Longs joins, Longs makes_seed, Flagged is_seed, Flagged valid,
+                    Ints order, int64_t late, int32_t* roots, int32_t* queue) {
+  if (64 * num_words < k) return TOO_WIDE;
+  for (int64_t i = 0; i < num_points; i++) roots[i] = -1;
+  for (int64_t r = 0; r < num_roots; r++) {
+    const int32_t root = order[r];
+    if (uint32_t(root) >= uint64_t(num_points)) return NO_SUCH_ROW;
+    if (roots[root] >= 0 || !valid[root]) continue;
+    roots[root] = root, queue[0] = root;
+    int64_t count = 1;
+    for (int claims = 0; claims <= late; claims++)
+      for (int64_t head = 0; head < count; head++) {
+        const int64_t seed = queue[head];
+        for (int64_t word = 0; word < num_words; word++) {
+          uint64_t edges = joins[seed * num_words + word];
+          const uint64_t promoting = makes_seed ? makes_seed[seed * num_words + word] : 0;
+          if (late) edges &= claims ? ~promoting : promoting;
+          for (; edges; edges &= edges - 1) {
+            const int bit = __builtin_ctzll(edges);
+            if (64 * word + bit >= k) return TOO_WIDE;
+            const int32_t target = indices[seed * k + 64 * word + bit];
+            if (uint32_t(target) >= uint64_t(num_points)) return NO_SUCH_ROW;
+            if (roots[target] >= 0 || !valid[target]) continue;
+            roots[target] = root;
+            if (claims) continue;
+            if (makes_seed ? promoting >> bit & 1 : is_seed && is_seed[target])
+              queue[count++] = target;
+          }
+        }
+      }
+  }
+  return DONE;
+}
