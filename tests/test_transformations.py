@@ -160,6 +160,7 @@ def test_functional_gradients_are_those_of_autograd(name, patches):
 @of_torch
 @functions
 def test_compiled_without_graph_breaks(name, patches):
+    torch.compiler.reset()  # The functions share code, which torch compiles only so many times.
     compiled = torch.compile(FUNCTIONS[name], fullgraph=True, backend="aot_eager")
     assert_close(compiled(patches), FUNCTIONS[name](patches))
     leaf = patches.clone().requires_grad_()
