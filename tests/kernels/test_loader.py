@@ -38,7 +38,7 @@ def any_tensor(draw, letter, shape, num_points):
 
 def any_call(draw, name):
     """Call a kernel with lengths of 0 to 70; return whether it took the arguments."""
-    lengths = {letter: draw.choice([0, 1, 2, 3, 8, 9, 16, 50, 64, 70]) for letter in "NnkpcCw"}
+    lengths = {letter: draw.choice([0, 1, 2, 3, 8, 9, 16, 50, 64, 70]) for letter in "NnkpcCweErRF"}
     lengths["c"] = draw.choice([10, lengths["c"]])
     arguments = []
     for word in SIGNATURES[name].split("->")[0].split():

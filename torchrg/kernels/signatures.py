@@ -20,5 +20,9 @@ SIGNATURES = {
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n -> i[N] i[N]",
+    "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
+    "gather_borders": "l[e] l[e] d[e] d[e] L[r] L[r] -> l[e] l[e] l[e] d[e] d[e] l[1]",
+    "merging_costs": "d[R] d[RF] d[Rc] d[Rc] l[E] l[E] d[E] d[E] x x -> d[E]",
+    "cheapest_borders": "l[E] l[E] d[E] D[R] -> l[R]",
     "neighbor_quantiles": "f[N] i[nk] b[nk]? x n -> f[n]",
 }
