@@ -12,12 +12,15 @@ from typing import Any, Literal, TypeVar
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
+from torchrg.structures import Sampling
 
 Settings = TypeVar("Settings")
 NormalMethod = Literal[
     "pca", "jet", "irls", "fastmcd", "mve", "detmcd", "detmm", "paper", "consensus"
 ]
 DEFAULT_PRESET = "consensus"
+Auto = Literal["auto"]
+"""A setting that is measured; see :meth:`PipelineConfig.at_sampling`."""
 NO_FLAG = {"is_flag": False}
 """Metadata of a setting that files and Python change, and no flag of the command line."""
 
@@ -57,11 +60,11 @@ class NormalsConfig:
     adaptive_k: int | None = None
     """Largest number of neighbours that consensus may use in noisy clouds, where k are too few to
     tell faces apart. None: always k."""
-    noise_scope: Literal["local", "regional"] = "local"
+    noise_scope: Literal["auto", "local", "regional"] = "auto"
     """Noise about a point, as consensus sees it: what is found at the point (local), or at most
     what is found in the region around it, within four neighbourhoods (regional). Regional is for
-    reconstructions, which round a step between parallel faces into a ramp that looks like noise to
-    the points on it."""
+    vertices of meshes with noise: reconstructions round a step between parallel faces into a ramp
+    that looks like noise to the points on it. By default it is measured which of them these are."""
 
     def __post_init__(self) -> None:
         _check_choices(self)
@@ -72,6 +75,14 @@ class NormalsConfig:
         _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
         _require(self, "irls_decay", "> 1", self.irls_decay > 1)
+
+
+    def at_sampling(self, sampling: Sampling) -> "NormalsConfig":
+        """Return the settings with a choice; see :meth:`PipelineConfig.at_sampling`."""
+        if self.noise_scope != "auto":
+            return self
+        is_regional = _facets(sampling) < 0.5 and sampling.variation < _VARIATION
+        return dataclasses.replace(self, noise_scope="regional" if is_regional else "local")
 
 
 @dataclass(frozen=True)
@@ -118,16 +129,19 @@ class GrowingConfig:
     max_distance: float | None = None
     """A neighbour farther than this does not join, in the unit of the cloud. Where points are few,
     the k nearest neighbours reach across gaps, and this keeps them apart. None: not tested."""
-    min_size: int = 50
+    min_size: int | Auto = "auto"
     """Regions of fewer points are not labelled. With absorb, points at the borders of a region
-    count as well."""
+    count as well. By default the points on a square whose side is a 27th of the height of the
+    cloud, 10 cm in a room, but 20 to 50."""
     cut_bridges: bool = True
     """Whether a region of several faces that only a few points join is split, as faces 12 degrees
     apart and floors with furniture on them are. It takes consensus about a twentieth more time."""
-    facet_tolerance: float | None = None
+    facet_tolerance: float | Auto | None = "auto"
     """After growth, regions that touch become one when they lie within this root mean square
     distance of one plane, in the unit of the cloud. It is for points drawn from a mesh, which lie
-    exactly on its facets, of which a flat face has several. None: they stay apart."""
+    exactly on its facets, of which a flat face has several, and for reconstructions that bend flat
+    faces. By default 1/225 of the height of the cloud, 12 mm in a room, where deviations grow with
+    scale, and none where noise is white. None: they stay apart."""
     max_plane_residual: float | None = None
     """After growth, a point loses its label when it is farther from the plane of its region than
     this many times the thickness of the region. None: it keeps the label."""
@@ -162,13 +176,48 @@ class GrowingConfig:
             value = getattr(self, name)
             _require(self, name, ">= 0 or none", value is None or value >= 0)
         facets = self.facet_tolerance
-        _require(self, "facet_tolerance", "> 0 or none", facets is None or facets > 0)
-        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        is_open = facets is None or facets == "auto"
+        _require(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets) > 0)
+        least = self.min_size
+        _require(self, "min_size", ">= 1 or auto", least == "auto" or int(least) >= 1)
         residual = self.max_plane_residual
         _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
         _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
         _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
+
+
+    def at_sampling(self, sampling: Sampling) -> "GrowingConfig":
+        """Return the settings with numbers; see :meth:`PipelineConfig.at_sampling`."""
+        least, tolerance = self.min_size, self.facet_tolerance
+        if least == "auto":
+            side = _SIDE_OF_REGION * sampling.height
+            low, high = _LEAST_SIZES
+            least = min(max(round(sampling.density * side**2), low), high)
+        if tolerance == "auto":
+            reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
+            most = min(_FACETS_BY_HEIGHT * sampling.height, _FACETS_BY_REACH * reach)
+            tolerance = _facets(sampling) * most or None
+        return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance)
+
+
+_WHITENESS = 0.4, 0.6
+"""Whiteness up to which faces are in facets or bent, and from which on noise is white."""
+_VARIATION = 0.34
+"""Variation of spacing below which points are vertices of a mesh or of a grid."""
+_FACETS_BY_HEIGHT, _FACETS_BY_REACH = 1 / 225, 0.3
+"""Tolerance of facets by the height of the cloud, and at most by the reach of 50 neighbours, that
+scans of many storeys do not have a larger one."""
+_SIDE_OF_REGION = 1 / 27
+"""Side of the least region by the height of the cloud: 10 cm in a room of 2.7 m."""
+_LEAST_SIZES = 20, 50
+"""Bounds of the points of the least region: fewer have no sure plane, and 50 is the paper's."""
+
+
+def _facets(sampling: Sampling) -> float:
+    """Return how much of the deviation from planes is form and not noise, in [0, 1]."""
+    low, high = _WHITENESS
+    return min(max((high - sampling.whiteness) / (high - low), 0.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -223,6 +272,33 @@ class PipelineConfig:
             for part, name in _ANGLES.items()
         }
         return dataclasses.replace(self, **parts)
+
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether a setting that counts is ``auto``, so that the cloud has to be measured."""
+        scope = self.normals.method == "consensus" and self.normals.noise_scope
+        return "auto" in (scope, self.growing.min_size, self.growing.facet_tolerance)
+
+    def at_sampling(self, sampling: Sampling) -> "PipelineConfig":
+        """Return the settings with numbers in place of ``auto``, by how a cloud samples surfaces.
+
+        Where whiteness is below 0.4, faces are bent or in facets, and ``facet_tolerance`` is 1/225
+        of the height of the cloud, but at most 0.3 of the reach of 50 neighbours; from 0.6 on noise
+        is white, and there is none; between, it falls evenly. The noise of a region counts where it
+        is white and distances to the nearest point vary by less than 0.34, as only those of
+        vertices and grids do.
+
+        Example:
+            >>> config = load_config().at_sampling(Sampling(0.06, 0.5, 4400.0, 2.7))
+            >>> config.growing.facet_tolerance, config.growing.min_size, config.normals.noise_scope
+            (0.012, 44, 'local')
+        """
+        return dataclasses.replace(
+            self,
+            normals=self.normals.at_sampling(sampling),
+            growing=self.growing.at_sampling(sampling),
+        )
 
 
 _ANGLES = {"normals": "sharp_angle_deg", "growing": "max_angle_deg"}

@@ -23,6 +23,7 @@ from torchrg.errors import ShapeError
 from torchrg.neighbors import (
     canonical_order,
     finite_rows,
+    measure_sampling,
     restore_points,
     restore_rows,
     sample_voxels,
@@ -156,6 +157,10 @@ def _segment(
     if len(cloud.points):
         k = min(config.normals.k, len(cloud.points))
         neighbors = search_knn(cloud.points, k, canonical=True)
+    sampling = None
+    if config.is_measured:
+        sampling = measure_sampling(cloud.points, neighbors)
+        config = config.at_sampling(sampling)
 
     begin("normals")
     estimate = ESTIMATORS[config.normals.method]
@@ -190,7 +195,7 @@ def _segment(
         planes = describe(points[rows], normals[rows], labels[rows])._replace(adjacency=adjacency)
     begin("done")
     kept = neighbors if voxel is None else None
-    return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept)
+    return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
 
 
 def _numbered_by_points(labels: Tensor, num_planes: int) -> tuple[Tensor, Tensor]:

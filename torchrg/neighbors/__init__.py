@@ -2,6 +2,7 @@
 
 from torchrg.neighbors.knn import gather_columns, gather_patches, search_knn, search_nearest
 from torchrg.neighbors.order import canonical_order, finite_rows, restore_rows
+from torchrg.neighbors.sampling import measure_sampling
 from torchrg.neighbors.voxels import Voxels, restore_points, sample_voxels
 
 __all__ = [
@@ -10,6 +11,7 @@ __all__ = [
     "finite_rows",
     "gather_columns",
     "gather_patches",
+    "measure_sampling",
     "restore_points",
     "restore_rows",
     "sample_voxels",

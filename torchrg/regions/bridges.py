@@ -105,7 +105,7 @@ def find_mixed_regions(
     off = has_region & (planes.distances(cloud.points, region) > limit[region])
     num_off = torch.bincount(labels[off], minlength=len(limit))
     on_plane = num_off <= _MOST_OFF_PLANE * planes.num_points
-    mixed = num_off >= config.min_size
+    mixed = num_off >= int(config.min_size)
     rows = (torch.where(on_plane[region], off, has_region) & mixed[region]).nonzero().squeeze(1)
     if len(rows) == 0:
         return None

@@ -196,7 +196,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     ]
     radius = segments.median(torch.cat(radii)).double()
     floor = config.coplanarity_floor * radius
-    facets = _FACET_THICKNESS * (config.facet_tolerance or 0.0)
+    facets = _FACET_THICKNESS * float(config.facet_tolerance or 0.0)
     planes = planes._replace(
         thickness=torch.maximum(planes.thickness, floor).clamp(min=facets),
         num_points=torch.bincount(labels + 1, minlength=1)[1:],

@@ -20,7 +20,7 @@ from torchrg._parallel import (
 )
 from torchrg.config import GrowingConfig, PipelineConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import blocks, canonical_order
+from torchrg.neighbors import blocks, canonical_order, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import (
@@ -134,6 +134,8 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
+    if "auto" in (config.min_size, config.facet_tolerance):
+        config = config.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
     labels = label_regions(cloud, grow(cloud, config, chunk_size), config, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
@@ -142,7 +144,7 @@ def label_regions(
     cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
     """Return labels of regions that have grown, after all steps that the settings ask for."""
-    least = config.min_size
+    least = int(config.min_size)
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
         least = min(least, max(least // 2, LEAST_FITTED))
@@ -152,15 +154,15 @@ def label_regions(
     if config.cut_bridges and bool((labels >= 0).any()):
         mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)
         if mixed is not None:
-            cores = number_by_size(grow(mixed.part, config, chunk_size), config.min_size)
+            cores = number_by_size(grow(mixed.part, config, chunk_size), int(config.min_size))
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
             labels = number_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
         contacts = NearestPoints(cloud.neighbors).contacts(labels)
-        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=config.facet_tolerance)
+        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=float(config.facet_tolerance))
         labels = number_by_size(labels, least)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
-        labels = number_by_size(refine_regions(cloud, labels, config, fits), config.min_size)
+        labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
     return labels
 
 
@@ -289,7 +291,7 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
         return _grow_by_bits(cloud, config, order, seeds, limit, chunk_size)
     if is_order_free(config):
         roots, others = reach_from_seeds(cloud, config, seeds, limit, chunk_size)
-        if config.min_size <= cloud.neighbors.indices.shape[1]:
+        if int(config.min_size) <= cloud.neighbors.indices.shape[1]:
             # Points that no seed reaches may make regions with free neighbours of their own.
             free = roots < 0
             left = grow_first_in_first_out(others, order[free[order]], free)
@@ -313,7 +315,7 @@ def _grow_by_bits(
     indices, late = cloud.neighbors.indices, promotes_late(config)
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
     begins, is_seed = order, cloud.curvature <= limit
-    if makes_seed is None and config.min_size > indices.shape[1]:
+    if makes_seed is None and int(config.min_size) > indices.shape[1]:
         # What a point has around it that no seed reaches is too small a region.
         begins = seeds
     bits = indices, joins, makes_seed, is_seed, cloud.valid

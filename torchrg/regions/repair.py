@@ -84,7 +84,7 @@ def refine_regions(
             normals=cloud.normals,
             max_angle_deg=config.absorb_angle_deg,
         )
-        labels = _drop_small(labels, config.min_size)
+        labels = _drop_small(labels, int(config.min_size))
     if config.merge_coplanar:
         planes = fits.of(labels)
         contacts = _contacts_to_merge(labels, beside, planes, cloud.neighbors)
@@ -103,7 +103,7 @@ def _drop_scattered(
     cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
 ) -> Tensor:
     """Return labels without small regions whose normals do not agree, with gaps."""
-    small = torch.bincount(labels + 1, minlength=1)[1:] < config.min_size
+    small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
     small = torch.cat([small, small.new_zeros(1)])
     segments = Segments(torch.where(small[labels], labels, UNLABELED))
     own, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE
 from torchrg.config import NormalsConfig
-from torchrg.neighbors import search_knn
+from torchrg.neighbors import measure_sampling, search_knn
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.noise import Survey, regional_noise, survey_noise
 from torchrg.normals.consensus.smoothing import (
@@ -76,6 +76,8 @@ def estimate_consensus(
             fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
             survey = survey_noise(points, neighbors, fit, chunk_size=size)
     noise = survey.noise
+    if config.noise_scope == "auto":
+        config = config.at_sampling(measure_sampling(points, neighbors))
     if config.noise_scope == "regional":
         noise = torch.minimum(noise, regional_noise(noise, neighbors))
         survey = survey._replace(noise=noise)
