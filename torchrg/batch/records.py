@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -102,41 +102,33 @@ def write_record(folder: Path, description: Record, report: TaskReport) -> None:
         beside.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def read_record(folder: Path) -> Record | None:
-    """Return the record in a folder, or None if there is none that can be read."""
-    content = _read_json(folder / RECORD)
-    return content if isinstance(content, dict) and _is_record(content) else None
+def read_record(folder: Path, *, is_ours: bool = False) -> Record | None:
+    """Return the record in a folder, or None if there is none that can be read.
 
-
-def check_record(folder: Path) -> None:
-    """Raise FormatError if another program has a file in the place of the record."""
-    content = _read_json(folder / RECORD)
-    if content is not None and not _is_record(content):
+    With ``is_ours``, a file of another program in its place is a FormatError.
+    """
+    try:
+        content = json.loads((folder / RECORD).read_bytes())
+    except (OSError, *DAMAGES):
+        return None
+    names = ("versions", "outputs")
+    if isinstance(content, dict) and all(isinstance(content.get(name), dict) for name in names):
+        return content
+    if is_ours and content is not None:
         raise FormatError(
             f"{folder / RECORD}: was not written by torchrg; move it away, or choose another "
             "directory."
         )
+    return None
 
 
-def _read_json(path: Path) -> object:
-    """Return what is in the place of the record, None if it is not there or damaged."""
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, *DAMAGES):
-        return None
-
-
-def _is_record(content: object) -> bool:
-    """Return whether an object of JSON is a record."""
-    names = ("versions", "outputs")
-    return isinstance(content, dict) and all(isinstance(content.get(name), dict) for name in names)
-
-
-def is_unchanged(folder: Path, name: str, noted: object) -> bool:
-    """Return whether a file beside a record is still the one that the record notes."""
-    path = folder / name
-    is_result = path.parent == folder and path.is_file() and not path.is_symlink()
-    return is_result and _fingerprint(path) == noted
+def remove_earlier(folder: Path, record: Record, files: Collection[str]) -> None:
+    """Remove the files of an earlier record, but for those of these names or changed since."""
+    for name in record["outputs"].keys() - set(files):
+        path = folder / name
+        is_result = path.parent == folder and path.is_file() and not path.is_symlink()
+        if is_result and _fingerprint(path) == record["outputs"][name]:
+            path.unlink()
 
 
 def reason_to_convert(job: Recorded) -> str:

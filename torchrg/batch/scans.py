@@ -9,6 +9,7 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,10 +20,9 @@ from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.records import (
     RECORD,
     Record,
-    check_record,
     describe_work,
-    is_unchanged,
     read_record,
+    remove_earlier,
     write_record,
 )
 from torchrg.batch.task import Begin, TaskReport, report_on
@@ -195,37 +195,32 @@ def convert_scan(job: Job) -> TaskReport:
     The record of an earlier run is removed first, and the new one written last: whoever finds a
     record finds complete files.
     """
-    is_new = False
-
-    def convert(begin: Begin) -> TaskReport:
-        nonlocal is_new
-        begin("hash")
-        description = job.describe()
-        is_new = not job.folder.exists()
-        job.folder.mkdir(parents=True, exist_ok=True)
-        for folder in (job.folder, *job.folder.parents):
-            sync_folder(folder.parent)
-            if folder == job.out:
-                break
-        record = job.folder / RECORD
-        check_place(record)
-        check_record(job.folder)
-        job.clean()
-        earlier = read_record(job.folder) or {"outputs": {}}
-        record.unlink(missing_ok=True)
-        with marked_parts(job.mark):
-            report = job.source.convert(job.scan, job.folder, begin)
-            begin("record")
-            for name in earlier["outputs"].keys() - set(report.files):
-                if is_unchanged(job.folder, name, earlier["outputs"][name]):
-                    (job.folder / name).unlink()
-            write_record(job.folder, description, report)
-        return report
-
-    report = report_on(job.name, convert)
+    is_new = not os.path.lexists(job.folder)
+    report = report_on(job.name, partial(_convert, job))
     if report.status == "failed" and is_new:
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
+    return report
+
+
+def _convert(job: Job, begin: Begin) -> TaskReport:
+    """Convert one scan, between the record of an earlier run and the new one."""
+    begin("hash")
+    description, folder = job.describe(), job.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in (folder, *folder.parents):
+        sync_folder(path.parent)
+        if path == job.out:
+            break
+    check_place(folder / RECORD)
+    earlier = read_record(folder, is_ours=True) or {"outputs": {}}
+    job.clean()
+    (folder / RECORD).unlink(missing_ok=True)
+    with marked_parts(job.mark):
+        report = job.source.convert(job.scan, folder, begin)
+        begin("record")
+        remove_earlier(folder, earlier, report.files)
+        write_record(folder, description, report)
     return report
 
 
