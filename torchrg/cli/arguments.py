@@ -37,7 +37,7 @@ OFTEN = (
 RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
-"""What decides where and how fast a command runs, never what it finds."""
+"""Flags that decide where and how fast a command runs, never what it finds."""
 _RUNNING = "how it runs, without effect on what is found"
 _EXAMPLES = "\n\nExamples:\n"
 _WIDEST = 100

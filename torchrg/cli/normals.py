@@ -30,7 +30,7 @@ from torchrg.normals import estimate_normals
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
-"""What is written of each point."""
+"""Fields of each point that are written."""
 
 
 @dataclass(frozen=True)

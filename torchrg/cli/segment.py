@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from torchrg import scratch
-from torchrg.batch.memory import available_memory, memory_of_scan, memory_on_disk
+from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import Record, describe_run
 from torchrg.batch.run import REPORT, lock_folder
 from torchrg.batch.scans import (
@@ -227,7 +227,7 @@ def _segment(
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
     """Refuse a cloud that takes more memory than allowed even with its large arrays on a disk."""
-    least = memory_on_disk(num_points)
+    least = memory_of_scan(num_points, on_disk=True)
     if least > limit:
         raise ConfigError(
             f"{source}: expected --limit-memory of at least {least / 1e9:.2f} GB for about "
