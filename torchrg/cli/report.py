@@ -25,12 +25,8 @@ def format_plan(plan: Plan) -> str:
 def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[float, str]) -> str:
     """Return what a plan would take, in words, or that there is nothing to do.
 
-    Args:
-        plan: The plan.
-        workers: Most scans at a time.
-        limit: Bytes of memory that these may take together.
-        free: Bytes that the disk of the results has free.
-        rate: Seconds of a core for a million points, and what these points are.
+    ``limit`` is the memory of all workers and ``free`` the room on the disk, in bytes; ``rate`` is
+    the seconds of a core for a million points, and what these points are.
     """
     jobs, (seconds, of_what) = plan.to_convert, rate
     if not jobs:
