@@ -81,7 +81,7 @@ class CloudSource(Source):
     level: int = 0
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 104
-    """What the largest of the layouts takes."""
+    """Space of a point in the largest of the layouts."""
     kind: ClassVar[str]
     """The name of the kind of source."""
     dataset: ClassVar[str] = "ScanNet"

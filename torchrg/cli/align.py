@@ -15,7 +15,7 @@ from torchrg.batch.scans import check_finite
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
-from torchrg.cli.loop import check_apart, note_input, output_paths, run_each, stage_bar
+from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_each, stage_bar
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
@@ -84,7 +84,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
         warn(f"{source}: {note}.")
     check_output(target, dataclasses.replace(cloud, header={}))
     settings = arguments.settings.resolved
-    with stage_bar(source.name, ("neighbors", "normals", "regions", "planes")) as advance:
+    with stage_bar(source.name, STAGES) as advance:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:
         with warnings_as_lines():

@@ -72,7 +72,7 @@ class Arguments:
     dry_run: bool = False
     """Say what would be done and why, and write nothing."""
     unit: ClassVar[str] = "scan"
-    """What one of them is called."""
+    """Name for one of them in messages."""
     seconds_per_million: ClassVar[tuple[float, str]] = (33.0, "points, as consensus takes")
     """Time of one core of an Intel Xeon for a million points, and what it is the time of: the table
     of README.md that ``scripts/bench.py steady`` measures. There ``classic`` takes a third of it,

@@ -19,6 +19,8 @@ from torchrg.structures import Cloud
 
 DRAWINGS = (".png", ".html")
 """Suffixes of pictures and pages."""
+STAGES = ("neighbors", "normals", "regions", "planes")
+"""Stages of the segmentation of a cloud, which progress bars show."""
 
 
 def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> list[Path]:

@@ -28,6 +28,7 @@ from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn
 from torchrg.cli.loop import (
+    STAGES,
     check_apart,
     is_page,
     left_out,
@@ -56,7 +57,6 @@ from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes
 from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
-STAGES = ("neighbors", "normals", "regions", "planes")
 _DATASET = "ScanNet"
 """The data set as whose scans layouts take clouds without labels."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
