@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes
 from torchrg.linalg.eigen import smallest_eigenvector3
 
@@ -167,6 +168,57 @@ class Segments:
     def mean(self, values: Tensor) -> Tensor:
         """Return the mean of each region's values."""
         return self.sum(values) / self.counts
+
+    def moments(
+        self, columns: Sequence[Tensor], weights: Tensor, *, centered: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Return the weighted mean ``(M, 3)`` and covariance ``(M, 3, 3)`` of each region.
+
+        The columns are as :meth:`take_columns` returns them; unless ``centered`` the mean is taken
+        for zero.
+        """
+        if self._is_served(weights):
+            numbers = self.counts, centered
+            mean, covariance = kernels.call("segment_moments", *columns, weights, *numbers)
+            return mean, covariance
+        total = self.sum(weights)
+        means = [self.sum(column * weights) / total * centered for column in columns]
+        about = [c - self.spread(mean) for c, mean in zip(columns, means, strict=True)]
+        return torch.stack(means, dim=1), second_moments(about, weights, self.sum, total)
+
+    def reweigh(
+        self,
+        columns: Sequence[Tensor],
+        means: Tensor,
+        axes: Tensor,
+        least: Tensor,
+        factors: tuple[float, float],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Weigh points by Tukey's bisquare of their residuals along an axis of each region.
+
+        A point weighs nothing at a number of standard deviations, the second of the factors, and
+        the first times the median of the residuals is one; at ``least`` ``(M,)``. Returns weights
+        ``(n,)``, medians of the residuals without their signs, and mean squares, ``(M,)``.
+        """
+        if self._is_served(means):
+            tables = self.counts, means, axes, least
+            weights, medians, squares = kernels.call(
+                "reweigh_segments", *columns, *tables, *factors
+            )
+            return weights, medians, squares
+        residuals = torch.zeros_like(columns[0])
+        # Products and sums apart: their rounding must not depend on where a block of memory ends.
+        for column, mean, part in zip(columns, means.T, axes.T, strict=True):
+            residuals += (column - self.spread(mean)) * self.spread(part)
+        medians = self.median(residuals.abs())
+        cut = factors[1] * torch.maximum(factors[0] * medians, least)
+        # A region of one place at the origin has cut 0: its residuals are 0 too.
+        ratio = residuals / self.spread(torch.where(cut > 0, cut, 1.0))
+        weights = (1 - ratio * ratio).clamp(min=0).square()
+        return weights, medians, self.mean(residuals * residuals)
+
+    def _is_served(self, values: Tensor) -> bool:
+        return values.device.type == "cpu" and kernels.serve() and bool(self.counts.all())
 
     def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smallest and the largest value of each region."""

@@ -1,0 +1,170 @@
+// Moments and residuals of regions whose points lie side by side: torchrg/linalg/moments.py.
+//
+// Sums are of halves of halves, in NumPy's order.
+#include "plain.h"
+
+namespace {
+
+typedef const double* Doubles;
+
+constexpr int BLOCK = 128;
+constexpr int SAMPLE = 512, NEAR = 40;  // of a sample's values, those around the one asked for
+
+// Adds up T terms of places `from` to `from + count`, which `fill` writes.
+template <int T, class Fill>
+void add_pairwise(int64_t from, int64_t count, const Fill& fill, double (&sums)[T]) {
+  if (count > BLOCK) {
+    const int64_t half = count / 2 - count / 2 % LANES;
+    double others[T];
+    add_pairwise<T>(from, half, fill, sums);
+    add_pairwise<T>(from + half, count - half, fill, others);
+    for (int t = 0; t < T; t++) sums[t] += others[t];
+    return;
+  }
+  alignas(32) double terms[T][BLOCK];
+  fill(from, int(count), terms);
+  const int whole = int(count) - int(count) % LANES;
+  for (int t = 0; t < T; t++) {
+    double lanes[LANES] = {}, sum = 0;
+    for (int lane = 0; lane < LANES && whole; lane++) lanes[lane] = terms[t][lane];
+    for (int j = LANES; j < whole; j += LANES)
+      for (int lane = 0; lane < LANES; lane++) lanes[lane] += terms[t][j + lane];
+    if (whole)
+      sum = ((lanes[0] + lanes[1]) + (lanes[2] + lanes[3])) +
+            ((lanes[4] + lanes[5]) + (lanes[6] + lanes[7]));
+    for (int j = whole; j < count; j++) sum += terms[t][j];
+    sums[t] = sum;
+  }
+}
+
+// As NumPy's reduceat: the first term, and the sum of all others.
+template <int T, class Fill>
+void add_up(int64_t from, int64_t count, const Fill& fill, double (&sums)[T]) {
+  double first[T][BLOCK];
+  fill(from, 1, first);
+  add_pairwise<T>(from + 1, count - 1, fill, sums);
+  for (int t = 0; t < T; t++) sums[t] = first[t][0] + sums[t];
+}
+
+// The value that k others precede; values move.
+double select(double* values, int64_t count, int64_t k) {
+  int64_t low = 0, high = count - 1;
+  while (low < high) {
+    const double a = values[low], b = values[low + (high - low) / 2], c = values[high];
+    const double pivot = larger(smaller(a, b), smaller(larger(a, b), c));
+    int64_t i = low, j = high;
+    while (i <= j) {
+      while (values[i] < pivot) i++;
+      while (pivot < values[j]) j--;
+      if (i > j) break;
+      const double other = values[i];
+      values[i++] = values[j], values[j--] = other;
+    }
+    if (k <= j)
+      high = j;
+    else if (k >= i)
+      low = i;
+    else
+      break;
+  }
+  return values[k];
+}
+
+// The same of `fill()`, which is called again if need be: what a sample shows to be near the value
+// is moved to the front first.
+template <class Fill>
+double select_filled(double* values, int64_t count, int64_t k, const Fill& fill) {
+  fill();
+  if (count < 8 * SAMPLE) return select(values, count, k);
+  double sample[SAMPLE];
+  for (int64_t i = 0; i < SAMPLE; i++) sample[i] = values[i * count / SAMPLE];
+  const int64_t rank = k * SAMPLE / count, low_rank = larger(rank - NEAR, int64_t(0)),
+                high_rank = smaller(rank + NEAR, int64_t(SAMPLE - 1));
+  const double low = select(sample, SAMPLE, low_rank), high = select(sample, SAMPLE, high_rank);
+  int64_t below = 0, between = 0;
+  for (int64_t i = 0; i < count; i++) {
+    const double value = values[i];
+    values[between] = value;
+    below += value < low, between += (value >= low) & (value <= high);
+  }
+  if (k >= below && k < below + between) return select(values, between, k - below);
+  fill();
+  return select(values, count, k);
+}
+
+INLINE int64_t sum_of(Longs counts, int64_t num, int64_t n) {
+  int64_t total = 0;
+  for (int64_t m = 0; m < num; m++) {
+    if (counts[m] < 1 || counts[m] > n - total) return -1;
+    total += counts[m];
+  }
+  return total;
+}
+
+}  // namespace
+
+// Segments.moments: means and covariances of weighted points, about zero if not centered.
+KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Doubles weights,
+                       Longs counts, int64_t is_centered, double* means, double* covariances) {
+  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
+  int64_t start = 0;
+  for (int64_t m = 0; m < num; start += counts[m++]) {
+    double total[1], sums[3], *mean = means + 3 * m, squares[6];
+    add_up<1>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
+      __builtin_memcpy(terms[0], weights + from, sizeof(double) * count);
+    }, total);
+    add_up<3>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
+      for (int j = 0; j < count; j++) {
+        const double weight = weights[from + j];
+        terms[0][j] = x[from + j] * weight, terms[1][j] = y[from + j] * weight;
+        terms[2][j] = z[from + j] * weight;
+      }
+    }, sums);
+    for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total[0] : 0;
+    const double a = mean[0], b = mean[1], c = mean[2];
+    add_up<6>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
+      for (int j = 0; j < count; j++) {
+        const double u = x[from + j] - a, v = y[from + j] - b, w = z[from + j] - c;
+        const double weight = weights[from + j], wu = weight * u, wv = weight * v;
+        terms[0][j] = wu * u, terms[1][j] = wu * v, terms[2][j] = wu * w;
+        terms[3][j] = wv * v, terms[4][j] = wv * w, terms[5][j] = weight * w * w;
+      }
+    }, squares);
+    const int place[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
+    for (int entry = 0; entry < 9; entry++)
+      covariances[9 * m + entry] = squares[place[entry]] / total[0];
+  }
+  return DONE;
+}
+
+// Segments.reweigh: medians and mean squares of the distances of points from planes, and Tukey's
+// bisquare of these in units of `cut` medians, or of the least.
+KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Longs counts,
+                        Doubles means, Doubles axes, Doubles least, double mad, double cut,
+                        double* weights, double* medians, double* squares) {
+  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
+  int64_t start = 0;
+  for (int64_t m = 0; m < num; start += counts[m++]) {
+    const double a = means[3 * m], b = means[3 * m + 1], c = means[3 * m + 2];
+    const double p = axes[3 * m], q = axes[3 * m + 1], r = axes[3 * m + 2];
+    const auto residual = [&](int64_t i) { return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r; };
+    medians[m] = select_filled(weights + start, counts[m], (counts[m] - 1) / 2, [&]() {
+      for (int64_t i = start; i < start + counts[m]; i++) {
+        const double away = size_of(residual(i));
+        weights[i] = away < double(INFINITE) ? away : double(INFINITE);
+      }
+    });
+    double sum[1];
+    add_up<1>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
+      for (int j = 0; j < count; j++) terms[0][j] = residual(from + j) * residual(from + j);
+    }, sum);
+    squares[m] = sum[0] / double(counts[m]);
+    double unit = cut * larger(mad * medians[m], least[m]);
+    unit = unit > 0 ? unit : 1;
+    for (int64_t i = start; i < start + counts[m]; i++) {
+      const double ratio = residual(i) / unit, weight = larger(1 - ratio * ratio, 0.0);
+      weights[i] = weight * weight;
+    }
+  }
+  return DONE;
+}
