@@ -76,21 +76,20 @@ class InverseCloud(NamedTuple):
 
 
 def grow_pixels(
-    cloud: InverseCloud, image: Image, planes: PixelPlanes, pixels: Pixels, config: DepthConfig
+    cloud: InverseCloud, flat: Tensor, joins: tuple[Tensor, Tensor], config: DepthConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Grow regions over a depth image, and give border pixels and parts of one face to them.
 
-    Regions are the connected components of the pairs of pixels that :func:`join_pixels` joins.
+    Regions are the connected components of the flat pixels that :func:`join_pixels` joins.
 
     Returns:
         Labels ``(H * W,)``, 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; unit normals
         of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
         thicker than noise and a slight bend can make it, ``(M,)``, bool.
     """
-    joins = join_pixels(image, planes, pixels, config)
-    labels = number_by_size(connect_pixels(planes.choice.flat, *joins), config.min_size)
+    labels = number_by_size(connect_pixels(flat, *joins), config.min_size)
     if not bool((labels >= 0).any()):
-        return labels, image.values.new_empty(0, 3), image.seen.new_empty(0)
+        return labels, cloud.points.new_empty(0, 3), flat.new_empty(0)
     labels, fit = _refine(cloud, labels, config)
     return labels, _normals_in_space(fit), fit.curved
 
@@ -219,9 +218,9 @@ class PixelGrid:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of regions that touch, and the number of contacts of each pair."""
-        regions = torch.stack([labels[pixels] for pixels in self.borders(labels)])
+        first, second = (labels[pixels] for pixels in self.borders(labels))
         num_regions = int(labels.max()) + 1
-        keys = regions.amin(dim=0) * num_regions + regions.amax(dim=0)
+        keys = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
         keys, counts = torch.unique(keys, return_counts=True)
         # Either pixel is beside the other.
         return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts

@@ -4,12 +4,13 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._parallel import sequential_operations
+from torchrg._parallel import places_of, sequential_operations
 from torchrg.config import DepthConfig
-from torchrg.depth.camera import has_depth, points_of_image, read_intrinsics
-from torchrg.depth.growth import InverseCloud, grow_pixels
+from torchrg.depth.camera import has_depth, read_intrinsics
+from torchrg.depth.growth import InverseCloud, grow_pixels, join_pixels
 from torchrg.depth.normals import Pixels, describe_pixels, fit_pixels
 from torchrg.depth.windows import Image
+from torchrg.linalg.moments import kth_smallest
 from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 
@@ -87,11 +88,13 @@ def _segment(
     image, x, y = Image(inverse, seen, u, v), u / fx, v / fy
     planes = fit_pixels(image, focal=focal, noise=config.noise, dtype=depth.dtype)
     pixels = describe_pixels(image, planes, x, y, focal)
+    joins, flat, edge = join_pixels(image, planes, pixels, config), *planes.choice[1:]
+    del planes
     cloud = _inverse_cloud(image, pixels, x, y)
-    labels, plane_normals, curved = grow_pixels(cloud, image, planes, pixels, config)
+    labels, plane_normals, curved = grow_pixels(cloud, flat, joins, config)
     normals, valid = pixels.normals.view(-1, 3), pixels.valid
     # A window at a border that is not flat has no normal of its own; the region has.
-    borders = (~planes.choice.flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    borders = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
     borders = borders[~curved[labels[borders]]]
     normals[borders] = plane_normals[labels[borders]]
     valid.view(-1)[borders] = True
@@ -99,14 +102,16 @@ def _segment(
     if pose is not None:
         pose = pose.to(normals)
         normals = normals @ pose[:3, :3].T
-    points = points_of_image(depth, intrinsics, pose)
-    rows = seen.flatten().nonzero().squeeze(1)
-    table = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
+    z = torch.where(seen, depth.double(), 1.0)
+    points = torch.stack([(x * z).flatten(), (y[:, None] * z).flatten(), z.flatten()]).T
+    if pose is not None:
+        points = (pose[:3, :3] @ points.T + pose[:3, 3:]).T
+    table = summarize_planes(points, normals, labels)
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),
         pixels.curvature.to(depth.dtype),
-        planes.choice.edge,
+        edge,
         valid,
         table._replace(curved=curved),
     )
@@ -115,7 +120,8 @@ def _segment(
 def _inverse_cloud(image: Image, pixels: Pixels, x: Tensor, y: Tensor) -> InverseCloud:
     """Return the image as the cloud that regions grow in, from the rays ``(x, y, 1)``."""
     inverse, seen = image.values, image.seen
-    unit = inverse[seen].median() if bool(seen.any()) else inverse.new_ones(())
+    known = inverse.flatten()[places_of(seen)]
+    unit = kth_smallest(known, (len(known) - 1) // 2) if len(known) else inverse.new_ones(())
     columns = [x.expand_as(inverse), y[:, None].expand_as(inverse), inverse / unit]
     points = torch.stack([column.flatten() for column in columns]).T
     return InverseCloud(points, (pixels.noise / unit).flatten(), seen)

@@ -237,6 +237,8 @@ def noise_by_size(
         constant, growth = given
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
     windows = {size: Windows(*table) for size, table in tables.items()}
+    # Windows stand a cell apart and overlap; of the smallest a quarter are as many as of the next.
+    windows[1] = Windows(*tables[1][:, ::REACH, ::REACH])
     middle = windows[sorted(windows)[len(windows) // 2 - 1]]
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0

@@ -41,8 +41,8 @@ INLINE void solve(const double (&s)[MOMENTS][N], int j, double least_count, doub
 
 // What a pixel adds to the sums of its windows, in place j.
 template <int N>
-INLINE void write_moments(bool seen, double u, double v, double value, double (*to)[N], int j) {
-  const double one = seen ? 1 : 0, mu = one * u, mv = one * v, w = seen ? value : 0;
+INLINE void write_moments(uint8_t seen, double u, double v, double value, double (*to)[N], int j) {
+  const double one = seen, mu = one * u, mv = one * v, w = one > 0 ? value : 0;
   to[0][j] = one, to[1][j] = mu, to[2][j] = mv, to[3][j] = w, to[4][j] = mu * u;
   to[5][j] = mu * v, to[6][j] = mv * v, to[7][j] = w * u, to[8][j] = w * v, to[9][j] = w * w;
 }
@@ -151,11 +151,12 @@ KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, 
                          double least_spread, int64_t from, int64_t to) {
   if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
     return TOO_WIDE;
+  const auto* ones = reinterpret_cast<const uint8_t*>(seen);
   return fit_all(h, w, from, to, least_count, least_spread, planes, coarse,
                  [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
                    for (int j = 0; j < count; j++) {
                      const int64_t pixel = row * w + first + j;
-                     write_moments(seen[pixel], u[first + j], v[row], values[pixel], sums, at + j);
+                     write_moments(ones[pixel], u[first + j], v[row], values[pixel], sums, at + j);
                    }
                  });
 }
@@ -273,7 +274,7 @@ KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubl
       for (int64_t r = larger(row - tall, int64_t(0)); r <= smaller(row + tall, h - 1); r++)
         for (int64_t c = larger(column - wide, int64_t(0)); c <= smaller(column + wide, w - 1); c++) {
           if (numbers[r * w + c] < 0) continue;
-          write_moments(true, u[c], v[r], values[r * w + c], terms, 0);
+          write_moments(1, u[c], v[r], values[r * w + c], terms, 0);
           for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m][0];
         }
       solve(sums, shape, least_count, least_spread, solved);

@@ -8,7 +8,7 @@ namespace {
 typedef const double* Doubles;
 
 constexpr int BLOCK = 128;
-constexpr int SAMPLE = 512, NEAR = 40;  // of a sample's values, those around the one asked for
+constexpr int SAMPLE = 256, NEAR = 32;  // of a sample's values, those around the one asked for
 
 // Adds up T terms of places `from` to `from + count`, which `fill` writes.
 template <int T, class Fill>
@@ -52,30 +52,32 @@ double select(double* values, int64_t count, int64_t k) {
   while (low < high) {
     const double a = values[low], b = values[low + (high - low) / 2], c = values[high];
     const double pivot = larger(smaller(a, b), smaller(larger(a, b), c));
-    int64_t i = low, j = high;
-    while (i <= j) {
-      while (values[i] < pivot) i++;
-      while (pivot < values[j]) j--;
-      if (i > j) break;
-      const double other = values[i];
-      values[i++] = values[j], values[j--] = other;
+    int64_t below = low, equal = low;
+    for (int64_t i = low; i <= high; i++) {
+      const double value = values[i];
+      values[i] = values[below], values[below] = value;
+      below += value < pivot;
     }
-    if (k <= j)
-      high = j;
-    else if (k >= i)
-      low = i;
-    else
-      break;
+    if (k < below) {
+      high = below - 1;
+      continue;
+    }
+    for (int64_t i = low; below == low && i <= high; i++) {
+      const double value = values[i];
+      values[i] = values[equal], values[equal] = value;
+      equal += value == pivot;
+    }
+    if (k < equal) return pivot;
+    low = larger(below, equal);
   }
   return values[k];
 }
 
-// The same of `fill()`, which is called again if need be: what a sample shows to be near the value
-// is moved to the front first.
+// The same of many values: those that a sample shows to be near the one are moved to the front. If
+// it is none of them `fill` writes all again.
 template <class Fill>
 double select_filled(double* values, int64_t count, int64_t k, const Fill& fill) {
-  fill();
-  if (count < 8 * SAMPLE) return select(values, count, k);
+  if (count < 4 * SAMPLE) return select(values, count, k);
   double sample[SAMPLE];
   for (int64_t i = 0; i < SAMPLE; i++) sample[i] = values[i * count / SAMPLE];
   const int64_t rank = k * SAMPLE / count, low_rank = larger(rank - NEAR, int64_t(0)),
@@ -103,6 +105,35 @@ INLINE int64_t sum_of(Longs counts, int64_t num, int64_t n) {
 
 }  // namespace
 
+// Segments.rows and counts: of regions of many points every so many, so that at most `most` are
+// taken.
+KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t* counts,
+                    int64_t* places, int64_t* rows) {
+  if (most < 1) return TOO_WIDE;
+  for (int64_t m = 0; m < num; m++) counts[m] = 0;
+  for (int64_t i = 0; i < n; i++) {
+    if (labels[i] >= num) return NO_SUCH_ROW;
+    if (labels[i] >= 0) counts[labels[i]]++;
+  }
+  int64_t start = 0;
+  for (int64_t m = 0; m < num; m++) {
+    const int64_t step = larger((counts[m] + most - 1) / most, int64_t(1));
+    places[m] = start * step, start += (counts[m] + step - 1) / step, counts[m] = step;
+  }
+  // A place counts all points, and those that a step divides are taken.
+  for (int64_t i = 0; i < n; i++) {
+    const int64_t m = labels[i];
+    if (m < 0) continue;
+    if (places[m] % counts[m] == 0) rows[places[m] / counts[m]] = i;
+    places[m]++;
+  }
+  for (int64_t m = num - 1, end = start; m >= 0; m--) {
+    const int64_t first = m ? (places[m - 1] + counts[m - 1] - 1) / counts[m - 1] : 0;
+    counts[m] = end - first, end = first;
+  }
+  return DONE;
+}
+
 // Segments.moments: means and covariances of weighted points, about zero if not centered.
 KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Doubles weights,
                        Longs counts, int64_t is_centered, double* means, double* covariances) {
@@ -113,7 +144,7 @@ KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, 
     add_up<1>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
       __builtin_memcpy(terms[0], weights + from, sizeof(double) * count);
     }, total);
-    add_up<3>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
+    if (is_centered) add_up<3>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
       for (int j = 0; j < count; j++) {
         const double weight = weights[from + j];
         terms[0][j] = x[from + j] * weight, terms[1][j] = y[from + j] * weight;
@@ -148,16 +179,18 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
     const double a = means[3 * m], b = means[3 * m + 1], c = means[3 * m + 2];
     const double p = axes[3 * m], q = axes[3 * m + 1], r = axes[3 * m + 2];
     const auto residual = [&](int64_t i) { return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r; };
-    medians[m] = select_filled(weights + start, counts[m], (counts[m] - 1) / 2, [&]() {
+    double sum[1];
+    const auto fill = [&]() {
       for (int64_t i = start; i < start + counts[m]; i++) {
         const double away = size_of(residual(i));
         weights[i] = away < double(INFINITE) ? away : double(INFINITE);
       }
-    });
-    double sum[1];
+    };
+    fill();
     add_up<1>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
-      for (int j = 0; j < count; j++) terms[0][j] = residual(from + j) * residual(from + j);
+      for (int j = 0; j < count; j++) terms[0][j] = weights[from + j] * weights[from + j];
     }, sum);
+    medians[m] = select_filled(weights + start, counts[m], (counts[m] - 1) / 2, fill);
     squares[m] = sum[0] / double(counts[m]);
     double unit = cut * larger(mad * medians[m], least[m]);
     unit = unit > 0 ? unit : 1;

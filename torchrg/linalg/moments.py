@@ -106,6 +106,9 @@ class Segments:
     """
 
     def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
+        if labels.device.type == "cpu" and kernels.serve():
+            self._take_rows(labels, most)
+            return
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
         self.rows = _ascending(labels)[num_unlabeled:]
@@ -119,6 +122,14 @@ class Segments:
             self.rows = self.rows[torch.cat(parts)] if parts else self.rows
             sizes = [len(part) for part in parts]
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
+        self.labels = torch.repeat_interleave(self.counts)
+
+    def _take_rows(self, labels: Tensor, most: int | None) -> None:
+        num_regions = int(labels.max()) + 1 if len(labels) else 0
+        self.counts = torch.zeros(max(num_regions, 0), dtype=torch.int64)
+        room, most = torch.empty_like(self.counts), most or max(len(labels), 1)
+        (rows,) = kernels.call("segment_rows", labels.long(), most, self.counts, room)
+        self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
     def split(self, most: int) -> "list[Segments]":

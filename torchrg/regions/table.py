@@ -384,7 +384,8 @@ def _outer_places(places: NDArray[np.float64]) -> NDArray[np.integer]:
     Not those inside the octagon of the farthest points in eight directions: S. Akl, G. Toussaint. A
     fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
-    along = _COMPASS @ places.T
+    # BLAS would start threads of its own.
+    along = _COMPASS[:, :1] * places[:, 0] + _COMPASS[:, 1:] * places[:, 1]
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
     octagon = places[ends[ends != np.roll(ends, 1)]]
     if len(octagon) < 3:
@@ -393,7 +394,8 @@ def _outer_places(places: NDArray[np.float64]) -> NDArray[np.integer]:
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
     offsets = (inward * octagon).sum(axis=1)
     rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(places).max()
-    inside = (inward @ places.T > (offsets + rounding)[:, None]).all(axis=0)
+    heights = inward[:, :1] * places[:, 0] + inward[:, 1:] * places[:, 1]
+    inside = (heights > (offsets + rounding)[:, None]).all(axis=0)
     return np.flatnonzero(~inside)
 
 
