@@ -108,7 +108,7 @@ INLINE int64_t sum_of(Longs counts, int64_t num, int64_t n) {
 // Segments.rows and counts: of regions of many points every so many, so that at most `most` are
 // taken.
 KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t* counts,
-                    int64_t* places, int64_t* rows) {
+                    int64_t* steps, int64_t* places, int64_t* rows) {
   if (most < 1) return TOO_WIDE;
   for (int64_t m = 0; m < num; m++) counts[m] = 0;
   for (int64_t i = 0; i < n; i++) {
@@ -117,20 +117,34 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t*
   }
   int64_t start = 0;
   for (int64_t m = 0; m < num; m++) {
-    const int64_t step = larger((counts[m] + most - 1) / most, int64_t(1));
-    places[m] = start * step, start += (counts[m] + step - 1) / step, counts[m] = step;
+    steps[m] = larger((counts[m] + most - 1) / most, int64_t(1)), places[m] = start;
+    start += (counts[m] + steps[m] - 1) / steps[m], counts[m] = 0;
   }
-  // A place counts all points, and those that a step divides are taken.
+  // The count is of points up to the next one that is taken.
   for (int64_t i = 0; i < n; i++) {
     const int64_t m = labels[i];
     if (m < 0) continue;
-    if (places[m] % counts[m] == 0) rows[places[m] / counts[m]] = i;
-    places[m]++;
+    if (counts[m] == 0) rows[places[m]++] = i, counts[m] = steps[m];
+    counts[m]--;
   }
-  for (int64_t m = num - 1, end = start; m >= 0; m--) {
-    const int64_t first = m ? (places[m - 1] + counts[m - 1] - 1) / counts[m - 1] : 0;
-    counts[m] = end - first, end = first;
-  }
+  for (int64_t m = 0; m < num; m++) counts[m] = places[m] - (m ? places[m - 1] : 0);
+  return DONE;
+}
+
+// Segments.along: coordinates (A, n) of rows along the axes of their regions, about centers.
+KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
+                           Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
+                           Doubles axes, double* coordinates) {
+  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
+  for (int64_t m = 0, start = 0; m < num; start += counts[m++])
+    for (int64_t i = start; i < start + counts[m]; i++) {
+      if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
+      const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
+      const double u = x[rows[i]] - center[0], v = y[rows[i]] - center[1],
+                   w = z[rows[i]] - center[2];
+      for (int64_t a = 0; a < num_axes; a++, axis += 3)
+        coordinates[a * n + i] = u * axis[0] + v * axis[1] + w * axis[2];
+    }
   return DONE;
 }
 
@@ -140,18 +154,16 @@ KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, 
   if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
   int64_t start = 0;
   for (int64_t m = 0; m < num; start += counts[m++]) {
-    double total[1], sums[3], *mean = means + 3 * m, squares[6];
-    add_up<1>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
-      __builtin_memcpy(terms[0], weights + from, sizeof(double) * count);
-    }, total);
-    if (is_centered) add_up<3>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
+    double sums[4], *mean = means + 3 * m, squares[6];
+    add_up<4>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
       for (int j = 0; j < count; j++) {
         const double weight = weights[from + j];
         terms[0][j] = x[from + j] * weight, terms[1][j] = y[from + j] * weight;
-        terms[2][j] = z[from + j] * weight;
+        terms[2][j] = z[from + j] * weight, terms[3][j] = weight;
       }
     }, sums);
-    for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total[0] : 0;
+    const double total = sums[3];
+    for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total : 0;
     const double a = mean[0], b = mean[1], c = mean[2];
     add_up<6>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
       for (int j = 0; j < count; j++) {
@@ -163,7 +175,7 @@ KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, 
     }, squares);
     const int place[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
     for (int entry = 0; entry < 9; entry++)
-      covariances[9 * m + entry] = squares[place[entry]] / total[0];
+      covariances[9 * m + entry] = squares[place[entry]] / total;
   }
   return DONE;
 }
@@ -197,6 +209,44 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
     for (int64_t i = start; i < start + counts[m]; i++) {
       const double ratio = residual(i) / unit, weight = larger(1 - ratio * ratio, 0.0);
       weights[i] = weight * weight;
+    }
+  }
+  return DONE;
+}
+
+// table._outer_places of each region: whether its points (x, y) are outside of the octagon of the
+// farthest ones.
+KERNEL outer_places(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, double rounding,
+                    bool* outer) {
+  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
+  for (int64_t m = 0, start = 0; m < num; start += counts[m++]) {
+    const int64_t end = start + counts[m];
+    int64_t farthest[8];
+    double most[8], largest = 0;
+    for (int e = 0; e < 8; e++) farthest[e] = start, most[e] = -double(INFINITE);
+    for (int64_t i = start; i < end; i++) {
+      const double along[4] = {x[i], x[i] + y[i], y[i], y[i] - x[i]};
+      for (int e = 0; e < 4; e++) {
+        if (along[e] > most[e]) most[e] = along[e], farthest[e] = i;
+        if (-along[e] > most[e + 4]) most[e + 4] = -along[e], farthest[e + 4] = i;
+      }
+      largest = larger(largest, larger(size_of(x[i]), size_of(y[i])));
+    }
+    int corners = 0;
+    int64_t octagon[8];
+    for (int e = 0; e < 8; e++)
+      if (farthest[e] != farthest[(e + 7) % 8]) octagon[corners++] = farthest[e];
+    double u[8], v[8], offset[8];
+    for (int e = 0; e < corners; e++) {
+      const int64_t one = octagon[e], next = octagon[(e + 1) % corners];
+      u[e] = y[one] - y[next], v[e] = x[next] - x[one];
+      offset[e] = u[e] * x[one] + v[e] * y[one] +
+                  rounding * larger(size_of(u[e]), size_of(v[e])) * largest;
+    }
+    for (int64_t i = start; i < end; i++) {
+      bool inside = corners > 2;
+      for (int e = 0; e < corners; e++) inside &= u[e] * x[i] + v[e] * y[i] > offset[e];
+      outer[i] = !inside;
     }
   }
   return DONE;

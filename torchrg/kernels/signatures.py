@@ -30,7 +30,9 @@ SIGNATURES = {
     "describe_pixels": "d[hw] b[hw] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] D[hw] D[hw] "
     "B[hw] x x x x x x n n -> ",
     "join_pixels": "l[hw] b[hw] d[hw3] d[hw] d[N] d[M] l[n] d[w] d[h] B[hw] B[hw] x x x n n -> ",
-    "segment_rows": "l[n] n L[M] L[M] -> l[n]",
+    "segment_rows": "l[n] n L[M] L[M] L[M] -> l[n]",
+    "outer_places": "d[n] d[n] l[M] x -> b[n]",
+    "segment_coordinates": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
     "number_by_size": "l[n] n -> l[n] l[n] l[n]",

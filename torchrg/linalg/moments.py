@@ -127,8 +127,8 @@ class Segments:
     def _take_rows(self, labels: Tensor, most: int | None) -> None:
         num_regions = int(labels.max()) + 1 if len(labels) else 0
         self.counts = torch.zeros(max(num_regions, 0), dtype=torch.int64)
-        room, most = torch.empty_like(self.counts), most or max(len(labels), 1)
-        (rows,) = kernels.call("segment_rows", labels.long(), most, self.counts, room)
+        room, most = torch.empty(2, len(self.counts), dtype=torch.int64), most or len(labels) + 1
+        (rows,) = kernels.call("segment_rows", labels.long(), most, self.counts, *room)
         self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
@@ -163,8 +163,27 @@ class Segments:
         """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
         return [self.take(column).double() for column in vectors.unbind(dim=1)]
 
+    def along(self, vectors: Tensor, centers: Tensor, axes: Tensor) -> list[Tensor]:
+        """Return coordinates of the points of vectors ``(N, 3)`` about a center ``(M, 3)``.
+
+        Along the ``axes`` ``(M, A, 3)`` of their region, A columns ``(n,)`` of float64.
+        """
+        if self.is_served(vectors) and centers.dtype == torch.float64:
+            tables = self.rows, self.counts, centers, axes
+            return list(kernels.call("segment_coordinates", *vectors.unbind(dim=1), *tables)[0])
+        about, columns = self.take_about(vectors, centers), []
+        for axis in axes.unbind(dim=1):
+            total = torch.zeros_like(about[0])
+            # Products and sums apart: their rounding must not depend on where a block ends.
+            for column, part in zip(about, axis.unbind(dim=1), strict=True):
+                total += column * self.spread(part)
+            columns.append(total)
+        return columns
+
     def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
+        if self.is_served(vectors) and centers.dtype == torch.float64:
+            return self.along(vectors, centers, torch.eye(3).double().expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
         return [self.take(column).double() - self.spread(center) for column, center in pairs]
 
@@ -188,7 +207,7 @@ class Segments:
         The columns are as :meth:`take_columns` returns them; unless ``centered`` the mean is taken
         for zero.
         """
-        if self._is_served(weights):
+        if self.is_served(weights):
             numbers = self.counts, centered
             mean, covariance = kernels.call("segment_moments", *columns, weights, *numbers)
             return mean, covariance
@@ -211,7 +230,7 @@ class Segments:
         the first times the median of the residuals is one; at ``least`` ``(M,)``. Returns weights
         ``(n,)``, medians of the residuals without their signs, and mean squares, ``(M,)``.
         """
-        if self._is_served(means):
+        if self.is_served(means):
             tables = self.counts, means, axes, least
             weights, medians, squares = kernels.call(
                 "reweigh_segments", *columns, *tables, *factors
@@ -228,8 +247,10 @@ class Segments:
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
 
-    def _is_served(self, values: Tensor) -> bool:
-        return values.device.type == "cpu" and kernels.serve() and bool(self.counts.all())
+    def is_served(self, values: Tensor) -> bool:
+        """Tell whether kernels work on values of float64 of these regions."""
+        is_plain = values.device.type == "cpu" and values.dtype == torch.float64
+        return is_plain and kernels.serve() and bool(self.counts.all())
 
     def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smallest and the largest value of each region."""

@@ -1,7 +1,6 @@
 """Planes of regions: robust fits, and what is known of the noise of their points."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -136,7 +135,7 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPla
 
 def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
     """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
-    columns = segments.take_columns(normals)
+    columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
     weights = torch.ones_like(columns[0])
     _, spread_of_normals = segments.moments(columns, weights, centered=False)
     shares, directions = eigh3_of_few(spread_of_normals)
@@ -215,15 +214,6 @@ class RegionFits:
         if self._known is None or not torch.equal(self._known[0], labels):
             self._known = labels, fit_regions(self._cloud, labels, self._config)
         return self._known[1]
-
-
-def coordinates_along(segments: Segments, columns: Sequence[Tensor], axes: Tensor) -> Tensor:
-    """Return coordinates of points, given by columns, along the axis ``(M, 3)`` of their region."""
-    total = torch.zeros_like(columns[0])
-    # Products and sums apart: their rounding must not depend on where a block of memory ends.
-    for column, part in zip(columns, axes.unbind(dim=1), strict=True):
-        total += column * segments.spread(part)
-    return total
 
 
 def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
