@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import map_rows, places_of
+from torchrg._parallel import places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import hidden_contacts, join_strips
 from torchrg.depth.normals import PixelPlanes, Pixels
@@ -362,16 +362,11 @@ def move_to_creases(
             "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *room
         )
         return labels
-    tables = *cloud.points.unbind(dim=1), planes, middles, reach
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))
     for _ in range(_MOST_MOVES):
         around = grid.around(rows)
-        near = labels[around]
-        at_border = ((near >= 0) & (near != labels[rows][:, None])).any(dim=1)
-        rows, around, near = rows[at_border], around[at_border], near[at_border]
-        columns = [rows, around, labels[rows], near]
-        (across,) = map_rows(_regions_across, columns, *tables)
+        across = _regions_across(cloud, labels, planes, middles, reach, rows, around)
         moved = across != labels[rows]
         if not bool(moved.any()):
             break
@@ -382,20 +377,18 @@ def move_to_creases(
 
 
 def _regions_across(
-    rows: Tensor,
-    around: Tensor,
-    own: Tensor,
-    near: Tensor,
-    x: Tensor,
-    y: Tensor,
-    inverse: Tensor,
+    cloud: InverseCloud,
+    labels: Tensor,
     planes: Tensor,
     middles: Tensor,
     reach: Tensor,
-) -> tuple[Tensor]:
-    """Return the region ``(n,)`` that pixels at borders belong to by the creases there."""
-    other = (near >= 0) & (near != own[:, None])
-    own, near = own[:, None], near.clamp(min=0)
+    rows: Tensor,
+    around: Tensor,
+) -> Tensor:
+    """Return the region ``(n,)`` that pixels belong to by the creases beside them."""
+    x, y, inverse = cloud.points.unbind(dim=1)
+    own, near = labels[rows][:, None], labels[around]
+    other, near = (near >= 0) & (near != own), near.clamp(min=0)
     ray, around_rays = (x[rows][:, None], y[rows][:, None]), (x[around], y[around])
     apart = planes[own] - planes[near]
     a, b, _ = apart.unbind(dim=2)
@@ -408,8 +401,9 @@ def _regions_across(
     goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
     goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[own])
     away = torch.where(goes, away, torch.inf)
-    nearest = torch.where(away == away.amin(dim=1, keepdim=True), near, planes.shape[0]).amin(dim=1)
-    return (torch.where(goes.any(dim=1), nearest, own.squeeze(1)),)
+    least = away.amin(dim=1, keepdim=True)
+    nearest = torch.where(goes & (away == least), near, len(planes)).amin(dim=1)
+    return torch.where(nearest < len(planes), nearest, own.squeeze(1))
 
 
 def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -289,7 +289,8 @@ def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach
     row, column = pixels // len(image.u), pixels % len(image.u)
     on_plane = u_slope * image.u[column] + v_slope * image.v[row]
     away = (image.values[row, column] - (on_plane + origin)).abs()
-    return away.le(reach.flatten()[places])
+    is_near: Tensor = away <= reach.flatten()[places]
+    return is_near
 
 
 def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:

@@ -409,7 +409,8 @@ def _outside_of_octagon(places: NDArray[np.float64]) -> NDArray[np.float64]:
     rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(places).max()
     heights = inward[:, :1] * places[:, 0] + inward[:, 1:] * places[:, 1]
     inside = (heights > (offsets + rounding)[:, None]).all(axis=0)
-    return places[~inside]
+    outside: NDArray[np.float64] = places[~inside]
+    return outside
 
 
 class _Cells(NamedTuple):
