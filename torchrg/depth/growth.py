@@ -250,7 +250,7 @@ def _refine(
     """
     beside = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
-        planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
+        planes = fit_inverse_planes(cloud, labels)
         reach = planes.times_thickness(_ABSORB_REACH)
         labels = absorb_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
@@ -258,10 +258,10 @@ def _refine(
         contacts, counts = (torch.cat(part) for part in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
-    planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
+    planes = fit_inverse_planes(cloud, labels)
     joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
     if not torch.equal(joined, labels):
-        labels, planes = joined, fit_inverse_planes(cloud, joined, most=MOST_FITTED)
+        labels, planes = joined, fit_inverse_planes(cloud, joined)
     reach = planes.times_thickness(_ABSORB_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
@@ -298,14 +298,14 @@ def _planes_over_rays(fit: RegionPlanes) -> Tensor:
 
 
 def fit_inverse_planes(
-    cloud: InverseCloud, labels: Tensor, *, most: int | None = None
+    cloud: InverseCloud, labels: Tensor, *, most: int = MOST_FITTED
 ) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, which alone has noise.
 
     A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.fit.fit_planes` has; the
     thickness, along the normals, is never taken for less than the mean noise of the region. Curved
     is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
-    region, in even steps, by default to all.
+    region, in even steps.
     """
     segments = Segments(labels, most=most)
     noise = segments.mean(segments.take(cloud.noise))
