@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import places_of
+from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import hidden_contacts, join_strips
 from torchrg.depth.normals import PixelPlanes, Pixels
@@ -307,7 +307,14 @@ def fit_inverse_planes(
     is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
     region, in even steps.
     """
-    segments = Segments(labels, most=most)
+    shares = Segments(labels, most=most).shares(len(labels) + 1)
+    parts = map_tasks(lambda some: _fit_together(cloud, some), shares, labels.device)
+    planes = RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return planes._replace(num_points=torch.bincount(labels + 1, minlength=1)[1:])
+
+
+def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
+    """Fit planes to the regions of a share; see :func:`fit_inverse_planes`."""
     noise = segments.mean(segments.take(cloud.noise))
     columns = segments.take_columns(cloud.points)
     weights = torch.ones_like(columns[0])
@@ -330,7 +337,7 @@ def fit_inverse_planes(
         covariance,
         torch.maximum(thickness / length.squeeze(1), noise),
         rms=squares.sqrt() / length.squeeze(1),
-        num_points=torch.bincount(labels + 1, minlength=1)[1:],
+        num_points=segments.counts,
         curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
         floor=noise,
         reach=torch.full_like(noise, torch.inf),

@@ -7,7 +7,6 @@ them up in its own way, so that a sum does not depend on what stands beside it. 
 """
 
 import bisect
-import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes
-from torchrg._parallel import allowed_threads, map_tasks
+from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
 
 _LEAST_POINTS = 2**16
@@ -152,6 +151,11 @@ class Segments:
             region, row = last, end
         return parts
 
+    def shares(self, most: int) -> "list[Segments]":
+        """Return what :meth:`split` does, in about equally large parts for each thread."""
+        share = max(len(self.rows) // allowed_threads() + 1, _LEAST_POINTS)
+        return self.split(min(share, most))
+
     def take(self, values: Tensor) -> Tensor:
         """Return the values of the points that have a region, region by region."""
         return values.index_select(0, self.rows)
@@ -213,8 +217,8 @@ class Segments:
         for zero.
         """
         if self.is_served(weights):
-            values = (*columns, weights), ()
-            mean, covariance = self._call_by_regions("segment_moments", *values, centered)
+            numbers = self.counts, centered
+            mean, covariance = kernels.call("segment_moments", *columns, weights, *numbers)
             return mean, covariance
         total = self.sum(weights)
         means = [self.sum(column * weights) / total * centered for column in columns]
@@ -236,8 +240,10 @@ class Segments:
         ``(n,)``, medians of the residuals without their signs, and mean squares, ``(M,)``.
         """
         if self.is_served(means):
-            values = columns, (means, axes, least)
-            weights, medians, squares = self._call_by_regions("reweigh_segments", *values, *factors)
+            tables = self.counts, means, axes, least
+            weights, medians, squares = kernels.call(
+                "reweigh_segments", *columns, *tables, *factors
+            )
             return weights, medians, squares
         residuals = torch.zeros_like(columns[0])
         # Products and sums apart: their rounding must not depend on where a block of memory ends.
@@ -249,29 +255,6 @@ class Segments:
         ratio = residuals / self.spread(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
-
-    def _call_by_regions(
-        self, name: str, columns: Sequence[Tensor], tables: Sequence[Tensor], *numbers: float
-    ) -> list[Tensor]:
-        """Call a kernel on about equally many points for each thread, and return all it returns.
-
-        Columns are those of the points, tables of the regions.
-        """
-        ends = self.counts.cumsum(0)
-        num_parts = min(allowed_threads(), len(self.rows) // _LEAST_POINTS + 1)
-        limits = [len(self.rows) * part // num_parts for part in range(1, num_parts)]
-        cuts = [0, *torch.searchsorted(ends, torch.tensor(limits)).tolist(), len(ends)]
-        starts = [0, *ends.tolist()]
-
-        def work(regions: slice) -> tuple[Tensor, ...]:
-            points = slice(starts[regions.start], starts[regions.stop])
-            parts = [column[points] for column in columns]
-            parts += [table[regions] for table in (self.counts, *tables)]
-            return kernels.call(name, *parts, *numbers)
-
-        slices = [slice(*cut) for cut in itertools.pairwise(cuts)]
-        found = map_tasks(work, slices, self.counts.device)
-        return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
     def is_served(self, values: Tensor) -> bool:
         """Tell whether kernels work on values of float64 of these regions."""

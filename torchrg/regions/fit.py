@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_tasks
 from torchrg.config import GrowingConfig
 from torchrg.linalg import coordinate_resolution, eigh3_of_few
 from torchrg.linalg.moments import Segments
@@ -129,7 +129,8 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPla
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
-    parts = [_fit_together(some, points, normals) for some in segments.split(POINTS_AT_ONCE)]
+    shares = segments.shares(POINTS_AT_ONCE)
+    parts = map_tasks(lambda some: _fit_together(some, points, normals), shares, points.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._optional import require
-from torchrg._parallel import places_of
+from torchrg._parallel import map_tasks, places_of
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments
@@ -118,12 +118,14 @@ def summarize_planes(
     fit = fit_planes(segments, points, normals)
     first, second = _plane_axes(fit)
 
-    measures, start = [], 0
-    for some in segments.split(POINTS_AT_ONCE):
-        rows = slice(start, start + len(some.counts))
-        frame = (fit.center[rows], first[rows], second[rows])
-        measures.append(_measure(points, some, frame, outline=outline))
-        start = rows.stop
+    shares = segments.shares(POINTS_AT_ONCE)
+    sizes = [len(some.counts) for some in shares]
+    frames = zip(*(torch.split(part, sizes) for part in (fit.center, first, second)), strict=True)
+    measures = map_tasks(
+        lambda part: _measure(points, *part, outline=outline),
+        list(zip(shares, frames, strict=True)),
+        points.device,
+    )
     numbers, outlines = zip(*measures, strict=True)
     mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
