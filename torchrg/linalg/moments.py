@@ -130,8 +130,8 @@ class Segments:
 
     def _take_rows(self, labels: Tensor, most: int | None) -> None:
         num_regions = int(labels.max()) + 1 if len(labels) else 0
-        self.counts = torch.zeros(max(num_regions, 0), dtype=torch.int64)
-        room, most = torch.empty(2, len(self.counts), dtype=torch.int64), most or len(labels) + 1
+        self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
+        room, most = self.counts.new_empty(2, len(self.counts)), most or len(labels) + 1
         (rows,) = kernels.call("segment_rows", labels.long(), most, self.counts, *room)
         self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
@@ -192,7 +192,8 @@ class Segments:
     def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
         if self.is_served(vectors) and centers.dtype == torch.float64:
-            return self.along(vectors, centers, torch.eye(3).double().expand(len(centers), 3, 3))
+            eye = torch.eye(3, dtype=torch.float64, device=centers.device)
+            return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
         return [self.take(column).double() - self.spread(center) for column, center in pairs]
 
