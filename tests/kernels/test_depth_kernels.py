@@ -21,6 +21,7 @@ from torchrg.depth.segment import _inverse_cloud
 from torchrg.depth.windows import Image
 from torchrg.linalg.moments import Segments
 from torchrg.regions.growth import number_by_size
+from torchrg.regions.table import outer_places
 from torchrg.scenes import build_room
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
@@ -142,6 +143,28 @@ def test_moments_and_weights_of_regions_are_those_of_the_definition(size, rng):
         _, about_zero = segments.moments(list(columns), weights, centered=False)
         reweighed = segments.reweigh(list(columns), mean, axes, least, (1.48, 4.7))
         return [mean, covariance, about_zero, *reweighed]
+
+    found = stages()
+    with definitions():
+        assert_same(found, stages())
+
+
+@pytest.mark.parametrize("most", [None, 1, 7])
+def test_rows_and_outer_points_of_regions_are_those_of_the_definition(most, rng):
+    places = torch.randn(900, 2, generator=rng).double()
+    places[300:400, 1] = places[300:400, 0]
+    places[400:410], places[500:600] = 1.0, places[500:600].round()
+    labels = torch.arange(900).div(100, rounding_mode="floor") - 1
+    labels = labels[torch.randperm(900, generator=rng)]
+
+    def stages():
+        segments = Segments(labels, most=most)
+        columns = [segments.take(column) for column in places.T]
+        return [
+            segments.rows,
+            segments.counts,
+            *map(torch.tensor, outer_places(segments, *columns)),
+        ]
 
     found = stages()
     with definitions():
