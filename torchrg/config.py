@@ -243,9 +243,9 @@ class SuperpointsConfig:
     more. None: strengths decide."""
     min_size: int = 10
     """A superpoint of fewer distinct points joins the neighbour to which that costs least."""
-    planes: Literal["pieces", "whole"] = "pieces"
-    """How planes enter: as compact pieces, which merge again unless objects meet in the plane
-    (pieces), or as they are, never cut (whole)."""
+    planes: Literal["borders", "whole"] = "borders"
+    """How planes enter: superpoints prefer to keep to their borders (borders), or each enters as it
+    is, never cut (whole)."""
     max_extent: float | None = None
     """Longest side of the box around a superpoint, in the unit of the cloud. Whole planes may have
     longer ones. None: no limit."""

@@ -45,10 +45,9 @@ that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
 BYTES_PER_POINT_ON_DISK = 150
 """Memory that a point adds where neighbours and edges are on a disk; see :mod:`torchrg.scratch`."""
 
-_STRENGTH_OF_K = 200.0
-"""Strength of superpoints for a threshold of 1 of ScanNet's Segmentator. At 0.01, which programs
-ask for, they were 0.99 to 1.5 times as many as its own in three depth frames with noise, meshed,
-and 1.5 to 2.5 times in exact ones, where there are 6 to 19."""
+_STRENGTH_OF_K = 100.0
+"""Strength of superpoints for a threshold of 1 of ScanNet's Segmentator. At its usual 0.01 there
+are about as many as of its own in depth frames with noise, meshed, and more in exact ones."""
 
 
 @of_clouds
@@ -224,9 +223,9 @@ def make_superpoints(
 
     Superpoints are connected (of a chain of points between any two, each is one of the 8 nearest
     neighbours of the one before or after it), of one orientation, and keep to the borders of
-    objects. Planes come first: their compact pieces, or whole planes, are regions from the start.
-    Regions merge while that costs an energy like that of cut pursuit at most the strength of the
-    level; see :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
+    objects and of planes. Each point is a region at first, or each plane. Regions merge while that
+    costs an energy like that of cut pursuit at most the strength of the level; see
+    :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
 
     Convention:
         The result does not depend on the order of the points or on the number of threads. Exact
@@ -302,7 +301,7 @@ def segment_mesh(
         vertices: Shape ``(V, 3)``, floating.
         faces: Rows of the corners of triangles, shape ``(F, 3)``. Superpoints are connected along
             their edges. Default: along neighbours, for points without a mesh.
-        k_thresh: As of Segmentator, in proportion: 0.01 is a strength of 2 in
+        k_thresh: As of Segmentator, in proportion: 0.01 is a strength of 1 in
             :class:`torchrg.config.SuperpointsConfig`.
         seg_min_verts: Smaller superpoints join a neighbour, in vertices.
         colors: As of :func:`make_superpoints`; Segmentator knows none.

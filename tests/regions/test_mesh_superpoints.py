@@ -140,7 +140,7 @@ def test_the_order_of_vertices_and_faces_changes_nothing(mesh):
 
 def test_without_faces_they_are_those_of_points(mesh):
     vertices, _, _ = mesh
-    config = SuperpointsConfig(strengths=(4.0,), min_size=30)
+    config = SuperpointsConfig(strengths=(2.0,), min_size=30)
     expected = make_superpoints(vertices, segment_planes(vertices, CLASSIC), config).labels
     found = segmentator.segment_mesh(vertices, None, 0.02, 30, config=CLASSIC)
     assert torch.equal(found, expected)
@@ -152,7 +152,7 @@ def test_vertices_with_many_edges_and_without_any():
     vertices = torch.cat([torch.zeros(1, 3), rim, torch.tensor([[9.0, 9, 9], [torch.nan, 0, 0]])])
     spokes = torch.arange(1, 200)
     faces = torch.stack([torch.zeros_like(spokes), spokes, spokes + 1], dim=1)
-    found = segmentator.segment_mesh(vertices, faces, config=CLASSIC)
+    found = segmentator.segment_mesh(vertices, faces, 0.02, config=CLASSIC)
     assert found.tolist() == [0] * 201 + [1, -1]
 
 

@@ -5,7 +5,7 @@ Regions of a graph of neighbours merge pair by pair, the pair that costs the ene
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_chunks, places_of
 from torchrg.config import SuperpointsConfig
 from torchrg.linalg import sq_chords
-from torchrg.linalg.moments import Segments
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
-from torchrg.neighbors.voxels import cell_keys
 from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
@@ -28,24 +27,21 @@ _NUM_NEIGHBORS = 1 + NUM_CONTACTS
 _SPACINGS_IN_REACH = 1.6
 """A circle around 8 points that are one spacing apart has this many spacings for its radius."""
 
-_PIECE_SPACINGS = 8.0
-"""Side of the pieces that planes enter as, in spacings: some 64 points, as the smallest plane."""
-
-_PIECES_EACH = 2
-"""Least mean number of pieces in a superpoint where their number is set, so that there is a
-choice."""
-
 _COLOR_WEIGHT = 3.0
 """Weight of a squared difference of colours in [0, 1] against one of unit normals: colours that are
 a third of the range apart in each channel weigh as much as a squared difference of normals of 1."""
 
-_COLOR_VARIATION = 0.1
-"""Weighted squared differences of the colours of a piece from their mean, added up, above which the
-piece is cut: four points that are off by 0.09 of the range from black to white reach it."""
-
-_PLACE_SPACINGS = 100.0
+_PLACE_SPACINGS = 200.0
 """Length by which places are divided to become features, in spacings. It tells boards, pictures and
 doors apart that are flush with a wall."""
+
+_STEP_WEIGHT = 0.25
+"""Weight of the squared sine of the angle between a contact and the surface: one that leads off the
+surface at a right angle, as down a step, weighs as much as normals that differ by 29 degrees."""
+
+_PLANE_WEIGHT = 0.25
+"""Weight of a contact between points of different planes, as of normals that differ by 29
+degrees."""
 
 _LEAST_DIFFERENCE = 0.01
 """Squared difference of normals, that of 6 degrees, which counts even between regions of one
@@ -74,14 +70,15 @@ def partition_points(
 ) -> Superpoints:
     r"""Partition a cloud; see :func:`torchrg.make_superpoints`.
 
-    The first regions are compact pieces of planes, or whole planes, and single points. Of two
-    regions that touch, of :math:`n_a` and :math:`n_b` points, merging costs
+    The first regions are single points, or whole planes and points. Of two regions that touch, of
+    :math:`n_a` and :math:`n_b` points, merging costs
 
     .. math:: \frac{n_a n_b}{n_a + n_b} (d_{ab} + \epsilon) / \sqrt{c_{ab}},
 
     where d is the squared difference of what the regions are (mean of :math:`n n^T` [1], of the
-    colour, and of the place in units of 100 spacings) and, at their contacts, the mean squared
-    difference of the normals, and c the number of contacts. The first factor is Ward's [2]: the
+    colour, and of the place in units of 200 spacings) and the mean of what parts the points at
+    their contacts (normals, a step between parallel surfaces, different planes), and c the number
+    of contacts. The first factor is Ward's [2]: the
     increase of the variance within regions. Divided by the length of the border that vanishes it is
     the strength of regularisation at which the energy of Mumford and Shah falls [3], the energy
     that cut pursuit minimises [4] and, with places and normals, the supervoxels of [5] and [6];
@@ -154,15 +151,14 @@ def _partition_places(
     spacing = _median_spacing(places, neighbors)
     if colors is not None:
         colors = math.sqrt(_COLOR_WEIGHT) * colors
-    pieces = labels
-    if config.planes == "pieces":
-        pieces = _cut_planes(places, spacing, neighbors, labels, colors, config)
     nearest = NearestPoints(neighbors).neighbors.indices
     nearest = nearest if edges is None else _listed(edges, len(places))
-    regions = _first_regions(pieces, nearest)
+    regions = torch.arange(len(places))
+    if config.planes == "whole":
+        regions = _whole_planes(labels, nearest)
     graph = _Graph(
-        _describe(Segments(regions), places, spacing, normals, colors, config),
-        _describe_borders(regions, normals, nearest),
+        _describe(regions, places, spacing, normals, colors, config),
+        _describe_borders(regions, places, normals, labels, nearest),
     )
     levels: list[Callable[..., tuple[_Graph, Tensor]]]
     if config.counts is None:
@@ -194,13 +190,16 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
     kept = column < _MOST_EDGES
     width = max(int(counts.max()), 1) if len(edges) else 1
-    listed = torch.arange(num_places)[:, None].repeat(1, min(width, _MOST_EDGES))
-    listed[edges[kept, 0], column[kept]] = edges[kept, 1]
+    listed = torch.arange(num_places, dtype=torch.int32)[:, None].repeat(1, min(width, _MOST_EDGES))
+    listed[edges[kept, 0], column[kept]] = edges[kept, 1].to(torch.int32)
     return listed
 
 
 class _Regions(NamedTuple):
-    """Sums over the points of R regions along the last axis, and the boxes around them, float64."""
+    """Points of R regions, sums of their features ``(R, F)``, boxes about them ``(R, 3)``, float64.
+
+    Without a bound on their extent boxes have no columns.
+    """
 
     size: Tensor
     features: Tensor
@@ -214,7 +213,7 @@ class _Borders(NamedTuple):
     first: Tensor
     second: Tensor
     contacts: Tensor
-    sq_chord: Tensor
+    difference: Tensor
 
 
 class _Graph(NamedTuple):
@@ -231,68 +230,20 @@ def _median_spacing(places: Tensor, neighbors: Neighbors) -> float:
     return float(reach) / _SPACINGS_IN_REACH
 
 
-def _cut_planes(
-    places: Tensor,
-    spacing: float,
-    neighbors: Neighbors,
-    labels: Tensor,
-    colors: Tensor | None,
-    config: SuperpointsConfig,
-) -> Tensor:
-    """Return the piece of a plane that each point is on, shape ``(n,)``, negative for none.
-
-    Pieces are what is in a cell of a cubic grid. Those whose colours vary, more than by the noise
-    that neighbours show, or that have too many points for the number of superpoints, are cut at
-    half the side again and again, in the end into points.
-    """
-    side = _PIECE_SPACINGS * spacing
-    if config.max_extent is not None:
-        side = min(side, config.max_extent)
-    most = math.inf if config.counts is None else len(places) / (_PIECES_EACH * config.counts[0])
-    if colors is not None:
-        nearest = neighbors.indices[:, min(1, neighbors.indices.shape[1] - 1)].long()
-        noise = float((colors[nearest] - colors).square().sum(dim=1).median())
-    columns = [column - column.min() for column in places.double().unbind(dim=1)]
-    pieces = labels.clamp(min=UNLABELED)
-    rows, num_pieces = places_of(labels >= 0), 0
-    while len(rows) and side >= spacing > 0:
-        cells = [(column[rows] / side).floor() for column in columns]
-        numbers = torch.unique(cell_keys([labels[rows], *cells]), return_inverse=True)[1]
-        pieces[rows] = numbers + num_pieces
-        num_pieces += int(numbers.max()) + 1
-        segments = Segments(numbers)
-        is_cut = segments.counts > most
-        if colors is not None:
-            variation = _sum_of_squares(segments, colors[rows])
-            is_cut |= variation > _COLOR_VARIATION + noise * segments.counts
-        rows, side = rows[is_cut[numbers]], side / 2
-    pieces[rows] = UNLABELED
-    return pieces
-
-
-def _sum_of_squares(segments: Segments, vectors: Tensor) -> Tensor:
-    """Return the squared differences of vectors ``(n, 3)`` from the mean of each region, added."""
-    total = torch.zeros_like(segments.counts, dtype=torch.float64)
-    for column in segments.take_columns(vectors):
-        differences = column - segments.spread(segments.mean(column))
-        total += segments.sum(differences * differences)
-    return total
-
-
-def _first_regions(pieces: Tensor, nearest: Tensor) -> Tensor:
-    """Return the first region of each point ``(n,)``: connected parts of pieces, and points."""
+def _whole_planes(labels: Tensor, nearest: Tensor) -> Tensor:
+    """Return the first region of each point ``(n,)``: connected parts of planes, and points."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
     def find(rows: slice) -> tuple[Tensor, Tensor]:
-        inside = (pieces[nearest[rows]] == pieces[rows, None]) & (pieces[rows, None] >= 0)
+        inside = (labels[nearest[rows]] == labels[rows, None]) & (labels[rows, None] >= 0)
         return inside.sum(dim=1), nearest[rows][inside].to(torch.int32)
 
-    parts = map_chunks(find, len(pieces), ROWS_AT_ONCE, pieces.device)
+    parts = map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device)
     counts, targets = (torch.cat(parts) for parts in zip(*parts, strict=True))
     starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     links = np.ones(len(targets), dtype=np.int8)
-    shape = (len(pieces), len(pieces))
+    shape = (len(labels), len(labels))
     edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)
     numbers = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
     return _by_first_point(numbers)
@@ -306,7 +257,7 @@ def _by_first_point(numbers: Tensor) -> Tensor:
 
 
 def _describe(
-    segments: Segments,
+    regions: Tensor,
     places: Tensor,
     spacing: float,
     normals: Tensor,
@@ -314,51 +265,101 @@ def _describe(
     config: SuperpointsConfig,
 ) -> _Regions:
     """Return sums and boxes of the first regions."""
-    x, y, z = segments.take_columns(normals)
+    places = places.double()
+    x, y, z = normals.double().unbind(dim=1)
     off = math.sqrt(2)
     features = [x * x, y * y, z * z, off * x * y, off * y * z, off * z * x]
     length = _PLACE_SPACINGS * spacing
     if config.max_extent is not None:
         length = min(length, config.max_extent)
     if length > 0:
-        origin = places.double().amin(dim=0)
-        features += segments.take_columns((places.double() - origin) / length)
+        features += ((places - places.amin(dim=0)) / length).unbind(dim=1)
     if colors is not None:
-        features += segments.take_columns(colors)
-    boxes = [segments.bounds(column) for column in segments.take_columns(places)]
-    low, high = (torch.stack(side) for side in zip(*boxes, strict=True))
-    sums = torch.stack([segments.sum(feature) for feature in features])
-    return _Regions(segments.counts.double(), sums, low, high)
+        features += colors.double().unbind(dim=1)
+    corners = places[:, : 0 if config.max_extent is None else 3]
+    points = _Regions(torch.ones_like(x), torch.stack(features, dim=1), corners, corners)
+    return _joined(points, regions)
 
 
-def _describe_borders(regions: Tensor, normals: Tensor, nearest: Tensor) -> _Borders:
+def _joined(regions: _Regions, new: Tensor) -> _Regions:
+    """Return regions of regions: the sums and boxes of those that become the same one ``(R,)``."""
+    # bincount adds one element after the other.
+    size, *features = (
+        torch.bincount(new, weights=sums)
+        for sums in (regions.size, *regions.features.unbind(dim=1))
+    )
+    rows = new[:, None].expand(regions.low.shape)
+    low, high = (
+        corners.new_empty(len(size), corners.shape[1]).scatter_reduce(
+            0, rows, corners, side, include_self=False
+        )
+        for side, corners in (("amin", regions.low), ("amax", regions.high))
+    )
+    return _Regions(size, torch.stack(features, dim=1), low, high)
+
+
+def _describe_borders(
+    regions: Tensor, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
+) -> _Borders:
     """Return the borders of the first regions: a contact leads from a point to a near one."""
 
-    def find(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
-        across = regions[nearest[rows]] != regions[rows, None]
-        target = nearest[rows][across]
-        source = torch.arange(rows.start, rows.stop)[:, None].expand(across.shape)[across]
-        own, other = (normals[ends].double().unbind(dim=1) for ends in (source, target))
-        return regions[source], regions[target], sq_chords(own, other)
+    def measure(rows: slice) -> Tensor:
+        return _contact_differences(rows, places, normals, labels, nearest)
 
-    parts = map_chunks(find, len(regions), ROWS_AT_ONCE, regions.device)
-    source, target, sq_chord = (torch.cat(part) for part in zip(*parts, strict=True))
-    return _gather_borders(source, target, torch.ones_like(sq_chord), sq_chord)
+    parts = map_chunks(measure, len(regions), ROWS_AT_ONCE, regions.device)
+    difference = torch.cat(parts).flatten()
+    source = regions[:, None].expand(nearest.shape).reshape(-1)
+    target = regions[nearest.flatten()]
+    return _gather_borders(source, target, torch.ones_like(difference), difference)
 
 
-def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, sq_chord: Tensor) -> _Borders:
+def _contact_differences(
+    rows: slice, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
+) -> Tensor:
+    """Return what parts points from those near them, shape ``(n, K)``, float64; see the formula.
+
+    That is the squared difference of their normals, the squared sine of the angle at which the way
+    between them leaves the flatter of the surfaces, and whether they are on different planes.
+    """
+    near = nearest[rows]
+    if kernels.serve(places, normals):
+        weights = _STEP_WEIGHT, _PLANE_WEIGHT
+        first = torch.arange(rows.start, rows.stop)
+        arguments = places, normals, labels, first, near, *weights
+        return kernels.call("contact_differences", *arguments)[0]
+    columns = [column.double() for column in (*places.unbind(dim=1), *normals.unbind(dim=1))]
+    here = [column[rows, None] for column in columns]
+    there = [column[near] for column in columns]
+    way = [b - a for a, b in zip(here[:3], there[:3], strict=True)]
+    ends = here[3:], there[3:]
+    step = torch.minimum(*(_dot(way, normal).square() for normal in ends)) / _dot(way, way)
+    is_other = (labels[rows, None] != labels[near]).double()
+    return sq_chords(*ends) + _STEP_WEIGHT * step + _PLANE_WEIGHT * is_other
+
+
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    """Return the inner products of vectors in columns."""
+    (x, y, z), (u, v, w) = a, b
+    return x * u + y * v + z * w
+
+
+def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, difference: Tensor) -> _Borders:
     """Return one row for each pair of different regions, with the sums of its rows."""
-    different = a != b
-    a, b, contacts, sq_chord = (part[different] for part in (a, b, contacts, sq_chord))
     if len(a) == 0:
-        return _Borders(a, b, contacts, sq_chord)
+        return _Borders(a, b, contacts, difference)
     width = int(torch.maximum(a.max(), b.max())) + 1
+    if kernels.serve():
+        buffers = a.new_empty(2, width + 1)
+        rows = kernels.call("gather_borders", a, b, contacts, difference, *buffers)
+        return _Borders(*(column[: int(rows[-1])] for column in rows[1:-1]))
+    different = places_of(a != b)
+    a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)
-    contacts, sq_chord = (
-        torch.segment_reduce(part[order], "sum", lengths=counts) for part in (contacts, sq_chord)
+    contacts, difference = (
+        torch.segment_reduce(part[order], "sum", lengths=counts) for part in (contacts, difference)
     )
-    return _Borders(keys // width, keys % width, contacts, sq_chord)
+    return _Borders(keys // width, keys % width, contacts, difference)
 
 
 def _merge_to_strength(
@@ -433,20 +434,24 @@ def _merging(
 
 def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
     """Return what merging at each border costs, infinite where the box would exceed the bound."""
+    means = regions.features / regions.size[:, None]
+    if kernels.serve():
+        boxes = regions.low, regions.high
+        limits = _LEAST_DIFFERENCE, bound
+        return kernels.call("merging_costs", regions.size, means, *boxes, *borders, *limits)[0]
     cost = torch.empty_like(borders.contacts)
     for rows in chunks_of(len(cost), ROWS_AT_ONCE):
         a, b = borders.first[rows], borders.second[rows]
-        size_a, size_b = regions.size[a], regions.size[b]
-        difference = borders.sq_chord[rows] / borders.contacts[rows] + _LEAST_DIFFERENCE
-        for feature in regions.features:
-            step = feature[a] / size_a - feature[b] / size_b
+        difference = borders.difference[rows] / borders.contacts[rows] + _LEAST_DIFFERENCE
+        for step in (means[a] - means[b]).unbind(dim=1):
             difference += step * step
+        size_a, size_b = regions.size[a], regions.size[b]
         ward = size_a * size_b / (size_a + size_b)
         cost[rows] = ward * difference / borders.contacts[rows].sqrt()
         if bound < math.inf:
-            high = torch.maximum(regions.high[:, a], regions.high[:, b])
-            low = torch.minimum(regions.low[:, a], regions.low[:, b])
-            cost[rows] = cost[rows].where((high - low).amax(dim=0) <= bound, math.inf)
+            high = torch.maximum(regions.high[a], regions.high[b])
+            low = torch.minimum(regions.low[a], regions.low[b])
+            cost[rows] = cost[rows].where((high - low).amax(dim=1) <= bound, math.inf)
     return cost
 
 
@@ -459,13 +464,7 @@ def _choose_pairs(
     at most so many, those that cost least. Of equal costs the first border's counts.
     """
     num_regions, num_borders = len(size), len(cost)
-    ends, costs = torch.cat([borders.first, borders.second]), cost.repeat(2)
-    least = cost.new_full((num_regions,), math.inf)
-    least = least.scatter_reduce(0, ends, costs, "amin")
-    rows = torch.arange(num_borders).repeat(2)
-    is_least = (costs == least[ends]) & costs.isfinite()
-    best = torch.full((num_regions,), num_borders)
-    best = best.scatter_reduce(0, ends[is_least], rows[is_least], "amin")
+    least, best = _cheapest_borders(borders, cost, num_regions)
     asking = (best < num_borders).nonzero().squeeze(1)
     wanted = borders.first[best[asking]] + borders.second[best[asking]] - asking
     joins = size[wanted] >= ratio * size[asking]
@@ -483,6 +482,20 @@ def _choose_pairs(
     return gone, owner[owner[gone]]
 
 
+def _cheapest_borders(borders: _Borders, cost: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
+    """Return the least cost at each region's borders, and its first border of that cost, or E."""
+    least = cost.new_full((num_regions,), math.inf)
+    if kernels.serve():
+        (best,) = kernels.call("cheapest_borders", borders.first, borders.second, cost, least)
+        return least, best
+    ends, costs = torch.cat([borders.first, borders.second]), cost.repeat(2)
+    least = least.scatter_reduce(0, ends, costs, "amin")
+    rows = torch.arange(len(cost)).repeat(2)
+    is_least = (costs == least[ends]) & costs.isfinite()
+    best = torch.full((num_regions,), len(cost))
+    return least, best.scatter_reduce(0, ends[is_least], rows[is_least], "amin")
+
+
 def _merge(
     regions: _Regions, borders: _Borders, gone: Tensor, kept: Tensor
 ) -> tuple[_Regions, _Borders, Tensor]:
@@ -491,15 +504,9 @@ def _merge(
     owner = torch.arange(num_regions).index_copy(0, gone, kept)
     stays = owner == torch.arange(num_regions)
     new = (stays.cumsum(0) - 1)[owner]
-    sums = torch.cat([regions.size[None], regions.features])
-    # One row at a time, index_add adds one element after the other.
-    sums = torch.stack([row.index_add(0, kept, row[gone]) for row in sums])[:, stays]
-    into = kept.expand(3, -1)
-    low = regions.low.scatter_reduce(1, into, regions.low[:, gone], "amin")
-    high = regions.high.scatter_reduce(1, into, regions.high[:, gone], "amax")
-    merged = _Regions(sums[0], sums[1:], low[:, stays], high[:, stays])
     first, second = new[borders.first], new[borders.second]
-    return merged, _gather_borders(first, second, borders.contacts, borders.sq_chord), new
+    merged = _joined(regions, new)
+    return merged, _gather_borders(first, second, borders.contacts, borders.difference), new
 
 
 def _unit_colors(colors: Tensor) -> Tensor:

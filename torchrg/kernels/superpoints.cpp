@@ -1,0 +1,125 @@
+// Borders of superpoints and what merging at them costs: torchrg/regions/superpoints.py.
+#include "plain.h"
+
+namespace {
+
+INLINE double dot(const double* a, const double* b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+INLINE void widen(const float* values, double* wide) {
+  for (int axis = 0; axis < 3; axis++) wide[axis] = values[axis];
+}
+
+// Shell's sort: few rows, or many in next to no order, without memory.
+void sort_by_second(int64_t count, int64_t* second, double* contacts, double* differences) {
+  int64_t gap = 1;
+  while (gap < count / 3) gap = 3 * gap + 1;
+  for (; gap > 0; gap /= 3)
+    for (int64_t i = gap; i < count; i++) {
+      const int64_t key = second[i];
+      const double contact = contacts[i], difference = differences[i];
+      int64_t j = i;
+      for (; j >= gap && second[j - gap] > key; j -= gap)
+        second[j] = second[j - gap], contacts[j] = contacts[j - gap],
+        differences[j] = differences[j - gap];
+      second[j] = key, contacts[j] = contact, differences[j] = difference;
+    }
+}
+
+}  // namespace
+
+// superpoints._contact_differences
+KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floats places,
+                           Floats normals, Longs planes, Longs rows, Ints nearest,
+                           double step_weight, double plane_weight, double* differences) {
+  double own[3], other[3], way[3], change[3];
+  for (int64_t q = 0; q < num_rows; q++, nearest += k, differences += k) {
+    const int64_t i = rows[q];
+    if (i < 0 || i >= num_points || !are_rows(nearest, k, num_points)) return NO_SUCH_ROW;
+    widen(normals + 3 * i, own);
+    for (int64_t j = 0; j < k; j++) {
+      const int64_t t = nearest[j];
+      widen(normals + 3 * t, other);
+      const double sign = __builtin_copysign(1.0, dot(own, other));
+      for (int axis = 0; axis < 3; axis++) {
+        way[axis] = double(places[3 * t + axis]) - double(places[3 * i + axis]);
+        change[axis] = other[axis] - own[axis] * sign;
+      }
+      const double here = dot(way, own), there = dot(way, other);
+      const double step = smaller(here * here, there * there) / dot(way, way);
+      const double is_other = planes[i] != planes[t];
+      differences[j] = dot(change, change) + step_weight * step + plane_weight * is_other;
+    }
+  }
+  return DONE;
+}
+
+// superpoints._gather_borders: rows by the smaller of their regions, equal ones added up, then those
+// of a region sorted by the larger.
+KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Longs a, Longs b,
+                      const double* contacts, const double* differences, int64_t* starts,
+                      int64_t* slots, int64_t* order, int64_t* first, int64_t* second,
+                      double* sum_contacts, double* sum_differences, int64_t* count) {
+  for (int64_t r = 0; r < num_starts; r++) starts[r] = 0, slots[r] = -1;
+  for (int64_t e = 0; e < num_rows; e++) {
+    const int64_t low = smaller(a[e], b[e]), high = larger(a[e], b[e]);
+    if (low < 0 || high >= num_starts - 1) return NO_SUCH_ROW;
+    starts[low + 1] += low != high;
+  }
+  for (int64_t r = 1; r < num_starts; r++) starts[r] += starts[r - 1];
+  for (int64_t e = 0; e < num_rows; e++)
+    if (a[e] != b[e]) order[starts[smaller(a[e], b[e])]++] = e;
+  int64_t end = 0, q = 0;
+  for (int64_t low = 0; low + 1 < num_starts; low++) {
+    const int64_t begin = end;
+    for (; q < starts[low]; q++) {
+      const int64_t e = order[q], high = larger(a[e], b[e]);
+      if (slots[high] < begin) {
+        slots[high] = end, first[end] = low, second[end] = high;
+        sum_contacts[end] = sum_differences[end] = 0, end++;
+      }
+      sum_contacts[slots[high]] += contacts[e], sum_differences[slots[high]] += differences[e];
+    }
+    sort_by_second(end - begin, second + begin, sum_contacts + begin, sum_differences + begin);
+  }
+  *count = end;
+  return DONE;
+}
+
+// superpoints._costs
+KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, int64_t num_borders,
+                     const double* size, const double* means, const double* low,
+                     const double* high, Longs first, Longs second, const double* contacts,
+                     const double* differences, double least, double bound, double* costs) {
+  for (int64_t e = 0; e < num_borders; e++) {
+    const int64_t a = first[e], b = second[e];
+    if (a < 0 || b < 0 || a >= num_regions || b >= num_regions) return NO_SUCH_ROW;
+    double difference = differences[e] / contacts[e] + least;
+    for (int64_t f = 0; f < num_features; f++) {
+      const double step = means[a * num_features + f] - means[b * num_features + f];
+      difference += step * step;
+    }
+    const double ward = size[a] * size[b] / (size[a] + size[b]);
+    costs[e] = ward * difference / square_root(contacts[e]);
+    for (int64_t d = 0; d < dims; d++)
+      if (larger(high[a * dims + d], high[b * dims + d]) -
+              smaller(low[a * dims + d], low[b * dims + d]) >
+          bound)
+        costs[e] = __builtin_inf();
+  }
+  return DONE;
+}
+
+// superpoints._cheapest_borders
+KERNEL cheapest_borders(int64_t num_borders, int64_t num_regions, Longs first, Longs second,
+                        const double* costs, double* least, int64_t* best) {
+  for (int64_t r = 0; r < num_regions; r++) best[r] = num_borders;
+  for (int64_t e = 0; e < num_borders; e++)
+    for (int end = 0; end < 2; end++) {
+      const int64_t r = end ? second[e] : first[e];
+      if (r < 0 || r >= num_regions) return NO_SUCH_ROW;
+      if (costs[e] < least[r]) least[r] = costs[e], best[r] = e;
+    }
+  return DONE;
+}
