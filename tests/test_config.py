@@ -93,6 +93,12 @@ def test_an_angle_beyond_a_right_one_is_refused():
         pytest.param("[" * 900, "expected YAML, got maximum recursion", id="brackets"),
         pytest.param("chunk_size: " + "9" * 5000, "expected YAML, got Exceeds", id="digits"),
         ("- 1", "expected a mapping"),
+        ("base: clasic", r"expected base to be one of .*classic, .* got 'clasic'"),
+        ("base: 3", "got 3"),
+        ("base: [consensus]", "got "),
+        ("base: ../mine", "expected base"),
+        ("base: consensus\ngrowing: 3", "growing: expected a mapping"),
+        ("base: consensus\ngrow: {}", "unknown key 'grow'"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text, message):
@@ -144,3 +150,42 @@ def test_missing_file_is_named(tmp_path):
 def test_values_out_of_range_are_refused(kind, values, message):
     with pytest.raises(ConfigError, match=message):
         kind(**values)
+
+
+def changes(settings, base):
+    """Return what differs, by section and name."""
+    return {
+        f"{section}.{name}": value
+        for section in ("normals", "growing", "planes")
+        for name, value in vars(getattr(settings, section)).items()
+        if value != getattr(getattr(base, section), name)
+    }
+
+
+OF_S3DIS = {"facet_tolerance": 0.009, "max_plane_residual": 2.5, "min_size": 200}
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("s3dis", {f"growing.{key}": v for key, v in OF_S3DIS.items()} | {"planes.up": "z"}),
+        (
+            "scannet",
+            {"normals.noise_scope": "regional", "growing.min_size": 20, "planes.up": "z"},
+        ),
+        ("laser", {"planes.up": "z"}),
+        ("rgbd", {"normals.k": 100, "growing.min_size": 100}),
+    ],
+)
+def test_settings_for_a_kind_of_data_are_consensus_but_for_what_they_say(name, expected):
+    assert changes(load_config(name), load_config("consensus")) == expected
+
+
+def test_a_file_holds_differences_to_its_base(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("base: consensus\ngrowing: {min_size: 7}\nchunk_size: 99\n")
+    settings = load_config(path)
+    assert changes(settings, load_config("consensus")) == {"growing.min_size": 7}
+    assert settings.chunk_size == 99
+    path.write_text("base: s3dis\n")
+    assert load_config(path) == load_config("s3dis")

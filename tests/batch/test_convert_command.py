@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
+from tests.batch.test_interruptions import results_of
 from tests.datasets.s3dis_tree import write_clean_room
 from torchrg.batch.records import RECORD
 from torchrg.batch.run import BatchReport, lock_folder
@@ -26,15 +27,6 @@ from torchrg.pipeline import segment_planes
 def convert(run):
     """``convert(kind, root, out, ...)``: the command on small rooms."""
     return lambda *arguments: run("convert", *arguments, "--preset", "classic")
-
-
-def contents(folder):
-    """Return the bytes of every result file by its path; reports and locks are none."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != "report.json" and not path.name.startswith(".")
-    }
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +53,7 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
     expected = {
         f"{room}/{name}" for room in ("hall", "east/office") for name in (*names, "provenance.json")
     }
-    assert set(contents(converted)) == expected
+    assert set(results_of(converted)) == expected
     points = np.load(rooms / "hall.npz")["points"]
     seg = segment_planes(points, load_config("classic"))
     hall = {name: np.load(converted / "hall" / f"{name}.npy") for name in ("coord", "normal")}
@@ -76,7 +68,7 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
 def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, convert):
     done = convert("folder", rooms, tmp_path / "out", "--workers", 1, "--limit-memory", 0.1)
     assert done.err.count("may need more memory than 0.1 GB; it runs alone") == 2
-    assert contents(tmp_path / "out") == contents(converted)
+    assert results_of(tmp_path / "out") == results_of(converted)
 
 
 def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tmp_path, convert):
@@ -97,7 +89,7 @@ def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tm
     status = {scan["name"]: scan["status"] for scan in report["scans"]}
     assert status == {"bad": "failed", "hall": "converted", "east/office": "kept"}
     assert all(name in done.out for name in status)
-    assert contents(tmp_path / "out") == contents(converted)
+    assert results_of(tmp_path / "out") == results_of(converted)
 
 
 def test_a_dry_run_writes_nothing(rooms, tmp_path, convert):
@@ -127,7 +119,7 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, con
     with lock_folder(tmp_path):
         error = convert("folder", rooms, tmp_path).error
     assert f"{tmp_path}: another torchrg command writes here; " in error
-    assert not contents(tmp_path)
+    assert not results_of(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -161,32 +153,28 @@ def test_mistakes_are_one_line_before_any_work(rooms, tmp_path, convert, argumen
     assert not (tmp_path / "out").exists()
 
 
-def test_progress_is_scans_points_a_second_and_time_left():
+@pytest.mark.parametrize(
+    ("unit", "bar_unit", "sizes", "words"),
+    [
+        ("scan", "pt", {"a": 900, "b": 100}, ("1/2 scans, 1 failed:  90%", "900/1000", "pt/s]")),
+        ("frame", "frame", {"a": 1, "b": 1}, ("1/2 frames, 1 failed:  50%", "1/2 [", "frame/s]")),
+    ],
+)
+def test_progress_is_scans_points_a_second_and_time_left(unit, bar_unit, sizes, words):
     shown = io.StringIO()
-    with tqdm(total=1000, unit="pt", file=shown, ncols=80) as bar:
-        progress = Progress(bar, {"900_a": 900, "100_b": 100}, unit="scan")
+    with tqdm(total=sum(sizes.values()), unit=bar_unit, file=shown, ncols=80) as bar:
+        progress = Progress(bar, sizes, unit=unit)
         progress(None)
-        progress(TaskReport("900_a", "failed"))
+        progress(TaskReport("a", "failed"))
         bar.refresh()
-    last = shown.getvalue().splitlines()[-1]
-    assert "1/2 scans, 1 failed:  90%" in last
-    assert "900/1000" in last
-    assert "pt/s]" in last
+    assert all(word in shown.getvalue().splitlines()[-1] for word in words)
 
 
 def test_depth_frames_are_counted_by_the_second():
-    shown = io.StringIO()
-    with tqdm(total=2, unit="frame", file=shown, ncols=80) as bar:
-        progress = Progress(bar, {"a": 1, "b": 1}, unit="frame")
-        progress(TaskReport("a", "converted"))
-        bar.refresh()
-    assert "1/2 frames:  50%" in shown.getvalue()
-    assert "frame/s]" in shown.getvalue()
     scans = (TaskReport("a", "converted", num_points=640), TaskReport("b", "failed"))
     report = BatchReport(scans, started=0.0, seconds=4.0, engine="local", workers=1)
-    assert "640 points in 4.0 s: 160 points, 0.25 frames a second" in format_report(
-        report, unit="frame"
-    )
+    told = "640 points in 4.0 s: 160 points, 0.25 frames a second"
+    assert told in format_report(report, unit="frame")
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")

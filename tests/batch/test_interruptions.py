@@ -120,7 +120,7 @@ def test_a_killed_command_goes_on_where_it_was(rooms, undisturbed, tmp_path):
 
 
 KILLS = 50
-"""Of each kind of data set."""
+"""Kills of the command for each kind of data set."""
 
 
 @pytest.fixture

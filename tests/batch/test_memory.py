@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from torchrg.batch.memory import available_memory, memory_of_scan, memory_on_disk, peak_memory
+from torchrg.batch.memory import available_memory, memory_of_scan, peak_memory
 
 MEASURE = """
 import sys
@@ -37,34 +37,22 @@ print(peak_memory())
 """
 
 
-def peaks(folder, what, preset, num_points):
-    """Return the peaks of memory that a process of its own has measured."""
-    command = [sys.executable, "-c", MEASURE, what, preset, str(num_points), str(folder)]
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("what", "preset", "num_points"),
+    [
+        ("frame", "classic", 640 * 480),
+        *(("scan", preset, 300_000) for preset in ("classic", "paper", "consensus")),
+        *(("disk", preset, 1_000_000) for preset in ("classic", "paper", "consensus")),
+    ],
+)
+def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, what, preset, num_points):
+    command = [sys.executable, "-c", MEASURE, what, preset, str(num_points), str(tmp_path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return [int(line) for line in done.stdout.split()]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ["classic", "paper", "consensus", "frame"])
-def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, preset):
-    num_points = 300_000 if preset != "frame" else 640 * 480
-    (peak,) = peaks(tmp_path, "frame" if preset == "frame" else "scan", preset, num_points)
-    assert 0.5 * memory_of_scan(num_points) < peak < memory_of_scan(num_points)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
-def test_what_a_cloud_on_a_disk_takes_is_what_the_model_says(tmp_path, preset):
-    num_points = 1_000_000
-    (peak,) = peaks(tmp_path, "disk", preset, num_points)
-    assert 0.5 * memory_on_disk(num_points) < peak < memory_on_disk(num_points)
+    promised = memory_of_scan(num_points, on_disk=what == "disk")
+    assert 0.5 * promised < int(done.stdout) < promised
 
 
 def test_memory_is_measured():
     assert 1e7 < peak_memory() < 1e12
     assert 1e7 < available_memory() < 1e14
-
-
-@pytest.mark.parametrize("num_points", [0, 10**5, 10**7])
-def test_the_estimate_stays_within_what_is_promised(num_points):
-    assert memory_of_scan(num_points) <= 2e9 + 1200 * num_points

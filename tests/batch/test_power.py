@@ -16,7 +16,7 @@ from torchrg.config import load_config
 from torchrg.scenes import make_room
 
 SYSTEM_CALLS = ("fsync", "unlink", "replace", "mkdir", "rmdir")
-"""What changes a folder, or flushes it."""
+"""Calls that change a folder, or flush it."""
 
 
 def convert(root):

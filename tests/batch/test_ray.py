@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.batch.test_interruptions import results_of
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource
@@ -31,23 +32,10 @@ def run_python(*arguments):
     return done.stdout
 
 
-def results_of(out):
-    """Return the bytes of every result."""
-    return {
-        path.relative_to(out).as_posix(): path.read_bytes()
-        for path in out.rglob("*.*")
-        if path.is_file() and not path.name.startswith(".") and path.name != "report.json"
-    }
-
-
 @needs_ray
 @pytest.mark.slow
 def test_ray_gives_the_bytes_of_one_process(folder_of_clouds, tmp_path):
-    rooms, out, here = (
-        folder_of_clouds("a.npz", "b.npz", "c.ply"),
-        tmp_path / "out",
-        tmp_path / "here",
-    )
+    rooms, out, here = folder_of_clouds("a.npz", "b.npz", "c.ply"), tmp_path / "out", tmp_path / "h"
     options = ("--preset", "classic", "--engine", "ray", "--workers", "2")
     shown = run_python("-m", "torchrg", "convert", "folder", rooms, out, *options)
     assert "3 of 3 scans are complete" in shown

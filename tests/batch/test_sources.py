@@ -17,7 +17,6 @@ from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config
 from torchrg.datasets.rgbd import LAYOUTS
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.errors import ConfigError
 from torchrg.io import Cloud, estimate_points, write_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
 
@@ -201,13 +200,6 @@ def test_folders_of_pointcept_go_elsewhere_with_their_labels(tmp_path):
     assert np.array_equal(normal, segment_planes(points, CLASSIC).normals)
 
 
-def test_results_never_go_in_among_the_scans(tmp_path):
-    np.save(tmp_path / "a.npy", grid())
-    for out in (tmp_path, tmp_path / "out"):
-        with pytest.raises(ConfigError, match="expected a directory outside"):
-            list_jobs(FolderSource(tmp_path, CLASSIC, out), out)
-
-
 def test_depth_frames_become_images(tmp_path):
     depth = np.full((30, 40), 2000, dtype=np.uint16)
     depth[:, 20:] = 3000
@@ -243,14 +235,3 @@ def test_points_are_counted_without_reading_them(tmp_path, suffix):
     assert estimate_points(path) == pytest.approx(780, rel=0 if suffix != ".xyz" else 0.02)
     path.write_bytes(path.read_bytes()[:20] if suffix != ".xyz" else b"")
     assert estimate_points(path) == 0
-
-
-def test_names_of_columns_are_for_files_that_take_them(tmp_path):
-    scene = tmp_path / "in" / "room"
-    scene.mkdir(parents=True)
-    np.save(scene / "coord.npy", grid())
-    source = FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", columns=("x", "y", "z"))
-    with pytest.raises(ConfigError, match=r"expected text or \.npy for --columns"):
-        source.list_scans()
-    np.savetxt(tmp_path / "in" / "hall.txt", grid())
-    assert [scan.name for scan in source.list_scans()] == ["hall", "room"]

@@ -19,6 +19,11 @@ CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads
 INTRINSICS = make_intrinsics(50.0, 50.0, 39.5, 29.5)
 
 
+def points_of(depth, camera=INTRINSICS):
+    """Return the points of a depth image, in its type."""
+    return depth_to_points(depth[None], camera[None])[0].view(-1, 3)
+
+
 @pytest.fixture
 def depth():
     """A wall with a step and a hole, in metres."""
@@ -53,8 +58,7 @@ def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth, run):
         out = tmp_path / f"cloud{suffix}"
         assert run("depth", frame, *CAMERA, "--out", out).code == 0
         cloud = read_cloud(out)
-        points = depth_to_points(depth[None].double(), INTRINSICS[None])[0].view(-1, 3)
-        np.testing.assert_allclose(cloud.coordinates, points.float(), rtol=1e-6)
+        np.testing.assert_allclose(cloud.coordinates, points_of(depth.double()), rtol=1e-6)
         expected = segment_depth(depth, INTRINSICS).labels.flatten()
         np.testing.assert_array_equal(cloud.fields["labels"], expected)
     assert cloud.grid_shape == (60, 80)
@@ -68,7 +72,7 @@ def test_a_depth_image_becomes_a_cloud(tmp_path, frame, depth, run):
 @pytest.mark.parametrize("focal", [50.0, 500.0])
 def test_organised_clouds_keep_their_grid(tmp_path, depth, run, focal):
     camera = make_intrinsics(focal, focal, 39.5, 29.5)
-    points = depth_to_points(depth[None], camera[None])[0].view(-1, 3)
+    points = points_of(depth, camera)
     source, out = tmp_path / "scan.pcd", tmp_path / "out.pcd"
     write_cloud(source, Cloud(points.numpy(), grid_shape=(60, 80)))
     # A narrow cloud is moved to an origin of its own; its planes stay where they are.
@@ -86,7 +90,7 @@ def test_organised_clouds_keep_their_grid(tmp_path, depth, run, focal):
 
 
 def test_segment_says_that_a_cloud_is_a_depth_image(tmp_path, run, depth):
-    points = depth_to_points(depth[None], INTRINSICS[None])[0].view(-1, 3).numpy()
+    points = points_of(depth).numpy()
     turned = points[:, [2, 0, 1]]
     for name, coordinates, grid in (
         ("image", points, (60, 80)),
@@ -141,7 +145,7 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, run):
 
 
 def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
-    points = depth_to_points(depth[None], INTRINSICS[None])[0].view(-1, 3).numpy()
+    points = points_of(depth).numpy()
     write_cloud(tmp_path / "list.pcd", Cloud(points))
     write_cloud(tmp_path / "turned.pcd", Cloud(points + 1, grid_shape=(60, 80)))
     np.save(tmp_path / "bad.npy", depth.numpy())

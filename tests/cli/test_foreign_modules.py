@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 MODULES = ("json", "numpy", "pickle", "random", "select", "torch")
-"""Of the standard library and of others, loaded by interpreters, libraries or Ray as they start."""
+"""Modules of the standard library and of others that interpreters, libraries or Ray load first."""
 SEGMENT = ("segment", "a.npy", "--out", "../o.npz", "--preset", "classic")
 CONVERT = ("convert", "folder", "../in", "../out", "--preset", "classic", "--workers", "2")
 COMMAND = """

@@ -9,8 +9,6 @@ import sys
 import numpy as np
 import pytest
 
-from torchrg.cli import main
-
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000"]
 # prctl(PR_CAPBSET_DROP, ...) of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, by which the superuser
 # writes where nobody may.
@@ -52,14 +50,14 @@ def server():
 
 
 @pytest.fixture
-def run(server, place):
+def there(server, place):
     """Run a command there, in the folder of the test; return its code, output and errors."""
 
-    def run(*arguments):
+    def call(*arguments):
         print(json.dumps([arguments, str(place)]), file=server.stdin, flush=True)
         return json.loads(server.stdout.readline())
 
-    return run
+    return call
 
 
 @pytest.fixture
@@ -125,9 +123,9 @@ def words_of(command):
     return [*command.split(), *(CAMERA if command.startswith("depth") else [])]
 
 
-def check_refused(place, run, command, target):
+def check_refused(place, there, command, target):
     before = contents(place)
-    code, out, err = run(*words_of(command))
+    code, out, err = there(*words_of(command))
     assert (code, err.count("\n"), out) == (2, 1, ""), err
     assert f"{target}: cannot be written: " in err
     assert "is read-only; write to another place, or make it writable." in err
@@ -136,58 +134,55 @@ def check_refused(place, run, command, target):
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("target", ["shut/x", "open/kept"])
-def test_a_file_that_cannot_be_written_is_told_before_the_work(place, run, command, target):
+def test_a_file_that_cannot_be_written_is_told_before_the_work(place, there, command, target):
     suffix = command.split("{}")[1].split()[0]
-    check_refused(place, run, command.format(target), f"{target}{suffix}")
+    check_refused(place, there, command.format(target), f"{target}{suffix}")
 
 
 @pytest.mark.parametrize(("command", "kept"), FOLDERS)
-def test_a_directory_with_a_file_that_cannot_be_written_is_told_too(place, run, command, kept):
-    check_refused(place, run, command.format(kept.split("/")[0]), kept)
+def test_a_directory_with_a_file_that_cannot_be_written_is_told_too(place, there, command, kept):
+    check_refused(place, there, command.format(kept.split("/")[0]), kept)
 
 
 @pytest.mark.parametrize("command", [command for command, _ in FOLDERS])
-def test_a_directory_that_takes_no_files_is_told_before_the_work(place, run, command):
+def test_a_directory_that_takes_no_files_is_told_before_the_work(place, there, command):
     for target, message in (("shut/out", "is read-only"), ("shut/new", "cannot be made")):
         if target == "shut/new" and command.startswith("depth 1.png --out"):
             continue  # One image goes to a file.
-        code, _, err = run(*words_of(command.format(target)))
+        code, _, err = there(*words_of(command.format(target)))
         assert (code, err.count("\n")) == (2, 1), err
         assert message in err
     assert not list(place.joinpath("shut", "out").iterdir())
 
 
-def test_a_device_is_no_place(tmp_path, capsys):
+def test_a_device_is_no_place(tmp_path, run):
     os.mkfifo(tmp_path / "pipe.png")
     np.savez(tmp_path / "a.npz", points=np.eye(3), labels=np.arange(3))
-    assert main(["view", str(tmp_path / "a.npz"), "--out", str(tmp_path / "pipe.png")]) == 2
-    assert "expected a file to write, got a device" in capsys.readouterr().err
+    done = run("view", tmp_path / "a.npz", "--out", tmp_path / "pipe.png")
+    assert "expected a file to write, got a device" in done.error
 
 
 @pytest.mark.parametrize("command", ["segment", "normals"])
-def test_inputs_whose_results_would_share_a_file_are_both_named(tmp_path, capsys, command):
-    for name in ("a/x.npz", "b/X.pcd"):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).touch()
-    inputs = [str(tmp_path / name) for name in ("a/x.npz", "b/X.pcd")]
-    assert main([command, *inputs, "--out", str(tmp_path / "out")]) == 2
-    line = capsys.readouterr().err
-    assert all(name in line for name in (*inputs, "give them different directories"))
+def test_inputs_whose_results_would_share_a_file_are_both_named(tmp_path, run, command):
+    inputs = [tmp_path / name for name in ("a/x.npz", "b/X.pcd")]
+    for path in inputs:
+        path.parent.mkdir()
+        path.touch()
+    line = run(command, *inputs, "--out", tmp_path / "out").error
+    assert all(str(name) in line for name in (*inputs, "give them different directories"))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["index", "INDEX"])
-def test_no_page_takes_the_place_of_the_index(tmp_path, capsys, name):
+def test_no_page_takes_the_place_of_the_index(tmp_path, run, name):
     pytest.importorskip("pydeck", reason="needs the extra view")
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in" / f"{name}.npy").touch()
-    (tmp_path / "pages").mkdir()
-    segment = ["segment", str(tmp_path / "in" / f"{name}.npy"), "--out", str(tmp_path)]
-    convert = ["convert", "folder", str(tmp_path / "in"), str(tmp_path / "out")]
+    inputs, pages = tmp_path / "in", tmp_path / "pages"
+    inputs.mkdir()
+    pages.mkdir()
+    (inputs / f"{name}.npy").touch()
     for command in (
-        [*segment, "--pages", "--picture", str(tmp_path / "pages")],
-        [*convert, "--pages", str(tmp_path / "pages")],
+        ("segment", inputs / f"{name}.npy", "--out", tmp_path, "--pages", "--picture", pages),
+        ("convert", "folder", inputs, tmp_path / "out", "--pages", pages),
     ):
-        assert main(command) == 2
-        assert f"the page of {name} would take the place of the index" in capsys.readouterr().err
-    assert not list((tmp_path / "pages").iterdir())
+        assert f"the page of {name} would take the place of the index" in run(*command).error
+    assert not list(pages.iterdir())

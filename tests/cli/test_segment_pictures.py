@@ -53,8 +53,10 @@ def test_picture_is_refused_before_the_work(rooms, tmp_path, segment, inputs, pl
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
-def test_cloud_without_a_plane_has_a_picture_too(tmp_path, segment):
+def test_equal_points_give_no_plane_a_warning_and_a_picture(tmp_path, segment):
     np.save(tmp_path / "one.npy", np.ones((300, 3), dtype=np.float32))
     places = ("--out", tmp_path / "seg.npz", "--picture", tmp_path / "seg.png")
-    assert segment(tmp_path / "one.npy", *places).code == 0
+    done = segment(tmp_path / "one.npy", *places)
+    assert (done.code, done.err.count("\n")) == (0, 1)
+    assert "no plane found: all points are equal" in done.err
     assert (tmp_path / "seg.png").read_bytes().startswith(PNG)

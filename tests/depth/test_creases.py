@@ -23,7 +23,9 @@ def move(surface, labels, *, truth, reach):
     fit = fit_planes(Segments(truth.flatten()), points, torch.ones_like(points))
     seen = torch.ones(height, width, dtype=torch.bool)
     cloud = InverseCloud(points, torch.zeros(height * width), seen)
-    return move_to_creases(cloud, labels.flatten(), fit, torch.tensor(reach)).view(height, width)
+    return move_to_creases(cloud, labels.flatten(), fit, torch.tensor(reach).double()).view(
+        height, width
+    )
 
 
 def roof(height=40, width=60):

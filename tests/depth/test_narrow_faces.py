@@ -8,7 +8,15 @@ import torch
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
 from torchrg.depth.faces import join_strips
-from torchrg.depth.windows import NARROW, find_jitter, fit_narrow_windows, fit_windows
+from torchrg.depth.windows import (
+    NARROW,
+    Image,
+    Windows,
+    find_jitter,
+    fit_narrow_windows,
+    fit_windows,
+    held_pixels,
+)
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 262.5
 CAMERA = make_intrinsics(FOCAL, FOCAL, 159.5, 119.5)
@@ -34,25 +42,30 @@ def step_in_a_wall(view):
 
 def test_narrow_windows_are_those_of_a_literal_least_squares_fit(rng):
     height, width = 14, 17
-    u, v = torch.arange(width).double() - 8, torch.arange(height).double()[:, None] - 7
+    u, v = torch.arange(width).double() - 8, torch.arange(height).double() - 7
     image = torch.randn(height, width, generator=rng, dtype=torch.float64)
     seen = torch.rand(height, width, generator=rng) < 0.8
-    pixels = torch.tensor([0, 40, 7 * width + 8, height * width - 1])
-    planes, held = fit_narrow_windows(image, seen, u, v, pixels)
+    seen.view(-1)[[1, 40, 7 * width + 8, -1]] = True
+    pixels = seen.flatten().nonzero().squeeze(1)
+    numbers = torch.full((height, width), -1)
+    numbers.view(-1)[pixels] = torch.arange(len(pixels))
+    planes = Windows(*fit_narrow_windows(Image(image, seen, u, v), numbers, pixels))
     for shape, (rows, columns) in enumerate(NARROW):
-        for number, pixel in enumerate(pixels.tolist()):
+        held = torch.stack([at for at, _ in held_pixels(numbers, pixels, rows, columns)], dim=1)
+        for pixel in (1, 40, 7 * width + 8, height * width - 1):
+            number = int(numbers.view(-1)[pixel])
             row, column = divmod(pixel, width)
             inside = torch.zeros_like(seen)
             top, left = max(row - rows // 2, 0), max(column - columns // 2, 0)
             area = (slice(top, row + rows // 2 + 1), slice(left, column + columns // 2 + 1))
             inside[area] = seen[area]
-            found = held[shape, number]
+            found = held[number]
             assert found[found >= 0].tolist() == inside.flatten().nonzero().squeeze(1).tolist()
             deviation = planes.deviation[shape, number]
             if int(inside.sum()) < 0.4 * rows * columns:
                 assert deviation.isinf()
                 continue
-            x, y = u.expand_as(image)[inside], v.expand_as(image)[inside]
+            x, y = u.expand_as(image)[inside], v[:, None].expand_as(image)[inside]
             matrix = torch.stack([x, y, torch.ones_like(x)], dim=1)
             solution = torch.linalg.lstsq(matrix, image[inside][:, None]).solution[:, 0]
             rest = image[inside] - matrix @ solution
@@ -64,11 +77,11 @@ def test_narrow_windows_are_those_of_a_literal_least_squares_fit(rng):
 
 @pytest.mark.parametrize("jitter", [0.0, 0.05, 0.1, 0.4])
 def test_jitter_of_rays_is_found(jitter, rng):
-    u, v = torch.arange(WIDTH).double() - 159.5, torch.arange(HEIGHT).double()[:, None] - 119.5
+    u, v = torch.arange(WIDTH).double() - 159.5, torch.arange(HEIGHT).double() - 119.5
     moved = [torch.randn(HEIGHT, WIDTH, generator=rng).double() * jitter for _ in range(2)]
-    image = 0.5 + 0.001 * (u + moved[0]).abs() + 0.0005 * (v + moved[1])
+    image = 0.5 + 0.001 * (u + moved[0]).abs() + 0.0005 * (v[:, None] + moved[1])
     seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    found = find_jitter(fit_windows(image, seen, u, v)[2])
+    found = find_jitter(fit_windows(Image(image, seen, u, v))[2])
     assert found == pytest.approx(min(jitter, 0.15), rel=0.1, abs=1e-4)
 
 

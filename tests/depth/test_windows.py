@@ -5,14 +5,18 @@ import torch
 
 from torchrg.depth.growth import holds
 from torchrg.depth.normals import fit_pixels, least_in_windows
-from torchrg.depth.windows import CELL_SIZES, fit_windows, noise_by_size
+from torchrg.depth.windows import CELL_SIZES, Image, Windows, fit_windows, noise_by_size
 
 FOCAL = (525.0, 525.0)
 
 
 def coordinates(height, width):
     u = torch.arange(width).double() - width / 2
-    return u, torch.arange(height).double()[:, None] - height / 2
+    return u, torch.arange(height).double() - height / 2
+
+
+def windows_of(*image):
+    return {size: Windows(*table) for size, table in fit_windows(Image(*image)).items()}
 
 
 @pytest.mark.parametrize("size", CELL_SIZES)
@@ -21,7 +25,7 @@ def test_windows_are_those_of_a_literal_least_squares_fit(rng, size):
     u, v = coordinates(height, width)
     image = torch.randn(height, width, generator=rng, dtype=torch.float64)
     seen = torch.rand(height, width, generator=rng) < 0.8
-    planes = fit_windows(torch.where(seen, image, 1e6), seen, u, v)[size]
+    planes = windows_of(torch.where(seen, image, 1e6), seen, u, v)[size]
     assert planes.mean.shape == (-(-height // size), -(-width // size))
     for row, column in ((3, 3), (1, 1), (5, 5), (4, 0)):
         rows = slice(max(row - 2, 0) * size, (row + 3) * size)
@@ -31,11 +35,11 @@ def test_windows_are_those_of_a_literal_least_squares_fit(rng, size):
         if int(inside.sum()) < 0.4 * (5 * size) ** 2:
             assert planes.deviation[row, column].isinf()
             continue
-        x, y = u.expand_as(image)[inside], v.expand_as(image)[inside]
+        x, y = u.expand_as(image)[inside], v[:, None].expand_as(image)[inside]
         matrix = torch.stack([x, y, torch.ones_like(x)], dim=1)
         solution = torch.linalg.lstsq(matrix, image[inside][:, None]).solution[:, 0]
         rest = image[inside] - matrix @ solution
-        found = torch.stack([part[row, column] for part in planes])
+        found = torch.stack([part[row, column] for part in planes[:5]])
         deviation = (rest.square().sum() / (len(x) - 3)).sqrt()
         expected = torch.stack([*solution, deviation, image[inside].mean()])
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
@@ -45,10 +49,10 @@ def test_windows_without_enough_pixels_or_along_a_line_have_no_plane():
     u, v = coordinates(9, 9)
     image, line = torch.ones(9, 9).double(), torch.zeros(9, 9, dtype=torch.bool)
     line[4] = True
-    for planes in fit_windows(image, line, u, v).values():
+    for planes in windows_of(image, line, u, v).values():
         assert planes.deviation.isinf().all()
     thin = torch.ones(1, 9, dtype=torch.bool)
-    for planes in fit_windows(image[:1], thin, u, v[:1]).values():
+    for planes in windows_of(image[:1], thin, u, v[:1]).values():
         assert planes.deviation.isinf().all()
 
 
@@ -64,12 +68,12 @@ def test_least_in_windows_is_that_of_a_literal_search(rng):
 
 def test_noise_of_depth_is_found_whatever_its_growth(rng):
     u, v = coordinates(240, 320)
-    inverse = 0.25 + (u + 160) * 0.004 + 0 * v
+    inverse = 0.25 + (u + 160) * 0.004 + 0 * v[:, None]
     seen = torch.ones_like(inverse, dtype=torch.bool)
     for constant, growth in ((0.004, 0.0), (0.0, 0.002), (0.003, 0.0015)):
         level = growth + constant * inverse**2
         noisy = inverse + level * torch.randn(240, 320, generator=rng, dtype=torch.float64)
-        noise = noise_by_size(fit_windows(noisy, seen, u, v), None, torch.float32)
+        noise = noise_by_size(fit_windows(Image(noisy, seen, u, v)), None, torch.float32)
         for size in CELL_SIZES:
             ratio = (noise[size].at(inverse) / level)[16:-16, 16:-16]
             assert float(ratio.min()) > 0.7, (constant, growth, size)
@@ -80,7 +84,7 @@ def test_noise_that_is_given_is_taken(rng):
     u, v = coordinates(20, 20)
     inverse = 0.5 + torch.rand(20, 20, generator=rng, dtype=torch.float64)
     seen = torch.ones_like(inverse, dtype=torch.bool)
-    noise = noise_by_size(fit_windows(inverse, seen, u, v), (0.01, 0.02), torch.float32)
+    noise = noise_by_size(fit_windows(Image(inverse, seen, u, v)), (0.01, 0.02), torch.float32)
     torch.testing.assert_close(noise[2].at(inverse), 0.02 + 0.01 * inverse**2)
     assert noise[2] == noise[8]
 
@@ -89,7 +93,8 @@ def test_windows_beside_a_step_are_flat_and_tell_the_edge():
     u, v = coordinates(30, 40)
     inverse = torch.where(u < 0, 0.5, 0.4).double().expand(30, 40)
     seen = torch.ones(30, 40, dtype=torch.bool)
-    found = fit_pixels(inverse, seen, u, v, focal=FOCAL, noise=None, dtype=torch.float32)
+    image = Image(inverse, seen, u, v)
+    found = fit_pixels(image, focal=FOCAL, noise=None, dtype=torch.float32).choice
     assert found.flat.all()
     assert found.edge[0].any()
     assert not found.edge.all()
@@ -101,7 +106,7 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
     image = 1 + 0.05 * torch.randn(height, width, generator=rng, dtype=torch.float64)
     image += torch.where(u < 3, 0.0, 2.0)
     seen = torch.ones(height, width, dtype=torch.bool)
-    found = fit_pixels(image, seen, u, v, focal=FOCAL, noise=None, dtype=torch.float32)
+    found = fit_pixels(Image(image, seen, u, v), focal=FOCAL, noise=None, dtype=torch.float32)
     squares = [
         (size * (row - 2), size * (row + 3), size * (column - 2), size * (column + 3))
         for size in sorted(CELL_SIZES)
@@ -109,14 +114,14 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         for column in range(-(-width // size))
     ]
     pixels, others = torch.randint(height * width, (2, 400), generator=rng)
-    expected = []
+    sides, middles = found.sides_and_middles(pixels)
+    expected, lengths = [], []
     for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
-        top, bottom, left, right = squares[int(found.window.flatten()[pixel])]
+        top, bottom, left, right = squares[int(found.choice.window.flatten()[pixel])]
         row, column = divmod(other, width)
         expected.append(top <= row < bottom and left <= column < right)
-        assert bottom - top == found.sides[0].flatten()[pixel]
-        assert right - left == found.sides[1].flatten()[pixel]
-    sides, middles = (part.flatten(1)[:, pixels] for part in (found.sides, found.middle))
+        lengths.append([bottom - top, right - left])
+    assert sides.T.tolist() == lengths
     assert holds(sides, middles, others, width).tolist() == expected
     assert any(expected)
     assert not all(expected)

@@ -1,5 +1,6 @@
 """Whatever the loader is given, a kernel gets what its signature says, or an error says why not."""
 
+import math
 import random
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from torchrg.kernels.signatures import SIGNATURES
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 
+LENGTHS = [0, 1, 2, 3, 8, 9, 16, 50, 64, 70]
 NUMBERS = [0.0, 1.0, -1.0, 0.35, 1e30, float("inf"), float("nan")]
 DTYPES = {"f": torch.float32, "d": torch.float64, "i": torch.int32, "l": torch.int64}
 
@@ -36,10 +38,22 @@ def any_tensor(draw, letter, shape, num_points):
     return values
 
 
+def lengths_of_image(height, width, num_narrow):
+    """Return lengths that fit to those of an image: of cells of 2 pixels, of tables of windows."""
+    shapes = [(height, width)]
+    while len(shapes) < 4:
+        shapes.append(tuple(-(-length // 2) for length in shapes[-1]))
+    squares = sum(math.prod(shape) for shape in shapes)
+    lengths = {"m": 10, "p": shapes[1][0], "q": shapes[1][1], "P": height * width}
+    return lengths | {"N": 9 * squares, "M": 18 * num_narrow}
+
+
 def any_call(draw, name):
     """Call a kernel with lengths of 0 to 70; return whether it took the arguments."""
-    lengths = {letter: draw.choice([0, 1, 2, 3, 8, 9, 16, 50, 64, 70]) for letter in "NnkpcCweErRF"}
+    lengths = {letter: draw.choice(LENGTHS) for letter in "NnkpcCwhmqMPLAeErRF"}
     lengths["c"] = draw.choice([10, lengths["c"]])
+    if "hw]" in SIGNATURES[name] and draw.random() < 0.7:
+        lengths |= lengths_of_image(lengths["h"], lengths["w"], lengths["n"])
     arguments = []
     for word in SIGNATURES[name].split("->")[0].split():
         letter, axes = word[0], word[1:].strip("[]?")

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
-from pathlib import Path
 from threading import Thread
 
 from torchrg._parallel import CHILD_ENVIRONMENT
@@ -27,8 +26,7 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
 
     A scan starts when a worker is free and all that run stay within the limit; one that takes more
     than the limit runs alone. When a worker dies, its scan waits until all others are done and is
-    tried once more, alone. Workers end with this process, however it ends. While scans are
-    converted, the system is asked to read the files of the next ones.
+    tried once more, alone. Workers end with this process, however it ends.
 
     Args:
         jobs: The scans to convert.
@@ -59,8 +57,6 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
                     break
                 waiting.remove(job)
                 start(job, attempt=1)
-                for following in waiting[workers - 1 : workers]:
-                    read_ahead(following.scan.inputs)
             if not busy:
                 start(lost.pop(0), attempt=2)
             ready = connection.wait(busy, timeout=BEAT_SECONDS)
@@ -79,16 +75,6 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
     finally:
         for worker in [*idle, *busy.values()]:
             worker.stop()
-
-
-def read_ahead(files: Sequence[Path]) -> None:
-    """Ask the system, where it can, to have files in memory soon; it reads them on the side."""
-    if not hasattr(os, "posix_fadvise"):
-        return
-    for file in files:
-        # One that cannot be read fails where it is needed.
-        with contextlib.suppress(OSError), file.open("rb") as stream:
-            os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_WILLNEED)
 
 
 class _Worker:

@@ -6,7 +6,7 @@ from pathlib import Path
 from torchrg.pipeline import BYTES_PER_POINT, BYTES_PER_POINT_ON_DISK
 
 PROCESS_BYTES = 500_000_000
-"""What a process takes before the first point: Python, torch, scipy."""
+"""Memory of a process before the first point: Python, torch, scipy."""
 _CGROUP = Path("/sys/fs/cgroup")
 """Where Linux shows control groups, with which containers are limited."""
 _CGROUP_FILES = (
@@ -19,24 +19,16 @@ _SHARE = 0.8
 others, and for what else the machine does."""
 
 
-def memory_of_scan(num_points: int) -> int:
-    """Return the memory that a process needs for a cloud or a depth image at once, in bytes.
+def memory_of_scan(num_points: int, *, on_disk: bool = False) -> int:
+    """Return the memory that a process needs for a cloud or a depth image, in bytes.
+
+    ``on_disk`` is for a cloud whose large arrays are on a disk.
 
     Example:
-        >>> memory_of_scan(1_000_000)
-        1600000000
+        >>> memory_of_scan(1_000_000), memory_of_scan(10_000_000, on_disk=True)
+        (1600000000, 2000000000)
     """
-    return PROCESS_BYTES + BYTES_PER_POINT * num_points
-
-
-def memory_on_disk(num_points: int) -> int:
-    """Return what a process needs for a cloud whose large arrays are on a disk, in bytes.
-
-    Example:
-        >>> memory_on_disk(10_000_000)
-        2000000000
-    """
-    return PROCESS_BYTES + BYTES_PER_POINT_ON_DISK * num_points
+    return PROCESS_BYTES + (BYTES_PER_POINT_ON_DISK if on_disk else BYTES_PER_POINT) * num_points
 
 
 def spare_memory() -> int:

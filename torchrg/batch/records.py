@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,8 +19,6 @@ from torchrg.io import atomic_path
 from torchrg.io.files import DAMAGES
 from torchrg.result import RECORD as RECORD
 
-Settings = PipelineConfig | NormalsConfig | DepthConfig
-"""The settings of a command."""
 Record = dict[str, Any]
 """A record, or a piece of one, as JSON holds it."""
 
@@ -33,10 +31,10 @@ class Recorded(Protocol):
         """Where the results and the record of them are."""
 
     def describe(self) -> Record:
-        """Return what decides the results; see :func:`describe_work`."""
+        """Return what decides the results, as JSON holds it."""
 
 
-def describe_run(source: Path, settings: Settings) -> Record:
+def describe_run(source: Path, settings: PipelineConfig | NormalsConfig | DepthConfig) -> Record:
     """Return what is needed to make a result of one file again, as JSON holds it."""
     return {
         "versions": describe_versions(),
@@ -63,31 +61,6 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def describe_work(
-    settings: Settings, options: Record, inputs: Sequence[Path], root: Path
-) -> Record:
-    """Return what decides the results of inputs below a folder, as JSON holds it.
-
-    Raises OSError if an input cannot be read.
-    """
-    names = (
-        path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
-        for path in inputs
-    )
-    config = dataclasses.asdict(settings)
-    # It never changes a result, and lowering it after running out of memory must cost nothing.
-    config.pop("chunk_size", None)
-    return {
-        "versions": describe_versions(),
-        "config": config,
-        "source": options,
-        "inputs": [
-            {"name": name} | _fingerprint(path) for name, path in zip(names, inputs, strict=True)
-        ],
-        "device": "cpu",
-    }
-
-
 def write_record(folder: Path, description: Record, report: TaskReport) -> None:
     """Write the record of a scan whose files are complete, with its description before the work."""
     record = {
@@ -96,47 +69,39 @@ def write_record(folder: Path, description: Record, report: TaskReport) -> None:
         "regions": report.num_regions,
         "repairs": list(report.repairs),
         "warnings": list(report.warnings),
-        "outputs": {name: _fingerprint(folder / name) for name in report.files},
+        "outputs": {name: fingerprint(folder / name) for name in report.files},
     }
     with atomic_path(folder / RECORD) as beside:
         beside.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def read_record(folder: Path) -> Record | None:
-    """Return the record in a folder, or None if there is none that can be read."""
-    content = _read_json(folder / RECORD)
-    return content if isinstance(content, dict) and _is_record(content) else None
+def read_record(folder: Path, *, is_ours: bool = False) -> Record | None:
+    """Return the record in a folder, or None if there is none that can be read.
 
-
-def check_record(folder: Path) -> None:
-    """Raise FormatError if another program has a file in the place of the record."""
-    content = _read_json(folder / RECORD)
-    if content is not None and not _is_record(content):
+    With ``is_ours``, a file of another program in its place is a FormatError.
+    """
+    try:
+        content = json.loads((folder / RECORD).read_bytes())
+    except (OSError, *DAMAGES):
+        return None
+    names = ("versions", "outputs")
+    if isinstance(content, dict) and all(isinstance(content.get(name), dict) for name in names):
+        return content
+    if is_ours and content is not None:
         raise FormatError(
             f"{folder / RECORD}: was not written by torchrg; move it away, or choose another "
             "directory."
         )
+    return None
 
 
-def _read_json(path: Path) -> object:
-    """Return what is in the place of the record, None if it is not there or damaged."""
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, *DAMAGES):
-        return None
-
-
-def _is_record(content: object) -> bool:
-    """Return whether an object of JSON is a record."""
-    names = ("versions", "outputs")
-    return isinstance(content, dict) and all(isinstance(content.get(name), dict) for name in names)
-
-
-def is_unchanged(folder: Path, name: str, noted: object) -> bool:
-    """Return whether a file beside a record is still the one that the record notes."""
-    path = folder / name
-    is_result = path.parent == folder and path.is_file() and not path.is_symlink()
-    return is_result and _fingerprint(path) == noted
+def remove_earlier(folder: Path, record: Record, files: Collection[str]) -> None:
+    """Remove the files of an earlier record, but for those of these names or changed since."""
+    for name in record["outputs"].keys() - set(files):
+        path = folder / name
+        is_result = path.parent == folder and path.is_file() and not path.is_symlink()
+        if is_result and fingerprint(path) == record["outputs"][name]:
+            path.unlink()
 
 
 def reason_to_convert(job: Recorded) -> str:
@@ -158,13 +123,13 @@ def reason_to_convert(job: Recorded) -> str:
             return f"{name} changed"
     for name, noted in record["outputs"].items():
         try:
-            if _fingerprint(job.folder / name) != noted:
+            if fingerprint(job.folder / name) != noted:
                 return f"{name} changed"
         except OSError:
             return f"{name} missing"
     return ""
 
 
-def _fingerprint(path: Path) -> Record:
+def fingerprint(path: Path) -> Record:
     """Return the size and the hash of a file."""
     return {"bytes": path.stat().st_size, "sha256": hash_file(path)}

@@ -8,7 +8,8 @@ import contextlib
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,10 +20,10 @@ from torchrg.batch.memory import memory_of_scan
 from torchrg.batch.records import (
     RECORD,
     Record,
-    check_record,
-    describe_work,
-    is_unchanged,
+    describe_versions,
+    fingerprint,
     read_record,
+    remove_earlier,
     write_record,
 )
 from torchrg.batch.task import Begin, TaskReport, report_on
@@ -166,9 +167,21 @@ class Job:
         return mark_of(self.scan.name)
 
     def describe(self) -> Record:
-        """Return what decides the results; see :func:`torchrg.batch.records.describe_work`."""
-        source = self.source
-        return describe_work(source.settings, source.describe(), self.scan.inputs, source.root)
+        """Return what decides the results, as JSON holds it; OSError if an input cannot be read."""
+        root, config = self.source.root, asdict(self.source.settings)
+        # It never changes a result, and lowering it after running out of memory must cost nothing.
+        config.pop("chunk_size", None)
+        inputs = [
+            (path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, path)
+            for path in self.scan.inputs
+        ]
+        return {
+            "versions": describe_versions(),
+            "config": config,
+            "source": self.source.describe(),
+            "inputs": [{"name": name} | fingerprint(path) for name, path in inputs],
+            "device": "cpu",
+        }
 
     def clean(self) -> None:
         """Remove what a process that was killed left half-written."""
@@ -195,45 +208,37 @@ def convert_scan(job: Job) -> TaskReport:
     The record of an earlier run is removed first, and the new one written last: whoever finds a
     record finds complete files.
     """
-    is_new = False
-
-    def convert(begin: Begin) -> TaskReport:
-        nonlocal is_new
-        begin("hash")
-        description = job.describe()
-        is_new = not job.folder.exists()
-        job.folder.mkdir(parents=True, exist_ok=True)
-        for folder in (job.folder, *job.folder.parents):
-            sync_folder(folder.parent)
-            if folder == job.out:
-                break
-        record = job.folder / RECORD
-        check_place(record)
-        check_record(job.folder)
-        job.clean()
-        earlier = read_record(job.folder) or {"outputs": {}}
-        record.unlink(missing_ok=True)
-        with marked_parts(job.mark):
-            report = job.source.convert(job.scan, job.folder, begin)
-            begin("record")
-            for name in earlier["outputs"].keys() - set(report.files):
-                if is_unchanged(job.folder, name, earlier["outputs"][name]):
-                    (job.folder / name).unlink()
-            write_record(job.folder, description, report)
-        return report
-
-    report = report_on(job.name, convert)
+    is_new = not os.path.lexists(job.folder)
+    report = report_on(job.name, partial(_convert, job))
     if report.status == "failed" and is_new:
         with contextlib.suppress(OSError):
             job.folder.rmdir()  # If it is empty.
     return report
 
 
-def check_finite(cloud: Cloud) -> tuple[str, ...]:
-    """Return warnings if points of a cloud are missing, far off, or have lost digits.
+def _convert(job: Job, begin: Begin) -> TaskReport:
+    """Convert one scan, between the record of an earlier run and the new one."""
+    begin("hash")
+    description, folder = job.describe(), job.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in (folder, *folder.parents):
+        sync_folder(path.parent)
+        if path == job.out:
+            break
+    check_place(folder / RECORD)
+    earlier = read_record(folder, is_ours=True) or {"outputs": {}}
+    job.clean()
+    (folder / RECORD).unlink(missing_ok=True)
+    with marked_parts(job.mark):
+        report = job.source.convert(job.scan, folder, begin)
+        begin("record")
+        remove_earlier(folder, earlier, report.files)
+        write_record(folder, description, report)
+    return report
 
-    Raises:
-        FormatError: If none is finite.
+
+def check_finite(cloud: Cloud) -> tuple[str, ...]:
+    """Return warnings if points are missing, far off, or have lost digits; one has to be finite.
 
     Example:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
@@ -275,32 +280,22 @@ def segment_cloud(
     voxel: float | None = None,
     begin: Begin = lambda stage: None,
 ) -> tuple[Segmentation, Superpoints | None]:
-    """Return the planes of a cloud, its normals turned, and its superpoints.
+    """Return the planes of a cloud, its normals turned to a side, and its superpoints.
 
-    Args:
-        cloud: The cloud.
-        settings: How planes are found.
-        orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
-        partition: How superpoints are made; None for none.
-        voxel: Side of voxels of which each gives one point; None for all points.
-        begin: Called with the name of each stage when it starts.
+    There are superpoints with a ``partition``; with a ``voxel`` one point of each is segmented.
+    ``begin`` is called with the name of each stage when it starts.
 
     Raises:
         ConfigError: If normals shall look at scanners, and the cloud does not know of any.
     """
     check_viewpoint(cloud, orient, "use --orient interior")
-    seg = segment_planes(
-        cloud.points,
-        settings,
-        voxel=voxel,
-        keep_neighbors=partition is not None,
-        on_stage=begin,
-    )
-    superpoints = None
+    points, superpoints = cloud.points, None
+    is_kept = partition is not None
+    seg = segment_planes(points, settings, voxel=voxel, keep_neighbors=is_kept, on_stage=begin)
     if partition is not None:
         begin("superpoints")
         colors = cloud.fields.get("color")
-        superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
+        superpoints = make_superpoints(points, seg, partition, colors=colors, voxel=voxel)
     begin("orientation")
     return _oriented(cloud, seg, orient, voxel), superpoints
 
@@ -323,11 +318,7 @@ def _oriented(
 def check_stems(layout: str, places: Mapping[str, str]) -> None:
     """Raise FormatError if a scan would write into the files of another in a layout.
 
-    See :func:`torchrg.datasets.folder.folded_name`.
-
-    Args:
-        layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
-        places: Where each scan is in its data set, by its name.
+    ``places`` says where each scan is in its data set, by its name.
     """
     taken: dict[str, str] = {}
     for name, place in places.items() if layout != "pointcept" else ():
@@ -359,21 +350,10 @@ def write_scan(
     level: int = 0,
     place: str | None = None,
 ) -> list[str]:
-    """Write a cloud, its planes and its superpoints into the folder of its name, in a layout.
+    """Write a scan in a layout, into the folder of its name; return the files by their paths there.
 
-    Args:
-        layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`, which needs
-            superpoints.
-        name: The name of the scan.
-        folder: The folder of that name in the output directory.
-        reading: The cloud.
-        seg: Its planes.
-        superpoints: Its superpoints.
-        level: Which of their levels is written.
-        place: Where the scan is in its data set, which some layouts keep. Default: its name.
-
-    Returns:
-        Names of the files, as paths from the folder.
+    Every layout but ``"pointcept"`` needs superpoints, of which it takes one ``level``. ``place``
+    is where the scan is in its data set, which some layouts keep; the default is its name.
     """
     cloud, arrays = reading.cloud, reading.arrays
     superpoint = None

@@ -81,7 +81,7 @@ class CloudSource(Source):
     level: int = 0
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 104
-    """What the largest of the layouts takes."""
+    """Space of a point in the largest of the layouts."""
     kind: ClassVar[str]
     """The name of the kind of source."""
     dataset: ClassVar[str] = "ScanNet"
@@ -105,15 +105,8 @@ class CloudSource(Source):
         begin("write")
         what, place = (reading, seg, superpoints), _place_of(scan)
         files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)
-        return TaskReport(
-            scan.name,
-            "converted",
-            len(cloud),
-            len(seg.planes.count),
-            tuple(files),
-            reading.repairs,
-            (*notes, *reading.notes),
-        )
+        sizes, told = (len(cloud), len(seg.planes.count)), (*notes, *reading.notes)
+        return TaskReport(scan.name, "converted", *sizes, tuple(files), reading.repairs, told)
 
     def describe(self) -> Record:
         """Return the kind of the source, and the settings that differ from their defaults."""

@@ -14,7 +14,7 @@ from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError
 from torchrg.io.files import is_disk_full
 
 Status = Literal["converted", "kept", "failed", "not started"]
-"""What became of a task: done now, or by an earlier run, or not."""
+"""States of a task at the end: done now, or by an earlier run, or not."""
 STATUSES: tuple[Status, ...] = get_args(Status)
 Begin = Callable[[str], None]
 """Called with the name of each stage of the work when it starts."""
@@ -58,7 +58,7 @@ class TaskReport:
 
 
 Reports = Generator[TaskReport | None, None, None]
-"""What an engine yields: a report of each task when it ends, None while there is none."""
+"""Reports that an engine yields: one of each task when it ends, None while there is none."""
 
 
 def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:

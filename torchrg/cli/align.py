@@ -15,8 +15,7 @@ from torchrg.batch.scans import check_finite
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
-from torchrg.cli.loop import note_input, run_each, stage_bar
-from torchrg.cli.places import check_apart, output_paths
+from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_each, stage_bar
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
@@ -63,8 +62,7 @@ def run(argv: list[str]) -> int:
     check_apart(outputs, arguments.inputs)
     if arguments.matrix is not None:
         _check_matrix(arguments, arguments.matrix, outputs)
-    names = list(map(str, arguments.inputs))
-    return run_each(_align_file, arguments, names, arguments.inputs, outputs)
+    return run_each(_align_file, arguments, arguments.inputs, outputs)
 
 
 def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
@@ -86,7 +84,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
         warn(f"{source}: {note}.")
     check_output(target, dataclasses.replace(cloud, header={}))
     settings = arguments.settings.resolved
-    with stage_bar(source.name, ("neighbors", "normals", "regions", "planes")) as advance:
+    with stage_bar(source.name, STAGES) as advance:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:
         with warnings_as_lines():
@@ -102,7 +100,8 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     write_cloud(target, moved, moved_seg, provenance=provenance)
     if arguments.matrix is not None:
         _write_matrix(arguments.matrix, whole.numpy())
-    tilt, turn = _angles(whole)
+    tilt = torch.rad2deg(whole[2, 2].clamp(-1, 1).acos())
+    turn = torch.rad2deg(torch.atan2(whole[1, 0], whole[0, 0]))
     seconds = time.perf_counter() - begin
     say(
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
@@ -126,10 +125,3 @@ def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:
         else:
             numbers = " ".join(f"{value:.9f}" for value in matrix.reshape(-1))
             beside.write_text(f"axisAlignment = {numbers}\n", encoding="utf-8")
-
-
-def _angles(motion: Tensor) -> tuple[float, float]:
-    """Return how far a motion tilts the z axis, and turns about it, in degrees."""
-    tilt = torch.rad2deg(motion[2, 2].clamp(-1, 1).acos())
-    turn = torch.rad2deg(torch.atan2(motion[1, 0], motion[0, 0]))
-    return float(tilt), float(turn)

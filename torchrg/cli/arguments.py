@@ -37,7 +37,7 @@ OFTEN = (
 RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
-"""What decides where and how fast a command runs, never what it finds."""
+"""Flags that decide where and how fast a command runs, never what it finds."""
 _RUNNING = "how it runs, without effect on what is found"
 _EXAMPLES = "\n\nExamples:\n"
 _WIDEST = 100
@@ -66,23 +66,17 @@ class Argument:
 
 
 class Flag(NamedTuple):
-    """An argument of a command.
-
-    Attributes:
-        path: The fields that lead to its value, with dots between them.
-        name: How it is called: ``--part.field``, or a word for what has no flag.
-        spelling: How it is written, with what stands for its value.
-        text: What it does.
-        part: What the part that it belongs to is about, empty for the command itself.
-        hint: Type of its value.
-        is_needed: Whether it has to be given.
-    """
+    """An argument of a command."""
 
     path: str
+    """Fields that lead to its value, with dots between them."""
     name: str
+    """How it is called: ``--part.field``, or a word for what has no flag."""
     spelling: str
+    """How it is written, with what stands for its value."""
     text: str
     part: str
+    """Subject of the part that it belongs to, empty for the command itself."""
     hint: object
     is_needed: bool
 
@@ -101,11 +95,7 @@ def parse(
 ) -> Command:
     """Parse arguments into a dataclass; ``--help`` prints and exits.
 
-    Args:
-        kind: The dataclass.
-        arguments: What stands behind the name of the command.
-        prog: The name of the command.
-        default: Values of fields in place of those of the dataclass.
+    ``default`` has values of fields in place of those of the dataclass; ``prog`` is the command.
 
     Raises:
         ConfigError: If an argument is wrong, as one line.
@@ -153,11 +143,10 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
         for name, const in switches if flag.hint is bool else [(flag.name, None)]:
             # Fields are written with underscores too.
             spellings = dict.fromkeys((name, f"--{name[2:].replace('-', '_')}"))
-            if const is None:
-                needed = flag.is_needed
-                parser.add_argument(*spellings, dest=flag.path, nargs=nargs, required=needed)
-            else:
-                parser.add_argument(*spellings, dest=flag.path, action="store_const", const=const)
+            takes: dict[str, Any] = {"nargs": nargs, "required": flag.is_needed}
+            if const is not None:
+                takes = {"action": "store_const", "const": const}
+            parser.add_argument(*spellings, dest=flag.path, **takes)
     given, left = parser.parse_known_args(arguments)
     if left:
         names = [flag.name for flag in flags] if left[0].startswith("--") else []
@@ -198,7 +187,7 @@ def _value_of(flag: Flag, given: bool | str | list[str]) -> object:
     kind, *others = _kinds(flag.hint)
     parts = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
-        choices = [*parts, *(choice for other in others for choice in typing.get_args(other))]
+        choices = [choice for literal in (kind, *others) for choice in typing.get_args(literal)]
         if words[0] not in choices:
             raise ConfigError(
                 f"expected {flag.name} to be one of {', '.join(choices)}, got {words[0]!r}."

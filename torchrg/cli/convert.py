@@ -22,13 +22,7 @@ from torchrg.batch.run import (
     write_report,
 )
 from torchrg.batch.scans import Job, Source, mark_of
-from torchrg.batch.sources import (
-    FolderSource,
-    RGBDSource,
-    S3DISSource,
-    ScanNetSource,
-    find_areas,
-)
+from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, ScanNetSource, find_areas
 from torchrg.batch.task import Reports
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
@@ -78,7 +72,7 @@ class Arguments:
     dry_run: bool = False
     """Say what would be done and why, and write nothing."""
     unit: ClassVar[str] = "scan"
-    """What one of them is called."""
+    """Name for one of them in messages."""
     seconds_per_million: ClassVar[tuple[float, str]] = (33.0, "points, as consensus takes")
     """Time of one core of an Intel Xeon for a million points, and what it is the time of: the table
     of README.md that ``scripts/bench.py steady`` measures. There ``classic`` takes a third of it,
@@ -262,10 +256,10 @@ def run(argv: list[str]) -> int:
         source = arguments.source(root, out)
         jobs = list_jobs(source, out, only=arguments.only)
     if arguments.dry_run:
-        plan, workers = _look_at(jobs, arguments), arguments.workers or num_cores()
-        resources = (workers, _memory_limit(arguments), free_space(out))
-        costs = format_costs(plan, *resources, arguments.seconds_per_million)
-        print(format_plan(plan), costs, sep="\n")
+        plan = _look_at(jobs, arguments)
+        resources = (arguments.workers or num_cores(), _memory_limit(arguments), free_space(out))
+        print(format_plan(plan))
+        print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_room(plan)
         return 0
     make_folder(out)
@@ -330,11 +324,11 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
         from torchrg.batch.ray_tasks import run_ray
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
-    by_frames = arguments.unit == "frame"
-    sizes = {job.name: 1 if by_frames else job.scan.num_points for job in jobs}
-    bar_unit, total = "frame" if by_frames else "pt", sum(sizes.values())
+    unit = "frame" if arguments.unit == "frame" else "pt"
+    sizes = {job.name: 1 if unit == "frame" else job.scan.num_points for job in jobs}
+    total = sum(sizes.values())
     # The mean of the whole run: scans end rarely, and a recent rate would jump with each.
-    with tqdm(total=total, unit=bar_unit, unit_scale=True, smoothing=0, disable=None) as bar:
+    with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
         shown = Progress(bar, sizes, unit=arguments.unit)
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     code = _finish(report, out, unit=arguments.unit)
@@ -357,12 +351,12 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
     jobs = [job for job in plan.jobs if job.name in done]
     entries = []
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
-        name = job.name
-        words = f"{done[name].num_points:,} points, {done[name].num_regions:,} planes"
+        scan = done[job.name]
+        words = f"{scan.num_points:,} points, {scan.num_regions:,} planes"
         try:
-            entries.append(draw_entry(folder, name, read_result(job.folder), words=words))
+            entries.append(draw_entry(folder, scan.name, read_result(job.folder), words=words))
         except (TorchrgError, OSError) as error:
-            warn(f"{name}: no page: {error}")
+            warn(f"{scan.name}: no page: {error}")
     say(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
 
 
@@ -383,12 +377,10 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
     again = "The same command goes on from here."
     if report.disk_full:
-        told = f"{out}: the disk is full; {state}. Make room. {again}"
-        return fail(told, code=SOME_FAILED)
+        return fail(f"{out}: the disk is full; {state}. Make room. {again}", code=SOME_FAILED)
     if report.interrupted:
         return fail(f"interrupted; {state}. {again}", code=INTERRUPTED)
     if len(report.complete) < len(report.scans):
-        told = f"{state}, {out / REPORT} says more."
-        return fail(told, code=SOME_FAILED)
+        return fail(f"{state}, {out / REPORT} says more.", code=SOME_FAILED)
     say(f"{state} -> {out}")
     return 0

@@ -14,15 +14,9 @@ from torchrg.batch.sources import orient_image
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
-from torchrg.cli.loop import note_input, run_each
-from torchrg.cli.places import check_apart, output_paths, picture_paths
+from torchrg.cli.loop import check_apart, note_input, output_paths, picture_paths, run_each
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
-from torchrg.depth import (
-    DepthConfig,
-    find_intrinsics,
-    make_intrinsics,
-    segment_depth,
-)
+from torchrg.depth import DepthConfig, find_intrinsics, make_intrinsics, segment_depth
 from torchrg.depth.camera import points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
@@ -31,8 +25,8 @@ from torchrg.render import color_planes, write_png
 from torchrg.structures import Cloud, Segmentation
 
 _COLORED_FROM = 200
-"""Pixels along the longer side that tell which planes are next to each other and must differ in
-colour. Choosing colours from all pixels would take as long as finding the planes."""
+"""Pixels along the longer side, evenly apart, that tell which planes are next to each other and
+must differ in colour. Choosing colours from all pixels would take as long as finding the planes."""
 _NO_IMAGES = ("planes", "points", "neighbors")
 """Parts of a segmentation of an image that are no images."""
 _LEAST_BYTES_A_PIXEL = 300
@@ -74,20 +68,17 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, segment each image and write its result."""
     arguments = parse(Arguments, argv, prog="torchrg depth")
     flags.use_threads(arguments.threads)
-    inputs = arguments.inputs
     _check_inputs(arguments)
+    inputs = arguments.inputs
     targets = output_paths(inputs, arguments.out, suffix=".png")
     pictures = picture_paths(targets, arguments.picture, suffixes=(".png",))
     if arguments.picture is None:
-        pictures = [
-            target.with_name(f"{target.stem}_planes.png") if _is_png(target) else None
-            for target in targets
-        ]
+        pictures = [t.with_name(f"{t.stem}_planes.png") if _is_png(t) else None for t in targets]
     drawn = [picture for picture in pictures if picture is not None]
     check_apart([*targets, *drawn], inputs)
     for picture in drawn:
         check_place(picture)
-    return run_each(_label, arguments, list(map(str, inputs)), inputs, targets, pictures)
+    return run_each(_label, arguments, inputs, targets, pictures)
 
 
 def _check_inputs(arguments: Arguments) -> None:
@@ -122,8 +113,10 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
     if num_planes == 0:
         warn(f"{source}: no plane found: no region is large enough.")
     if picture is not None:
-        colors = color_planes(seg.labels, _thinned(points))
-        write_png(picture, colors * (depth > 0)[..., None])
+        apart = -(-max(points.shape) // _COLORED_FROM)
+        few = torch.full_like(points, torch.nan)
+        few[::apart, ::apart] = points[::apart, ::apart]
+        write_png(picture, color_planes(seg.labels, few) * (depth > 0)[..., None])
     if _is_png(target):
         write_png(target, seg.labels + 1)
     else:
@@ -173,28 +166,18 @@ def _write_cloud(
     write_cloud(target, cloud, rows, provenance=provenance)
 
 
-def _thinned(points: Tensor) -> Tensor:
-    """Return an image of points ``(H, W, 3)`` with NaN but for rows and columns evenly apart."""
-    apart = -(-max(points.shape) // _COLORED_FROM)
-    thinned = torch.full_like(points, torch.nan)
-    thinned[::apart, ::apart] = points[::apart, ::apart]
-    return thinned
-
-
 def _read_frame(arguments: Arguments, path: Path) -> tuple[Cloud, Tensor, Tensor]:
-    """Return the cloud in camera coordinates, its depth ``(H, W)``, and the camera matrix."""
+    """Return the cloud in camera coordinates, its depth ``(H, W)``, and the camera matrix.
+
+    Without a camera that of an organised cloud is found from its points.
+    """
     numbers = flags.parse_intrinsics(arguments.intrinsics)
     camera = None if numbers is None else make_intrinsics(*numbers)
-    if camera is None or arguments.depth_scale is None or not _is_depth(path):
-        return _read_organised(path, camera)
-    depth = read_depth(path, depth_scale=arguments.depth_scale)
-    points = points_of_image(depth, camera).view(-1, 3).float()
-    height, width = depth.shape
-    return Cloud(points.numpy(), grid_shape=(height, width), source=str(path)), depth, camera
-
-
-def _read_organised(path: Path, camera: Tensor | None) -> tuple[Cloud, Tensor, Tensor]:
-    """Return an organised cloud, its depth, and the camera that is given or found."""
+    if camera is not None and arguments.depth_scale is not None and _is_depth(path):
+        depth = read_depth(path, depth_scale=arguments.depth_scale)
+        points = points_of_image(depth, camera).view(-1, 3).float()
+        height, width = depth.shape
+        return Cloud(points.numpy(), grid_shape=(height, width), source=str(path)), depth, camera
     cloud = read_cloud(path)
     if cloud.grid_shape is None:
         raise FormatError(

@@ -13,8 +13,15 @@ from torchrg.batch.scans import check_finite
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn
-from torchrg.cli.loop import left_out, note_input, run_each, stage_bar
-from torchrg.cli.places import check_apart, is_archive, output_paths
+from torchrg.cli.loop import (
+    check_apart,
+    is_archive,
+    left_out,
+    note_input,
+    output_paths,
+    run_each,
+    stage_bar,
+)
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
@@ -23,7 +30,7 @@ from torchrg.normals import estimate_normals
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
-"""What is written of each point."""
+"""Fields of each point that are written."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +79,7 @@ def run(argv: list[str]) -> int:
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
     check_apart(outputs, arguments.inputs)
-    return run_each(
-        _estimate_file, arguments, list(map(str, arguments.inputs)), arguments.inputs, outputs
-    )
+    return run_each(_estimate_file, arguments, arguments.inputs, outputs)
 
 
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
@@ -104,9 +109,8 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     fields = {} if is_archive(target) else cloud.fields
     fields = put_results(fields, {name: values.numpy() for name, values in results})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
-    num_valid = int(fit.valid.sum())
-    if num_valid < len(cloud):
-        num_bad = len(cloud) - num_valid
+    num_bad = len(cloud) - int(fit.valid.sum())
+    if num_bad:
         warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin

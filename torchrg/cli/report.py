@@ -1,5 +1,6 @@
 """What ``torchrg convert`` prints of a batch: its plan, what it will take, what became of it."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 from torchrg.batch.run import BatchReport, Plan
@@ -24,12 +25,8 @@ def format_plan(plan: Plan) -> str:
 def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[float, str]) -> str:
     """Return what a plan would take, in words, or that there is nothing to do.
 
-    Args:
-        plan: The plan.
-        workers: Most scans at a time.
-        limit: Bytes of memory that these may take together.
-        free: Bytes that the disk of the results has free.
-        rate: Seconds of a core for a million points, and what these points are.
+    ``limit`` is the memory of all workers and ``free`` the room on the disk, in bytes; ``rate`` is
+    the seconds of a core for a million points, and what these points are.
     """
     jobs, (seconds, of_what) = plan.to_convert, rate
     if not jobs:
@@ -61,33 +58,21 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     head = ["scan", "status", "points", "planes", *stages, "GB"]
     rows = [_row(scan, stages) for scan in shown]
     totals = report.with_status("converted")
-    rows.append(
-        [
-            "all",
-            f"{len(totals)} converted",
-            f"{report.num_points:,}",
-            f"{sum(scan.num_regions for scan in totals):,}",
-            *(f"{seconds:.1f}" for seconds in report.stage_seconds.values()),
-            f"{max((scan.peak_memory for scan in totals), default=0) / 1e9:.2f}",
-        ]
-    )
-    notes = [
-        printable(f"{scan.name}: {note}")
-        for scan in shown
-        for note in (
-            *(f"repaired: {text}" for text in scan.repairs),
-            *scan.warnings,
-            *([f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []),
-        )
-        if scan.status != "failed"
-    ]
-    points, scans = (
-        number / report.seconds if report.seconds else 0.0
-        for number in (report.num_points, len(totals))
-    )
+    peak = max((scan.peak_memory for scan in totals), default=0) / 1e9
+    planes = sum(scan.num_regions for scan in totals)
+    times = [f"{seconds:.1f}" for seconds in report.stage_seconds.values()]
+    sums = [f"{len(totals)} converted", f"{report.num_points:,}", f"{planes:,}"]
+    rows.append(["all", *sums, *times, f"{peak:.2f}"])
+    notes = []
+    for scan in shown:
+        if scan.status != "failed":
+            again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
+            told = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
+            notes += [printable(f"{scan.name}: {note}") for note in told]
+    seconds = report.seconds or math.inf
     speed = (
-        f"{report.num_points:,} points in {report.seconds:,.1f} s: {points:,.0f} points, "
-        f"{scans:,.2f} {unit}s a second"
+        f"{report.num_points:,} points in {report.seconds:,.1f} s: "
+        f"{report.num_points / seconds:,.0f} points, {len(totals) / seconds:,.2f} {unit}s a second"
     )
     return "\n".join([format_table(head, rows), *notes, speed])
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -109,22 +109,14 @@ def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
         {scene.name: scene.path for scene in FolderOfClouds(folder).scenes}
         for folder in (predicted, truth)
     )
-    for folder, missing in (
-        (truth, ours.keys() - theirs.keys()),
-        (predicted, theirs.keys() - ours.keys()),
-    ):
+    for folder, missing in ((truth, {*ours} - {*theirs}), (predicted, {*theirs} - {*ours})):
         if missing:
+            first, more = sorted(missing, key=natural_key)[:_MOST_NAMED], len(missing) - _MOST_NAMED
             raise FormatError(
-                f"{folder}: expected a counterpart of every scan, got none of {_named(missing)}."
+                f"{folder}: expected a counterpart of every scan, got none of {', '.join(first)}"
+                f"{f' and {more} more' if more > 0 else ''}."
             )
     return {name: (path, theirs[name]) for name, path in ours.items()}
-
-
-def _named(names: Iterable[str]) -> str:
-    """Return the first names, and how many more there are."""
-    ordered = sorted(names, key=natural_key)
-    more = len(ordered) - _MOST_NAMED
-    return ", ".join(ordered[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
@@ -141,9 +133,7 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     if arguments.match_distance is None:
         _check_rows(predicted, truth, ours, theirs)
     else:
-        ours, scores["match"] = _nearest(
-            predicted, truth, ours, theirs, distance=arguments.match_distance
-        )
+        ours, scores["match"] = _nearest(arguments.match_distance, predicted, truth, ours, theirs)
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _known(score(ours.fields[part], theirs.fields[part])._asdict())
@@ -152,14 +142,14 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(f"{path}: expected {field} for --superpoints, got {named}.")
-        found = score_partition(
+        indices = score_partition(
             ours.fields["superpoints"],
             theirs.fields["labels"],
             ours.points,
             boundary_distance=arguments.boundary_distance,
             ignore=arguments.ignore,
         )
-        scores["superpoints"] = _known(found._asdict())
+        scores["superpoints"] = _known(indices._asdict())
     if not scores.keys() - {"match"}:
         raise FormatError(f"{predicted}: shares neither labels nor normals with {truth}.")
     return scores
@@ -184,12 +174,12 @@ def _check_rows(predicted: Path, truth: Path, ours: Cloud, theirs: Cloud) -> Non
 
 
 def _nearest(
-    predicted: Path, truth: Path, ours: Cloud, theirs: Cloud, *, distance: float
+    distance: float, predicted: Path, truth: Path, ours: Cloud, theirs: Cloud
 ) -> tuple[Cloud, dict[str, float | None]]:
     """Return the results of ours at their points, and how many of these have none."""
     rows = match_points(ours, theirs, distance)
-    found = rows >= 0
-    num_lost = int(np.count_nonzero(~found))
+    is_matched = rows >= 0
+    num_lost = int(np.count_nonzero(~is_matched))
     if num_lost == len(rows):
         raise FormatError(
             f"{predicted}: expected points near those of {truth}, got none within the distance; "
@@ -203,13 +193,11 @@ def _nearest(
     fields = {}
     for name in ("labels", "normals", "superpoints"):
         if name in ours.fields:
-            values = ours.fields[name]
-            nothing = UNLABELED if values.ndim == 1 else 0
-            dtype = np.result_type(values.dtype, np.int8)
-            fields[name] = np.full((len(rows), *values.shape[1:]), nothing, dtype)
-            fields[name][found] = values[rows[found]]
-    num_used = len(np.unique(rows[found]))
-    matched = {"points": len(rows), "unmatched": num_lost, "unused": len(ours) - num_used}
+            values = ours.fields[name][rows].astype(np.result_type(ours.fields[name], np.int8))
+            values[~is_matched] = UNLABELED if values.ndim == 1 else 0
+            fields[name] = values
+    unused = len(ours) - len(np.unique(rows[is_matched]))
+    matched = {"points": len(rows), "unmatched": num_lost, "unused": unused}
     return Cloud(theirs.coordinates, fields, source=ours.source), {**matched}
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from torchrg import scratch
-from torchrg.batch.memory import available_memory, memory_of_scan, memory_on_disk
+from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import Record, describe_run
 from torchrg.batch.run import REPORT, lock_folder
 from torchrg.batch.scans import (
@@ -27,8 +27,18 @@ from torchrg.batch.scans import (
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn
-from torchrg.cli.loop import left_out, note_input, run_each, stage_bar
-from torchrg.cli.places import check_apart, is_page, output_paths, picture_paths
+from torchrg.cli.loop import (
+    STAGES,
+    check_apart,
+    is_page,
+    left_out,
+    name_of,
+    note_input,
+    output_paths,
+    picture_paths,
+    run_each,
+    stage_bar,
+)
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.depth import find_intrinsics
@@ -43,17 +53,10 @@ from torchrg.io import (
 )
 from torchrg.io.files import check_space
 from torchrg.render import make_page, write_page
-from torchrg.render.gallery import (
-    Entry,
-    check_gallery,
-    draw_entry,
-    draw_planes,
-    write_index,
-)
+from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
 from torchrg.result import Result
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
-STAGES = ("neighbors", "normals", "regions", "planes")
 _DATASET = "ScanNet"
 """The data set as whose scans layouts take clouds without labels."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
@@ -137,9 +140,8 @@ def run(argv: list[str]) -> int:
     pictures = picture_paths(outputs, arguments.picture)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    names = [_name_of(cloud) for cloud in clouds]
     with _sharing(arguments, outputs):
-        code = run_each(_segment, arguments, names, clouds, outputs, pictures)
+        code = run_each(_segment, arguments, clouds, outputs, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
@@ -190,26 +192,21 @@ def _segment(
     arguments: Arguments, sources: tuple[Path, ...], target: Path, picture: Path | None
 ) -> None:
     """Segment a cloud with a progress bar on a terminal, and one line about the result."""
-    begin, source = time.perf_counter(), _name_of(sources)
+    begin, source = time.perf_counter(), name_of(sources)
     limit = flags.bytes_of_limit(arguments.limit_memory, available_memory() // 2)
-    _check_limit(source, sum(map(estimate_points, sources)), limit)
+    _check_limit(source, sum(map(estimate_points, sources)), limit)  # Before it is read.
     cloud = merge_clouds(
         [read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources]
     )
     where = _arrays_of(arguments, source, target, len(cloud), limit)
     _check_points(arguments, source, cloud, target)
-    if _is_depth_image(cloud):
-        warn(
-            f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
-        )
-    partition = arguments.partition if arguments.superpoints else None
     stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
     with stage_bar(sources[0].name, stages) as advance, where:
         seg, superpoints = segment_cloud(
             cloud,
             arguments.settings.resolved,
             orient=arguments.orient,
-            partition=partition,
+            partition=arguments.partition if arguments.superpoints else None,
             voxel=arguments.voxel,
             begin=advance,
         )
@@ -230,7 +227,7 @@ def _segment(
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
     """Refuse a cloud that takes more memory than allowed even with its large arrays on a disk."""
-    least = memory_on_disk(num_points)
+    least = memory_of_scan(num_points, on_disk=True)
     if least > limit:
         raise ConfigError(
             f"{source}: expected --limit-memory of at least {least / 1e9:.2f} GB for about "
@@ -243,8 +240,7 @@ def _arrays_of(
 ) -> contextlib.AbstractContextManager[None]:
     """Return where the large arrays of a cloud are: in memory, or on a disk that has the room."""
     _check_limit(source, num_points, limit)
-    needed = memory_of_scan(num_points)
-    if needed <= limit:
+    if (needed := memory_of_scan(num_points)) <= limit:
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
     normals = arguments.settings.resolved.normals
@@ -257,11 +253,6 @@ def _arrays_of(
     return scratch.on_disk(folder)
 
 
-def _name_of(sources: tuple[Path, ...]) -> str:
-    """Return what a cloud of some files is called in messages."""
-    return f"{sources[0]}" + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
-
-
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
     """Warn of what is not as it seems, before the work; refuse what cannot be written."""
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
@@ -272,24 +263,20 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
         warn(f"{source}: {note}.")
     if arguments.layout is None:
         check_output(target, cloud)
-
-
-def _is_depth_image(cloud: Cloud) -> bool:
-    """Tell whether a cloud has a point for each pixel of a camera."""
-    if cloud.grid_shape is None:
-        return False
-    pixels = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
-    return find_intrinsics(pixels) is not None
+    grid = cloud.grid_shape
+    pixels = None if grid is None else torch.from_numpy(cloud.coordinates).view(*grid, 3)
+    if pixels is not None and find_intrinsics(pixels) is not None:
+        warn(
+            f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
+        )
 
 
 def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> Record:
     """Return the provenance of a cloud of one file or of several."""
     settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
-    if arguments.columns is not None:
-        provenance["columns"] = arguments.columns
-    if arguments.voxel is not None:
-        provenance["voxel"] = arguments.voxel
+    options = {"columns": arguments.columns, "voxel": arguments.voxel}
+    provenance |= {name: value for name, value in options.items() if value is not None}
     if arguments.superpoints:
         provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     if len(sources) > 1:

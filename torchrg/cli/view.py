@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
-from torchrg.cli.places import check_drawing, is_page
+from torchrg.cli.loop import check_drawing, is_page
 from torchrg.errors import ConfigError
 from torchrg.io.fields import WIDEN
 from torchrg.render import (
@@ -27,6 +27,7 @@ from torchrg.render import (
 from torchrg.render.channels import MODES
 from torchrg.render.page import MAX_POINTS
 from torchrg.result import Result, read_result
+from torchrg.structures import Cloud
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]
@@ -81,9 +82,8 @@ def run(argv: list[str]) -> int:
     check_drawing(arguments.out)
     files = (arguments.file, arguments.beside, arguments.truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
-    up = None if arguments.up is None else _direction(arguments.up)
     write = _write_page if is_page(arguments.out) else _write_picture
-    said = write(arguments, _read(arguments.file, arguments), up)
+    said = write(arguments, _read(arguments.file, arguments))
     say(f"{arguments.file} -> {arguments.out} ({said})")
     return 0
 
@@ -101,18 +101,19 @@ def _read(path: Path, arguments: Arguments) -> Result:
     return replace(result, cloud=replace(cloud, fields={**cloud.fields, "color": narrow}))
 
 
-def _write_picture(arguments: Arguments, result: Result, up: Direction | None) -> str:
+def _write_picture(arguments: Arguments, result: Result) -> str:
     """Write a picture, and return what there is to say about it."""
     if arguments.beside is not None or arguments.truth is not None:
         raise ConfigError("expected --beside and --truth with a page, --out PAGE.html.")
     cloud, normals = result.cloud, result.cloud.fields.get("normals")
+    up = _direction(arguments.up or "z")
     picture = render_cloud(
         cloud.points,
-        _colors(result, arguments.color, up or (0.0, 0.0, 1.0)),
+        _colors(cloud, arguments.color, up),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
         labels=result.fields.get("labels"),
         view=arguments.view,
-        up=up or (0.0, 0.0, 1.0),
+        up=up,
         azimuth_deg=arguments.azimuth_deg,
         width=arguments.width,
     )
@@ -120,7 +121,7 @@ def _write_picture(arguments: Arguments, result: Result, up: Direction | None) -
     return f"{picture.shape[1]} x {picture.shape[0]} pixels"
 
 
-def _write_page(arguments: Arguments, result: Result, up: Direction | None) -> str:
+def _write_page(arguments: Arguments, result: Result) -> str:
     """Write a page, and return what there is to say about it."""
     page = make_page(
         result,
@@ -128,7 +129,7 @@ def _write_page(arguments: Arguments, result: Result, up: Direction | None) -> s
         truth=None if arguments.truth is None else _read(arguments.truth, arguments).cloud,
         color=arguments.color,
         view=arguments.view,
-        up=up,
+        up=None if arguments.up is None else _direction(arguments.up),
         azimuth_deg=arguments.azimuth_deg,
         max_points=arguments.max_points,
     )
@@ -137,13 +138,8 @@ def _write_page(arguments: Arguments, result: Result, up: Direction | None) -> s
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
 
-def _colors(result: Result, color: PageColorBy | None, up: Direction) -> Tensor:
-    """Return the colour of each point.
-
-    Raises:
-        ConfigError: If the cloud lacks what the colours shall show.
-    """
-    cloud = result.cloud
+def _colors(cloud: Cloud, color: PageColorBy | None, up: Direction) -> Tensor:
+    """Return the colour of each point; raise ConfigError if the cloud has none of that kind."""
     present = [name for name in get_args(ColorBy) if MODES[name][1] in cloud.fields]
     if color is None:
         color = present[0] if present else None

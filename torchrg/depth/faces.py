@@ -9,6 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg import kernels
+from torchrg._parallel import places_of
+from torchrg.depth.passes import serves
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
 from torchrg.structures import UNLABELED
@@ -61,7 +64,8 @@ def join_strips(
         (labels, rays, noise),
         (labels.T, rays.transpose(0, 1), noise.T),
     ):
-        row, column = (image[:-1] != image[1:]).nonzero().unbind(dim=1)
+        places = places_of(image[:-1] != image[1:])
+        row, column = places // image.shape[1], places % image.shape[1]
         first, second = image[row, column], image[row + 1, column]
         for some in (first, second, image[0], image[-1]):
             edges += torch.bincount(some + 1, minlength=num_regions + 1)
@@ -80,8 +84,9 @@ def join_strips(
         pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_LEAST_REACH)],
         pairs.flip(1)[gap <= slope * (width[pairs[:, 1]] / 2).clamp(min=_LEAST_REACH)],
     ]
-    pairs, contacts = torch.unique(torch.cat(smooth), dim=0, return_counts=True)
-    strip, face = pairs.unbind(dim=1)
+    strip, face = torch.cat(smooth).unbind(dim=1)
+    keys, contacts = torch.unique(strip * num_regions + face, return_counts=True)
+    strip, face = keys // num_regions, keys % num_regions
     own, theirs = (normals[part][:, :, None].unbind(dim=1) for part in (strip, face))
     joins = (width[strip] < _MOST_WIDTH) & (width[strip] <= _MOST_SHARE * width[face])
     joins &= sq_chords(own, theirs).squeeze(1) <= deg_to_sq_chord(_MOST_TURN_DEG)
@@ -121,37 +126,47 @@ def hidden_contacts(
     pixels = _Lines(points.view(*seen.shape, 3), seen, labels.view(seen.shape))
     rows = _Lines(*(part[::_EVERY] for part in pixels))
     columns = _Lines(*(part[:, ::_EVERY].transpose(0, 1).contiguous() for part in pixels))
-    pairs, contacts = [], []
-    for larger, smaller in _aligned_pairs(planes):
-        plane = planes.normal[larger], planes.center[larger], reach[larger]
-        lines = sum(_count_lines(part, (larger, smaller), *plane) for part in (rows, columns))
-        if lines >= _LEAST_LINES:
-            pairs.append((min(larger, smaller), max(larger, smaller)))
-            contacts.append(lines * _EVERY)
-    return labels.new_tensor(pairs).view(-1, 2), labels.new_tensor(contacts)
+    pairs = _aligned_pairs(planes)
+    across, along = (count_lines(some, pairs, planes, reach) for some in (rows, columns))
+    lines = across + along
+    lead = lines >= _LEAST_LINES
+    return pairs[lead].sort(dim=1).values, lines[lead] * _EVERY
 
 
-def _aligned_pairs(planes: RegionPlanes) -> list[tuple[int, int]]:
-    """Return the pairs of a larger region and a smaller one whose middle is on its plane."""
+def _aligned_pairs(planes: RegionPlanes) -> Tensor:
+    """Return pairs ``(p, 2)`` of a larger region and a smaller one whose middle is on its plane."""
     normal, center, count = planes.normal, planes.center, planes.num_points
     away = normal @ center.T - (normal * center).sum(dim=1, keepdim=True)
     aligned = away.abs() <= _MOST_OFFSET * planes.thickness[:, None]
     place = torch.arange(len(count), device=count.device)
     is_larger = (count[:, None] > count) | ((count[:, None] == count) & (place[:, None] < place))
     both_flat = ~(planes.curved[:, None] | planes.curved)
-    return [(a, b) for a, b in (aligned & is_larger & both_flat).nonzero().tolist()]
+    return (aligned & is_larger & both_flat).nonzero()
 
 
-def _count_lines(
+def count_lines(lines: _Lines, pairs: Tensor, planes: RegionPlanes, reach: Tensor) -> Tensor:
+    """Return how many lines lead from one region to the other past what is nearer, by pair."""
+    tables = planes.normal, planes.center, reach
+    if serves(lines.points):
+        points = lines.points.movedim(-1, 0)
+        return kernels.call("count_lines", points, *lines[1:], *tables, pairs, _LEAST_NEARER)[0]
+    counts = [
+        _count_lines_of_pair(lines, (a, b), *(table[a] for table in tables))
+        for a, b in pairs.tolist()
+    ]
+    return pairs.new_tensor(counts)
+
+
+def _count_lines_of_pair(
     lines: _Lines, pair: tuple[int, int], normal: Tensor, center: Tensor, reach: Tensor
 ) -> int:
-    """Return how many lines lead from one region of a pair to the other past what is nearer."""
+    """Do as :func:`count_lines` for one pair and the plane of its larger region."""
     first, second = ((lines.labels == region) for region in pair)
     both = first.any(dim=1) & second.any(dim=1)
     if not bool(both.any()):
         return 0
     points, seen, first, second = lines.points[both], lines.seen[both], first[both], second[both]
-    height = (points - center) @ normal
+    height = ((points - center) * normal).sum(dim=2)
     in_front = seen & (height > reach)
     ends = first | second | (seen & (height < -reach))
     place = torch.arange(ends.shape[1], device=ends.device).expand_as(height)

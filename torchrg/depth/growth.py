@@ -6,11 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_rows, map_tasks, places_of
+from torchrg import kernels
+from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import hidden_contacts, join_strips
-from torchrg.depth.normals import PixelPlanes
-from torchrg.linalg import deg_to_sq_chord, second_moments, sq_chords
+from torchrg.depth.normals import PixelPlanes, Pixels
+from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.windows import Image
+from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MOST_FITTED, RegionPlanes
 from torchrg.regions.growth import number_by_size
@@ -73,36 +76,20 @@ class InverseCloud(NamedTuple):
 
 
 def grow_pixels(
-    cloud: InverseCloud,
-    pixels: PixelPlanes,
-    normals: Tensor,
-    u: Tensor,
-    v: Tensor,
-    config: DepthConfig,
+    cloud: InverseCloud, flat: Tensor, joins: tuple[Tensor, Tensor], config: DepthConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Grow regions over a depth image, and give border pixels and parts of one face to them.
 
-    Two pixels side by side are on one surface if both have a flat window, their normals in space
-    ``(H, W, 3)`` are within the angle, and at both pixels their two planes differ by at most
-    ``max_step`` times what a flat window may deviate by: no region crosses a step. Where both
-    windows hold both pixels the angle may be larger: a crease between the pixels would lie within
-    two flat windows. Regions are the connected components of such pairs.
-
-    ``u`` ``(W,)`` and ``v`` ``(H, 1)`` count columns and rows from the optical axis.
+    Regions are the connected components of the flat pixels that :func:`join_pixels` joins.
 
     Returns:
         Labels ``(H * W,)``, 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; unit normals
         of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
         thicker than noise and a slight bend can make it, ``(M,)``, bool.
     """
-
-    def join(axis: int) -> Tensor:
-        return _joins(pixels, normals, u, v, axis, config)
-
-    down, right = map_tasks(join, (0, 1), normals.device)
-    labels = number_by_size(_connected(pixels.flat, down, right), config.min_size)
+    labels = number_by_size(connect_pixels(flat, *joins), config.min_size)
     if not bool((labels >= 0).any()):
-        return labels, normals.new_empty(0, 3), pixels.flat.new_empty(0)
+        return labels, cloud.points.new_empty(0, 3), flat.new_empty(0)
     labels, fit = _refine(cloud, labels, config)
     return labels, _normals_in_space(fit), fit.curved
 
@@ -115,65 +102,62 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
     return normals
 
 
-def _joins(
-    pixels: PixelPlanes, normals: Tensor, u: Tensor, v: Tensor, axis: int, config: DepthConfig
-) -> Tensor:
-    """Return whether pixels and the next ones along an axis are on one surface, one place less."""
-    width, length = pixels.flat.shape[1], pixels.flat.shape[axis] - 1
-    joins = pixels.flat.narrow(axis, 0, length) & pixels.flat.narrow(axis, 1, length)
-    one_window = pixels.window.narrow(axis, 0, length) == pixels.window.narrow(axis, 1, length)
-    rows, columns = (joins & ~one_window).nonzero().unbind(dim=1)
-    here = rows * width + columns
-    there = here + (width if axis == 0 else 1)
+def join_pixels(
+    image: Image, planes: PixelPlanes, pixels: Pixels, config: DepthConfig
+) -> tuple[Tensor, Tensor]:
+    """Return whether pixels are on one surface with the next to the right, and below, ``(H, W)``.
+
+    They are if both have a flat window, their normals in space are within the angle, and at both
+    pixels their two planes differ by at most ``max_step`` times what a flat window may deviate by:
+    no region crosses a step. Where both windows hold both pixels the angle may be larger: a crease
+    between the pixels would lie within two flat windows.
+    """
     wider = min(_ALIKE * config.max_angle_deg, 90.0)
-    limits = (config.max_step, *map(deg_to_sq_chord, (config.max_angle_deg, wider)))
-    tables = [*pixels.planes[:3], pixels.tolerance]
-    (joins[rows, columns],) = map_rows(
-        _are_on_one_surface,
-        [here, there],
-        *(table.flatten() for table in tables),
-        normals.view(-1, 3),
-        pixels.sides.flatten(1),
-        pixels.middle.flatten(1),
-        u,
-        v.flatten(),
-        u.new_tensor(limits),
-    )
+    limits = config.max_step, deg_to_sq_chord(config.max_angle_deg), deg_to_sq_chord(wider)
+    window, flat, _ = planes.choice
+    joins = torch.zeros_like(flat), torch.zeros_like(flat)
+    if serves(image.values):
+        fixed = window, flat, pixels.normals, pixels.tolerance, *planes.tables, image.u, image.v
+        pass_over_rows("join_pixels", len(image.v), *fixed, *joins, *limits)
+        return joins
+    for axis, joined in ((1, joins[0]), (0, joins[1])):
+        length, step = flat.shape[axis] - 1, (flat.shape[1], 1)[axis]
+        both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
+        here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
+        there, numbers = here + step, window.flatten()
+        on_one_surface = _are_on_one_surface(image, planes, pixels, here, there, limits)
+        joined.view(-1)[here] = (numbers[here] == numbers[there]) | on_one_surface
     return joins
 
 
 def _are_on_one_surface(
+    image: Image,
+    planes: PixelPlanes,
+    pixels: Pixels,
     here: Tensor,
     there: Tensor,
-    u_slopes: Tensor,
-    v_slopes: Tensor,
-    origins: Tensor,
-    tolerances: Tensor,
-    normals: Tensor,
-    sides: Tensor,
-    middles: Tensor,
-    u: Tensor,
-    v: Tensor,
-    limits: Tensor,
-) -> tuple[Tensor]:
+    limits: tuple[float, float, float],
+) -> Tensor:
     """Tell which pixels are on one surface with others; limits of step, angle and wider angle."""
-    max_step, max_sq_chord, wider_sq_chord = limits.unbind()
-    width = u.shape[0]
+    max_step, max_sq_chord, wider_sq_chord = limits
+    width = len(image.u)
     row, column = here // width, here % width
-    u_slope, v_slope = u_slopes[here] - u_slopes[there], v_slopes[here] - v_slopes[there]
-    step = u_slope * u[column] + v_slope * v[row] + origins[here] - origins[there]
+    own, other = planes.take(here), planes.take(there)
+    u_slope, v_slope = own.u_slope - other.u_slope, own.v_slope - other.v_slope
+    step = u_slope * image.u[column] + v_slope * image.v[row] + own.origin - other.origin
     next_step = step + torch.where(there // width > row, v_slope, u_slope)
-    limit = max_step * torch.maximum(tolerances[here], tolerances[there])
-    own, theirs = (normals[at][:, :, None].unbind(dim=1) for at in (here, there))
-    turned = sq_chords(own, theirs).squeeze(1)
-    own_sides, their_sides = sides[:, here], sides[:, there]
-    sq_noise = _sq_slope_noise(own_sides, tolerances[here])
-    sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerances[there])
+    tolerance = pixels.tolerance.flatten()
+    limit = max_step * torch.maximum(tolerance[here], tolerance[there])
+    normals = pixels.normals.view(-1, 3)
+    turned = sq_chords(*(normals[at][:, :, None].unbind(dim=1) for at in (here, there))).squeeze(1)
+    sides, middles = planes.sides_and_middles(here)
+    their_sides, their_middles = planes.sides_and_middles(there)
+    sq_noise = _sq_slope_noise(sides, tolerance[here])
+    sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerance[there])
     alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
-    both_hold = holds(own_sides, middles[:, here], there, width)
-    both_hold = both_hold & holds(their_sides, middles[:, there], here, width)
+    both_hold = holds(sides, middles, there, width) & holds(their_sides, their_middles, here, width)
     accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
-    return (accepted & (step.abs() <= limit) & (next_step.abs() <= limit),)
+    return accepted & (step.abs() <= limit) & (next_step.abs() <= limit)
 
 
 def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
@@ -197,14 +181,16 @@ def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     return (down <= rows / 2) & (right <= columns / 2)
 
 
-def _connected(flat: Tensor, down: Tensor, right: Tensor) -> Tensor:
+def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
     """Return the connected components of an image ``(H * W,)``, -1 where it is not flat."""
+    if serves(flat):
+        return kernels.call("connect_pixels", flat, right, down)[0].flatten()
     from scipy.ndimage import label
 
     height, width = flat.shape
     grid = np.zeros((2 * height - 1, 2 * width - 1), dtype=bool)
     grid[::2, ::2], grid[1::2, ::2], grid[::2, 1::2] = (
-        part.cpu().numpy() for part in (flat, down, right)
+        part.cpu().numpy() for part in (flat, down[:-1], right[:, :-1])
     )
     parts = label(grid)[0][::2, ::2].astype(np.int64)
     return torch.from_numpy(parts.ravel() - 1).to(flat.device)
@@ -232,9 +218,9 @@ class PixelGrid:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of regions that touch, and the number of contacts of each pair."""
-        regions = torch.stack([labels[pixels] for pixels in self.borders(labels)])
+        first, second = (labels[pixels] for pixels in self.borders(labels))
         num_regions = int(labels.max()) + 1
-        keys = regions.amin(dim=0) * num_regions + regions.amax(dim=0)
+        keys = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
         keys, counts = torch.unique(keys, return_counts=True)
         # Either pixel is beside the other.
         return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
@@ -262,24 +248,39 @@ def _refine(
     regions that touch and lie on one plane are merged. Then borders between regions move to the
     lines where their planes meet. Returns labels by descending size, and the planes of the regions.
     """
-    beside, seen = PixelGrid(cloud.seen.shape), cloud.seen.flatten()
+    beside = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
-        planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
+        planes = fit_inverse_planes(cloud, labels)
         reach = planes.times_thickness(_ABSORB_REACH)
-        labels = absorb_points(cloud.points, labels, beside, planes, reach, valid=seen)
+        labels = absorb_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
         pairs = zip(beside.contacts(labels), hidden, strict=True)
         contacts, counts = (torch.cat(part) for part in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
-    planes = fit_inverse_planes(cloud, labels, most=MOST_FITTED)
+    planes = fit_inverse_planes(cloud, labels)
     joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
     if not torch.equal(joined, labels):
-        labels, planes = joined, fit_inverse_planes(cloud, joined, most=MOST_FITTED)
+        labels, planes = joined, fit_inverse_planes(cloud, joined)
     reach = planes.times_thickness(_ABSORB_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)
+
+
+def absorb_pixels(
+    cloud: InverseCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
+) -> Tensor:
+    """Do as :func:`torchrg.regions.repair.absorb_points` for the pixels of an image."""
+    seen = cloud.seen
+    if not serves(cloud.points):
+        beside = PixelGrid(seen.shape)
+        return absorb_points(cloud.points, labels, beside, planes, reach, valid=seen.flatten())
+    image = labels.view(seen.shape).clone()
+    room = [torch.empty_like(image) for _ in range(3)]
+    tables = planes.normal, planes.center, reach
+    kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *room)
+    return image.flatten()
 
 
 def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
@@ -297,48 +298,46 @@ def _planes_over_rays(fit: RegionPlanes) -> Tensor:
 
 
 def fit_inverse_planes(
-    cloud: InverseCloud, labels: Tensor, *, most: int | None = None
+    cloud: InverseCloud, labels: Tensor, *, most: int = MOST_FITTED
 ) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, which alone has noise.
 
     A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.fit.fit_planes` has; the
     thickness, along the normals, is never taken for less than the mean noise of the region. Curved
     is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
-    region, in even steps, by default to all.
+    region, in even steps.
     """
-    segments = Segments(labels, most=most)
+    shares = Segments(labels, most=most).shares(len(labels) + 1)
+    parts = map_tasks(lambda some: _fit_together(cloud, some), shares, labels.device)
+    planes = RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return planes._replace(num_points=torch.bincount(labels + 1, minlength=1)[1:])
+
+
+def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
+    """Fit planes to the regions of a share; see :func:`fit_inverse_planes`."""
     noise = segments.mean(segments.take(cloud.noise))
     columns = segments.take_columns(cloud.points)
-    x, y, w = columns
-    weights = torch.ones_like(w)
-    for last in range(_NUM_FITS):
-        total = segments.sum(weights)
-        center = torch.stack([segments.sum(column * weights) for column in columns], dim=1)
-        center = center / total[:, None]
-        about_zero = second_moments(columns, weights, segments.sum, total)
-        covariance = about_zero - center[:, :, None] * center[:, None, :]
+    weights = torch.ones_like(columns[0])
+    for _ in range(_NUM_FITS):
+        center, covariance = segments.moments(columns, weights)
         inverse = torch.linalg.pinv(covariance[:, :2, :2], hermitian=True)
         slopes = (inverse @ covariance[:, :2, 2:]).squeeze(2)
-        offset = center[:, 2] - (slopes * center[:, :2]).sum(dim=1)
-        a, b, c = segments.spread_columns(torch.cat([slopes, offset[:, None]], dim=1))
-        residuals = w - a * x - b * y - c
-        thickness = MAD_FACTOR * segments.median(residuals.abs())
-        if last == _NUM_FITS - 1:
-            break
-        ratio = residuals / segments.spread(BISQUARE_CUT * torch.maximum(thickness, noise))
-        weights = (1 - ratio * ratio).clamp(min=0).square()
-    normal = torch.cat([-slopes, torch.ones_like(slopes[:, :1])], dim=1)
+        normal = torch.cat([-slopes, torch.ones_like(slopes[:, :1])], dim=1)
+        factors = (MAD_FACTOR, BISQUARE_CUT)
+        weights, median, squares = segments.reweigh(columns, center, normal, noise, factors)
+    thickness = MAD_FACTOR * median
     length = normal.norm(dim=1, keepdim=True)
     # In the distance d of a plane from the camera, w is 1 / d of the cosine along a ray.
-    nearness = torch.cat([slopes, offset[:, None]], dim=1).norm(dim=1)
+    offset = (normal * center).sum(dim=1, keepdim=True)
+    nearness = torch.cat([slopes, offset], dim=1).norm(dim=1)
     extent = torch.linalg.eigvalsh(covariance[:, :2, :2])[:, 0].clamp(min=0).sqrt()
     return RegionPlanes(
         normal / length,
         center,
         covariance,
         torch.maximum(thickness / length.squeeze(1), noise),
-        rms=segments.mean(residuals * residuals).sqrt() / length.squeeze(1),
-        num_points=torch.bincount(labels + 1, minlength=1)[1:],
+        rms=squares.sqrt() / length.squeeze(1),
+        num_points=segments.counts,
         curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
         floor=noise,
         reach=torch.full_like(noise, torch.inf),
@@ -360,18 +359,21 @@ def move_to_creases(
 
     ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
     """
-    planes = _planes_over_rays(fit)
-    tables = *cloud.points.unbind(dim=1), planes, fit.center[:, :2], reach
+    planes, middles = _planes_over_rays(fit), fit.center[:, :2]
     labels = labels.clone()
+    if serves(cloud.points):
+        image = labels.view(cloud.seen.shape)
+        room = [torch.empty_like(image) for _ in range(3)]
+        limits = _MOST_MOVES, _STRAIGHT
+        kernels.call(
+            "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *room
+        )
+        return labels
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))
     for _ in range(_MOST_MOVES):
         around = grid.around(rows)
-        near = labels[around]
-        at_border = ((near >= 0) & (near != labels[rows][:, None])).any(dim=1)
-        rows, around, near = rows[at_border], around[at_border], near[at_border]
-        columns = [rows, around, labels[rows], near]
-        (across,) = map_rows(_regions_across, columns, *tables)
+        across = _regions_across(cloud, labels, planes, middles, reach, rows, around)
         moved = across != labels[rows]
         if not bool(moved.any()):
             break
@@ -382,20 +384,18 @@ def move_to_creases(
 
 
 def _regions_across(
-    rows: Tensor,
-    around: Tensor,
-    own: Tensor,
-    near: Tensor,
-    x: Tensor,
-    y: Tensor,
-    inverse: Tensor,
+    cloud: InverseCloud,
+    labels: Tensor,
     planes: Tensor,
     middles: Tensor,
     reach: Tensor,
-) -> tuple[Tensor]:
-    """Return the region ``(n,)`` that pixels at borders belong to by the creases there."""
-    other = (near >= 0) & (near != own[:, None])
-    own, near = own[:, None], near.clamp(min=0)
+    rows: Tensor,
+    around: Tensor,
+) -> Tensor:
+    """Return the region ``(n,)`` that pixels belong to by the creases beside them."""
+    x, y, inverse = cloud.points.unbind(dim=1)
+    own, near = labels[rows][:, None], labels[around]
+    other, near = (near >= 0) & (near != own), near.clamp(min=0)
     ray, around_rays = (x[rows][:, None], y[rows][:, None]), (x[around], y[around])
     apart = planes[own] - planes[near]
     a, b, _ = apart.unbind(dim=2)
@@ -408,8 +408,9 @@ def _regions_across(
     goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
     goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[own])
     away = torch.where(goes, away, torch.inf)
-    nearest = torch.where(away == away.amin(dim=1, keepdim=True), near, planes.shape[0]).amin(dim=1)
-    return (torch.where(goes.any(dim=1), nearest, own.squeeze(1)),)
+    least = away.amin(dim=1, keepdim=True)
+    nearest = torch.where(goes & (away == least), near, len(planes)).amin(dim=1)
+    return torch.where(nearest < len(planes), nearest, own.squeeze(1))
 
 
 def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -1,24 +1,27 @@
 """The plane at each pixel of a depth image: that of the largest flat window around it."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_rows
+from torchrg._parallel import places_of
+from torchrg.depth.passes import pass_over_rows, serves
 from torchrg.depth.windows import (
     CELL_SIZES,
     NARROW,
+    NUM_PLANE,
     REACH,
     SIDE,
+    Image,
     WindowNoise,
-    WindowPlanes,
+    Windows,
     find_jitter,
     fit_narrow_windows,
     fit_windows,
-    noise_at,
+    held_pixels,
     noise_by_size,
 )
 
@@ -41,44 +44,69 @@ _STEEPEST = 4.0
 a step looks like a bend."""
 _STEEP_SIZE = 2
 """Width of the cells of the windows that jitter is read from, in pixels."""
-_PIXELS_AT_ONCE = 2**14
-"""Pixels whose narrow windows are fitted at once."""
+
+
+class Choice(NamedTuple):
+    """The window of each pixel ``(H, W)``, by its number among those of all sizes.
+
+    ``flat`` tells whether that is flat, ``edge`` whether it is but could not lie around the pixel.
+    Others have the smallest square around them.
+    """
+
+    window: Tensor
+    flat: Tensor
+    edge: Tensor
 
 
 class PixelPlanes(NamedTuple):
-    """A plane in inverse depth for each pixel, that of a window, in columns and rows from the axis.
+    """Windows of an image, and which of them each pixel chose.
 
-    ``window`` tells pixels of one window from those of others, ``sides`` ``(2, H, W)`` are its rows
-    and columns, and ``middle`` ``(2, H, W)`` row and column of its middle. ``valid`` tells which
-    pixels have a plane, ``flat`` whether their window is flat, ``edge`` whether it is but could not
-    lie around the pixel; ``noise`` is that of inverse depth, as large windows see it, ``tolerance``
-    what a flat window may deviate by. All others are of shape ``(H, W)``.
+    Windows are numbered from the smallest squares to the largest, then the lying narrow ones around
+    ``pixels`` ``(n,)``, then the upright ones. ``squares`` are tables of :class:`Windows` by the
+    size of cells, ``narrow`` is one ``(9, 2, n)``; ``noise`` is that of the largest windows.
     """
 
-    planes: WindowPlanes
-    window: Tensor
-    sides: Tensor
-    middle: Tensor
-    valid: Tensor
-    flat: Tensor
-    edge: Tensor
-    noise: Tensor
-    tolerance: Tensor
+    choice: Choice
+    squares: dict[int, Tensor]
+    narrow: Tensor
+    pixels: Tensor
+    noise: WindowNoise
 
+    @property
+    def tables(self) -> list[Tensor]:
+        """All windows as kernels take them: squares, narrow ones, their pixels."""
+        size = sum(table.numel() for table in self.squares.values())
+        squares = self.squares[1].as_strided((size,), (1,))
+        return [squares, self.narrow.flatten(), self.pixels]
 
-class _Tolerances(NamedTuple):
-    """Limits of deviation ``(h, w)``: noise, noise or a slight bend, the strongest bend."""
+    def take(self, places: Tensor) -> Windows:
+        """Return the windows of pixels at row-major places."""
+        numbers = self.choice.window.flatten()[places]
+        every = (*self.squares.values(), self.narrow)
+        columns = zip(*every, strict=True)
+        return Windows(*(torch.cat([part.flatten() for part in c])[numbers] for c in columns))
 
-    noise: Tensor
-    flat: Tensor
-    most: Tensor
+    def sides_and_middles(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rows and columns of the windows of pixels, and the places of their middles.
+
+        Both have the shape ``(2, n)``.
+        """
+        width, double, parts = self.choice.window.shape[1], self.narrow.dtype, []
+        for size, table in self.squares.items():
+            rows, columns = (torch.arange(n, dtype=double) for n in table.shape[1:])
+            grid = torch.cartesian_prod(rows, columns).T * size + (size - 1) / 2
+            parts.append(torch.cat([torch.full_like(grid, SIDE * size), grid]))
+        for sides in NARROW:
+            middles = torch.stack([self.pixels // width, self.pixels % width]).to(double).cpu()
+            parts.append(
+                torch.cat([middles.new_tensor(sides)[:, None].expand_as(middles), middles])
+            )
+        found = torch.cat(parts, dim=1).to(places.device)[:, self.choice.window.flatten()[places]]
+        return found[:2], found[2:]
 
 
 def fit_pixels(
-    inverse: Tensor,
-    seen: Tensor,
-    u: Tensor,
-    v: Tensor,
+    image: Image,
     *,
     focal: tuple[float, float],
     noise: tuple[float, float] | None,
@@ -97,9 +125,8 @@ def fit_pixels(
     on faces seen at a grazing angle or a few pixels wide, is seen again by itself, with narrow
     windows. Pixels in no flat window have the smallest square around them.
 
-    ``inverse`` ``(H, W)``, float64, is anything finite where not ``seen``; columns ``u`` ``(W,)``
-    and rows ``v`` ``(H, 1)`` count from the optical axis; ``focal`` are the focal lengths along
-    both, ``noise`` is that of :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
+    ``focal`` are the focal lengths along columns and rows, ``noise`` is that of
+    :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
 
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban
@@ -107,310 +134,72 @@ def fit_pixels(
         [2] M. Kuwahara et al. Processing of RI-angiocardiographic images. Digital Processing of
         Biomedical Images, 1976.
     """
-    planes = fit_windows(inverse, seen, u, v)
-    noises = noise_by_size(planes, noise, dtype)
-    windows, first = dict[int, _SquareWindows](), 0
-    for size, of_size in planes.items():
-        limit = _tolerances(of_size, noises[size], size, focal)
-        windows[size] = _SquareWindows(size, first, of_size, noises[size], limit)
-        first += of_size.mean.numel()
-    choice = _Choice(inverse, seen, u, v)
+    squares = fit_windows(image)
+    noises = noise_by_size(squares, noise, dtype)
+    window = torch.arange(image.seen.numel(), device=image.seen.device).view(image.seen.shape)
+    choice = Choice(window, torch.zeros_like(image.seen), torch.zeros_like(image.seen))
+    first = sum(math.prod(table.shape[1:]) for table in squares.values())
+    num_squares = first
     for size in CELL_SIZES:
-        _offer_windows(choice, windows[size], windows.get(size // 2))
-    limits = partial(
-        _tolerances, noise=noises[1], size=1, focal=focal, jitter=find_jitter(planes[_STEEP_SIZE])
-    )
-    narrow = _NarrowWindows(first, *_flat_narrow_windows(choice, limits))
-    if len(narrow.pixel):
-        _offer_narrow_windows(choice, narrow)
-    every: list[_SquareWindows | _NarrowWindows] = [*windows.values(), narrow]
-    return _pixel_planes(choice, seen, every, noises[CELL_SIZES[0]].at(inverse))
+        quarters = size // 2 if size // 2 in squares else None
+        rate_windows(squares, size, noises, focal, quarters=quarters)
+    for size in CELL_SIZES:
+        first -= math.prod(squares[size].shape[1:])
+        offer_windows(choice, image, squares[size], size, first)
+    pixels = places_of(image.seen & ~choice.flat)
+    numbers = torch.full_like(choice.window, -1)
+    numbers.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
+    narrow = fit_narrow_windows(image, numbers, pixels)
+    rate_windows({1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE]))
+    chosen, beside = choose_narrow(image, numbers, pixels, narrow)
+    taken = chosen >= 0
+    pixel = pixels[taken]
+    choice.window.view(-1)[pixel] = num_squares + chosen[taken]
+    choice.flat.view(-1)[pixel] = True
+    choice.edge.view(-1)[pixel] = beside[taken]
+    return PixelPlanes(choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
 
 
-class _SquareWindows(NamedTuple):
-    """The windows of one size; they are numbered through all sizes, these from ``first`` on."""
-
-    size: int
-    first: int
-    planes: WindowPlanes
-    noise: WindowNoise
-    limit: _Tolerances
-
-    @property
-    def sides(self) -> tuple[Tensor, Tensor]:
-        """Rows and columns of each window, each ``(h, w)``."""
-        side = torch.full_like(self.planes.mean, SIDE * self.size)
-        return side, side
-
-    @property
-    def middles(self) -> tuple[Tensor, Tensor]:
-        """Row and column of the middle pixel of each window, each ``(h, w)``."""
-        mean, size = self.planes.mean, self.size
-        row, column = (
-            torch.arange(length, device=mean.device, dtype=mean.dtype) * size + (size - 1) / 2
-            for length in mean.shape
-        )
-        return row[:, None].expand_as(mean), column.expand_as(mean)
-
-
-class _NarrowWindows(NamedTuple):
-    """Flat narrow windows ``(k,)`` by middle pixel, and what they hold ``(k, 27)``, or -1."""
-
-    first: int
-    planes: WindowPlanes
-    limit: _Tolerances
-    shape: Tensor
-    pixel: Tensor
-    held: Tensor
-    width: int
-    size: int = 1
-
-    @property
-    def sides(self) -> tuple[Tensor, Tensor]:
-        """Rows and columns of each window, each ``(k,)``."""
-        sides = self.planes.mean.new_tensor(NARROW)[self.shape]
-        return sides[:, 0], sides[:, 1]
-
-    @property
-    def middles(self) -> tuple[Tensor, Tensor]:
-        """Row and column of the middle pixel of each window, each ``(k,)``."""
-        pixel = self.pixel.to(self.planes.mean.dtype)
-        return (pixel / self.width).floor(), pixel % self.width
-
-
-def _offer_windows(
-    choice: "_Choice", windows: _SquareWindows, quarters: _SquareWindows | None
-) -> None:
-    """Offer pixels the flat windows of a size; the smallest has no ``quarters``."""
-    limit, deviation = windows.limit, windows.planes.deviation
-    relative = _flatness(windows, quarters)
-    own = torch.arange(relative.numel(), device=relative.device).view(relative.shape)
-    choice.offer(windows, torch.where(relative <= _FLAT, own, -1), _OWN_REACH * limit.flat)
-    if quarters is None:
-        smooth = torch.where(deviation <= limit.most, own, -1)
-        choice.offer(windows, smooth, torch.full_like(deviation, torch.inf))
-    least, places = least_in_windows(relative, REACH)
-    reach = torch.maximum(_OWN_REACH * limit.noise, limit.flat)
-    choice.offer(windows, torch.where(least <= _FLAT, places, -1), reach, beside=True)
-
-
-def _flat_narrow_windows(
-    choice: "_Choice", limits: Callable[[WindowPlanes], _Tolerances]
-) -> tuple[WindowPlanes, _Tolerances, Tensor, Tensor, Tensor, int]:
-    """Return the flat ones among the narrow windows around pixels that have none, and of them."""
-    pixels, parts = choice.waiting, []
-    left = torch.zeros_like(choice.flat).index_fill(0, pixels, value=True)
-    for some in torch.split(pixels, _PIXELS_AT_ONCE):
-        planes, held = fit_narrow_windows(choice.values, left, choice.u, choice.v, some)
-        limit = limits(planes)
-        shape, place = (planes.deviation <= _FLAT * limit.flat).nonzero().unbind(dim=1)
-        at = shape * len(some) + place
-        held = held.flatten(0, 1)[at]
-        parts.append([*planes.take(at), *(part.flatten()[at] for part in limit), shape])
-        parts[-1] += [some[place], held]
-    *numbers, shape, pixel, held = (torch.cat(part) for part in zip(*parts, strict=True))
-    planes, limit = WindowPlanes(*numbers[:5]), _Tolerances(*numbers[5:])
-    return planes, limit, shape, pixel, held, choice.shape[1]
-
-
-def _offer_narrow_windows(choice: "_Choice", narrow: _NarrowWindows) -> None:
-    """Offer pixels the flatter narrow window around them, then the flattest that holds them."""
-    relative = narrow.planes.deviation / narrow.limit.flat
-    reach = torch.maximum(_OWN_REACH * narrow.limit.noise, narrow.limit.flat)
-    window = torch.arange(len(relative), device=relative.device)
-    choice.offer(narrow, _least_by_pixel(choice, narrow.pixel, window, relative), reach)
-    held, beside = narrow.held.flatten(), window.repeat_interleave(narrow.held.shape[1])
-    tables = _tables(narrow.planes, reach)
-    on_plane = (held >= 0) & _are_near(held.clamp(min=0), beside, tables, choice.image)
-    held, beside = held[on_plane], beside[on_plane]
-    places = _least_by_pixel(choice, held, beside, relative[beside])
-    choice.offer(narrow, places, reach, beside=True)
-
-
-def _least_by_pixel(choice: "_Choice", pixels: Tensor, windows: Tensor, cost: Tensor) -> Tensor:
-    """Return the window of the least cost for each pixel ``(H, W)``, of equal ones the first."""
-    none = len(windows)
-    least = cost.new_full((choice.window.numel(),), torch.inf)
-    least = least.scatter_reduce(0, pixels, cost, "amin")
-    ranked = torch.where(cost == least[pixels], windows, none)
-    first = torch.full_like(choice.window, none).scatter_reduce(0, pixels, ranked, "amin")
-    return torch.where(first < none, first, -1).view(choice.shape)
-
-
-def _flatness(windows: _SquareWindows, quarters: _SquareWindows | None) -> Tensor:
-    """Return what windows deviate by in units of the tolerance; inf if their quarters do less."""
-    limit, deviation = windows.limit, windows.planes.deviation
-    relative = deviation / limit.flat
-    if quarters is None:
-        return relative
-    usual = _deviation_of_quarters(quarters.planes.deviation, relative.shape)
-    # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
-    usual = usual * (limit.noise / quarters.noise.at(windows.planes.mean))
-    usual = torch.maximum(usual, _LEAST_QUARTERS * limit.flat)
-    same = deviation <= (1 + _SAME_NOISE / (SIDE * windows.size)) * usual
-    return torch.where(same, relative, torch.inf)
-
-
-class _Choice:
-    """The window that each pixel takes, numbered through all sizes: the first that it is on."""
-
-    def __init__(self, inverse: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> None:
-        self.shape = inverse.shape
-        self.values, self.u, self.v = inverse, u, v
-        self.window = torch.arange(inverse.numel(), device=inverse.device)
-        self.flat = torch.zeros_like(self.window, dtype=torch.bool)
-        self.edge = torch.zeros_like(self.flat)
-        self.waiting = seen.flatten().nonzero().squeeze(1)
-
-    def take(self, images: Sequence[Tensor]) -> Tensor:
-        """Return the values of the pixels' windows ``(H, W)`` from those of each size."""
-        return torch.cat([part.flatten() for part in images])[self.window].view(self.shape)
-
-    @property
-    def image(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Inverse depth by row-major place, columns and rows."""
-        return self.values.flatten(), self.u, self.v.flatten()
-
-    def offer(
-        self,
-        windows: _SquareWindows | _NarrowWindows,
-        places: Tensor,
-        reach: Tensor,
-        *,
-        beside: bool = False,
-    ) -> None:
-        """Offer each cell of a size a window, by its row-major place ``(h, w)``; -1 for none.
-
-        A pixel takes it if it is within reach ``(h, w)`` of the window's plane; the windows are
-        around the cells unless ``beside``.
-        """
-        waiting, sizes = self.waiting, (windows.size, places.shape[1])
-        (chosen,) = map_rows(
-            _chosen_windows,
-            [waiting],
-            places.flatten(),
-            *_tables(windows.planes, reach),
-            *self.image,
-            waiting.new_tensor(sizes),
-        )
-        is_taken = chosen >= 0
-        taken = waiting[is_taken]
-        self.window[taken] = chosen[is_taken] + windows.first
-        self.flat[taken] = True
-        self.edge[taken] = beside
-        self.waiting = waiting[~is_taken]
-
-
-def _tables(planes: WindowPlanes, reach: Tensor) -> list[Tensor]:
-    """Return the planes of windows and how far from them a pixel may be, each ``(T,)``."""
-    parts = planes.u_slope, planes.v_slope, planes.origin, reach
-    return [part.flatten() for part in parts]
-
-
-def _chosen_windows(
-    pixels: Tensor,
-    places: Tensor,
-    u_slope: Tensor,
-    v_slope: Tensor,
-    origin: Tensor,
-    reach: Tensor,
-    values: Tensor,
-    u: Tensor,
-    v: Tensor,
-    sizes: Tensor,
-) -> tuple[Tensor]:
-    """Return the window that cells offer pixels near it, or -1; ``sizes`` are width and columns."""
-    size, num_columns = sizes.unbind()
-    width = u.shape[0]
-    row, column = pixels // width, pixels % width
-    offered = places[row // size * num_columns + column // size]
-    tables, image = (u_slope, v_slope, origin, reach), (values, u, v)
-    is_near = _are_near(pixels, offered.clamp(min=0), tables, image)
-    return (torch.where(is_near, offered, -1),)
-
-
-def _are_near(
-    pixels: Tensor,
-    windows: Tensor,
-    tables: Sequence[Tensor],
-    image: tuple[Tensor, Tensor, Tensor],
-) -> Tensor:
-    """Tell which pixels are within the reach of windows, both by place; see :func:`_tables`."""
-    u_slope, v_slope, origin, reach = tables
-    values, u, v = image
-    width = u.shape[0]
-    on_plane = u_slope[windows] * u[pixels % width] + v_slope[windows] * v[pixels // width]
-    away = values[pixels] - (on_plane + origin[windows])
-    return away.abs() <= reach[windows]
-
-
-def _pixel_planes(
-    choice: _Choice,
-    seen: Tensor,
-    windows: Sequence[_SquareWindows | _NarrowWindows],
-    noise: Tensor,
-) -> PixelPlanes:
-    """Return the planes of the windows that pixels chose."""
-    table = zip(*(part.planes for part in windows), strict=True)
-    planes = WindowPlanes(*(choice.take(part) for part in table))
-    tolerance = choice.take([part.limit.flat for part in windows])
-    sides, middles = (
-        torch.stack([choice.take(part) for part in zip(*pairs, strict=True)])
-        for pairs in ([part.sides for part in windows], [part.middles for part in windows])
-    )
-    flat = choice.flat.view(choice.shape)
-    is_smooth = flat & (planes.deviation > _FLAT * tolerance)
-    tolerance = torch.where(is_smooth, planes.deviation, torch.maximum(tolerance, noise))
-    return PixelPlanes(
-        planes,
-        choice.window.view(choice.shape),
-        sides,
-        middles,
-        flat | (seen & planes.deviation.isfinite()),
-        flat,
-        choice.edge.view(choice.shape),
-        noise,
-        tolerance,
-    )
-
-
-def _tolerances(
-    planes: WindowPlanes,
-    noise: WindowNoise,
+def rate_windows(
+    tables: Mapping[int, Tensor],
     size: int,
+    noises: Mapping[int, WindowNoise],
     focal: tuple[float, float],
     *,
+    quarters: int | None = None,
     jitter: float = 0.0,
-) -> _Tolerances:
-    """Return what windows of a size may deviate by; jitter is that of the rays, in pixels.
+) -> None:
+    """Fill in what windows of a size may deviate by; jitter is that of the rays, in pixels.
 
     A bend is a share of half a window's side on the surface. On a plane at a distance d from the
     camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
-    depth is one of ``d z e`` from the plane.
+    depth is one of ``d z e`` from the plane. Windows that deviate by more than their ``quarters``,
+    the windows of half the size, are not flat.
     """
-    half = SIDE * size / 2 / max(map(abs, focal))
-    columns = [planes.u_slope, planes.v_slope, planes.origin, planes.mean]
-    limits = map_rows(
-        _tolerances_of_planes,
-        [part.flatten() for part in columns],
-        planes.mean.new_tensor(noise),
-        planes.mean.new_tensor([*focal, half, jitter]),
-    )
-    return _Tolerances(*(part.view(planes.mean.shape) for part in limits))
-
-
-def _tolerances_of_planes(
-    u_slope: Tensor, v_slope: Tensor, origin: Tensor, mean: Tensor, noise: Tensor, view: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return :class:`_Tolerances`; ``view`` is focal lengths, half a window's side, and jitter."""
-    fx, fy, half, jitter = view.unbind()
-    sq_blur = jitter.square() * (u_slope.square() + v_slope.square())
-    by_noise = (noise_at(mean, *noise.unbind()).square() + sq_blur).sqrt()
-    sq_nearness = (u_slope * fx).square() + (v_slope * fy).square() + origin.square()
+    table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
+    if serves(table):
+        finer = tables[size][0, :0] if quarters is None else tables[quarters][3]
+        numbers = *noise, noises[quarters or size].factor, *focal, half, jitter
+        pass_over_rows("rate_windows", table.shape[1], table, finer, *numbers, size)
+        return
+    u_slope, v_slope, origin, deviation, mean = table[:NUM_PLANE]
+    sq_blur = jitter * jitter * (u_slope.square() + v_slope.square())
+    by_noise = (noise.at(mean).square() + sq_blur).sqrt()
+    sq_nearness = (u_slope * focal[0]).square() + (v_slope * focal[1]).square() + origin.square()
     is_steep = sq_nearness > (_STEEPEST * mean).square()
     bend = half * torch.where(is_steep, 0.0, sq_nearness) / mean
     bend = torch.where(mean > 0, bend, 0.0)
-    return by_noise, torch.maximum(by_noise, _BEND * bend), _MOST_BEND * bend
+    tolerance = torch.maximum(by_noise, _BEND * bend)
+    relative = deviation / tolerance
+    is_flat = relative <= _FLAT
+    if quarters is not None:
+        usual = _deviation_of_quarters(tables[quarters][3], relative.shape)
+        # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
+        usual = usual * (by_noise / noises[quarters].at(mean))
+        usual = torch.maximum(usual, _LEAST_QUARTERS * tolerance)
+        is_flat &= deviation <= (1 + _SAME_NOISE / (SIDE * size)) * usual
+    relative = torch.where(is_flat, relative, torch.inf)
+    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MOST_BEND * bend, relative])
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
@@ -429,6 +218,81 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
     return torch.where(count > 0, squares / count, torch.inf).sqrt()
 
 
+def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first: int) -> None:
+    """Offer pixels without a window those of a size, numbered from ``first`` on.
+
+    They take the window around their cell if it is flat, of the smallest size also if it is smooth,
+    else the flattest that holds them.
+    """
+    windows = Windows(*table)
+    if serves(table):
+        pass_over_rows("offer_windows", table.shape[1], *image, table, *choice, size, first)
+        return
+    own = torch.arange(windows.mean.numel(), device=table.device).view_as(windows.mean)
+    least, flattest = least_in_windows(windows.relative, REACH)
+    beside = torch.where(least.isfinite(), flattest, -1)
+    reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
+    flat = torch.where(windows.relative.isfinite(), own, -1)
+    offers = [(flat, _OWN_REACH * windows.tolerance), (beside, reach)]
+    if size == 1:
+        smooth = torch.where(windows.deviation <= windows.most, own, -1)
+        offers.insert(1, (smooth, torch.full_like(reach, torch.inf)))
+    for places, reach in offers:
+        pixels = places_of(image.seen & ~choice.flat)
+        row, column = pixels // len(image.u), pixels % len(image.u)
+        offered = places[row // size, column // size]
+        taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)
+        pixels = pixels[taken]
+        choice.window.view(-1)[pixels] = first + offered[taken]
+        choice.flat.view(-1)[pixels] = True
+        choice.edge.view(-1)[pixels] = places is beside
+
+
+def choose_narrow(
+    image: Image, numbers: Tensor, pixels: Tensor, table: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Choose for pixels the flatter narrow window around them, else the flattest that holds them.
+
+    A pixel must be on its plane, too. The arguments are those of :func:`fit_narrow_windows`.
+    Returns places in the table, row by row, -1 for none, and whether they are the latter.
+    """
+    if serves(table):
+        chosen, beside = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
+        fixed = image.values, image.u, image.v, numbers, pixels, table, chosen, beside
+        pass_over_rows("choose_narrow", len(pixels), *fixed)
+        return chosen, beside
+    windows, count = Windows(*table), len(pixels)
+    relative = windows.relative.flatten()
+    reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
+
+    def reached(window: Tensor) -> Tensor:
+        near = (window >= 0) & _are_near(image, pixels, window, table, reach)
+        cost: Tensor = torch.where(near, relative[window], torch.inf)
+        return cost
+
+    own = torch.arange(count, device=pixels.device)
+    own = torch.where(windows.relative[1] < windows.relative[0], own + count, own)
+    takes_own = reached(own).isfinite()
+    least, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
+    for shape, sides in enumerate(NARROW):
+        for _, number in held_pixels(numbers, pixels, *sides):
+            window = torch.where(number >= 0, shape * count + number, -1)
+            cost = reached(window)
+            flattest = torch.where(cost < least, window, flattest)
+            least = torch.minimum(least, cost)
+    return torch.where(takes_own, own, flattest), ~takes_own & (flattest >= 0)
+
+
+def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach: Tensor) -> Tensor:
+    """Tell which pixels are within the reach of windows, both by place."""
+    u_slope, v_slope, origin = (part.flatten()[places] for part in table[:3])
+    row, column = pixels // len(image.u), pixels % len(image.u)
+    on_plane = u_slope * image.u[column] + v_slope * image.v[row]
+    away = (image.values[row, column] - (on_plane + origin)).abs()
+    is_near: Tensor = away <= reach.flatten()[places]
+    return is_near
+
+
 def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     """Return the least value within reach of each cell along both axes, and its row-major place."""
     best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
@@ -438,3 +302,67 @@ def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
         place = place[chosen.flatten()]
     return -best[0, 0], place.view(image.shape)
+
+
+class Pixels(NamedTuple):
+    """What the windows of pixels say, ``(H, W)``; normals are unit ones ``(H, W, 3)``.
+
+    ``curvature`` is the share of a window's variance across its plane. ``tolerance`` is what a flat
+    window may deviate by, ``noise`` that of inverse depth as large windows see it. ``valid`` tells
+    which pixels have a plane; all but the noise is 0 at others.
+    """
+
+    normals: Tensor
+    curvature: Tensor
+    tolerance: Tensor
+    noise: Tensor
+    valid: Tensor
+
+
+def describe_pixels(
+    image: Image, pixels: PixelPlanes, x: Tensor, y: Tensor, focal: tuple[float, float]
+) -> Pixels:
+    """Return normals towards the camera, curvature and limits of deviation of pixels.
+
+    ``x`` ``(W,)`` and ``y`` ``(H,)`` are slopes of the rays. A deviation e of inverse depth is one
+    of ``distance * z * e`` from the plane; a step of a column is one of
+    ``(x_step - x_slope * z * ray) z`` along it.
+    """
+    values, seen, choice = image.values, image.seen, pixels.choice
+    if serves(values):
+        curvature, tolerance, noise = (torch.empty_like(values) for _ in range(3))
+        normals = values.new_empty(*values.shape, 3)
+        found = Pixels(normals, curvature, tolerance, noise, torch.empty_like(seen))
+        fixed = values, seen, x, y, choice.window, choice.flat, *pixels.tables
+        numbers = *focal, *pixels.noise
+        pass_over_rows("describe_pixels", len(y), *fixed, *found, *numbers)
+        return found
+    places = torch.arange(values.numel(), device=values.device)
+    windows = Windows(*(part.view(values.shape) for part in pixels.take(places)))
+    sides = pixels.sides_and_middles(places)[0].view(2, *values.shape)
+    noise = pixels.noise.at(values)
+    valid = choice.flat | (seen & windows.deviation.isfinite())
+    is_smooth = windows.deviation > _FLAT * windows.tolerance
+    limit = torch.maximum(windows.tolerance, noise)
+    tolerance = torch.where(is_smooth, windows.deviation, limit)
+    away = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
+    length = (away[0].square() + away[1].square() + away[2].square()).sqrt()
+    length = torch.where(length > 0, length, 1.0)
+    z = 1 / torch.where(values > 0, values, 1.0)
+    across = (z * torch.where(valid, windows.deviation, 0.0) / length).square()
+    rays, y = x * x + (y * y)[:, None] + 1, y[:, None]
+    along = torch.zeros_like(z)
+    slopes = (windows.u_slope, windows.v_slope)
+    for side, slope, f, place in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
+        step, spread = slope * z, (side * side - 1) / 12
+        along = along + spread * (step * step * rays - 2 / f * step * place + 1 / (f * f))
+    total = across + along * z * z
+    variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
+    normals = torch.stack([-part / length for part in away], dim=-1)
+    return Pixels(
+        torch.where(valid[..., None], normals, 0.0),
+        torch.where(valid, variation, 0.0),
+        torch.where(valid, tolerance, 0.0),
+        noise,
+        valid,
+    )

@@ -4,11 +4,13 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._parallel import map_rows, sequential_operations
+from torchrg._parallel import places_of, sequential_operations
 from torchrg.config import DepthConfig
-from torchrg.depth.camera import has_depth, points_of_image, read_intrinsics
-from torchrg.depth.growth import InverseCloud, grow_pixels
-from torchrg.depth.normals import PixelPlanes, fit_pixels
+from torchrg.depth.camera import has_depth, read_intrinsics
+from torchrg.depth.growth import InverseCloud, grow_pixels, join_pixels
+from torchrg.depth.normals import Pixels, describe_pixels, fit_pixels
+from torchrg.depth.windows import Image
+from torchrg.linalg.moments import kth_smallest
 from torchrg.regions import summarize_planes
 from torchrg.structures import Segmentation
 
@@ -82,16 +84,17 @@ def _segment(
     fx, fy, cx, cy = (float(intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     focal = (fx, fy)
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
-    v = torch.arange(depth.shape[0], device=depth.device).double()[:, None] - cy
-    x, y = (rays.expand_as(inverse).contiguous() for rays in (u / fx, v / fy))
-    pixels = fit_pixels(inverse, seen, u, v, focal=focal, noise=config.noise, dtype=depth.dtype)
-    normals, curvature = _normals_and_curvature(pixels, inverse, x, y, focal)
-    valid = pixels.valid
-    cloud = _inverse_cloud(inverse, seen, pixels, x, y)
-    labels, plane_normals, curved = grow_pixels(cloud, pixels, normals, u, v, config)
-    normals = torch.where(valid[..., None], normals, 0.0).view(-1, 3)
+    v = torch.arange(depth.shape[0], device=depth.device).double() - cy
+    image, x, y = Image(inverse, seen, u, v), u / fx, v / fy
+    planes = fit_pixels(image, focal=focal, noise=config.noise, dtype=depth.dtype)
+    pixels = describe_pixels(image, planes, x, y, focal)
+    joins, flat, edge = join_pixels(image, planes, pixels, config), *planes.choice[1:]
+    del planes
+    cloud = _inverse_cloud(image, pixels, x, y)
+    labels, plane_normals, curved = grow_pixels(cloud, flat, joins, config)
+    normals, valid = pixels.normals.view(-1, 3), pixels.valid
     # A window at a border that is not flat has no normal of its own; the region has.
-    borders = (~pixels.flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    borders = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
     borders = borders[~curved[labels[borders]]]
     normals[borders] = plane_normals[labels[borders]]
     valid.view(-1)[borders] = True
@@ -99,72 +102,26 @@ def _segment(
     if pose is not None:
         pose = pose.to(normals)
         normals = normals @ pose[:3, :3].T
-    points = points_of_image(depth, intrinsics, pose)
-    rows = seen.flatten().nonzero().squeeze(1)
-    table = summarize_planes(points.view(-1, 3)[rows], normals[rows], labels[rows])
+    z = torch.where(seen, depth.double(), 1.0)
+    points = torch.stack([(x * z).flatten(), (y[:, None] * z).flatten(), z.flatten()]).T
+    if pose is not None:
+        points = (pose[:3, :3] @ points.T + pose[:3, 3:]).T
+    table = summarize_planes(points, normals, labels)
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),
-        curvature.to(depth.dtype),
-        pixels.edge,
+        pixels.curvature.to(depth.dtype),
+        edge,
         valid,
         table._replace(curved=curved),
     )
 
 
-def _inverse_cloud(
-    inverse: Tensor, seen: Tensor, pixels: PixelPlanes, x: Tensor, y: Tensor
-) -> InverseCloud:
+def _inverse_cloud(image: Image, pixels: Pixels, x: Tensor, y: Tensor) -> InverseCloud:
     """Return the image as the cloud that regions grow in, from the rays ``(x, y, 1)``."""
-    unit = inverse[seen].median() if bool(seen.any()) else inverse.new_ones(())
-    columns = torch.stack([x.flatten(), y.flatten(), inverse.flatten() / unit])
-    return InverseCloud(columns.T, (pixels.noise / unit).flatten(), seen)
-
-
-def _normals_and_curvature(
-    pixels: PixelPlanes, inverse: Tensor, x: Tensor, y: Tensor, focal: tuple[float, float]
-) -> tuple[Tensor, Tensor]:
-    """Return unit normals towards the camera ``(H, W, 3)``, and curvature ``(H, W)``."""
-    planes = pixels.planes
-    columns = [planes.u_slope, planes.v_slope, planes.origin, planes.deviation, *pixels.sides]
-    columns += [pixels.valid, inverse, x, y]
-    columns = [part.flatten() for part in columns]
-    *normals, curvature = map_rows(_shape_of_planes, columns, inverse.new_tensor(focal))
-    shape = inverse.shape
-    return torch.stack(normals, dim=1).view(*shape, 3), curvature.view(shape)
-
-
-def _shape_of_planes(
-    u_slope: Tensor,
-    v_slope: Tensor,
-    origin: Tensor,
-    deviation: Tensor,
-    rows: Tensor,
-    columns: Tensor,
-    valid: Tensor,
-    inverse: Tensor,
-    x: Tensor,
-    y: Tensor,
-    focal: Tensor,
-) -> tuple[Tensor, ...]:
-    """Return the columns of the normals of windows, and their surface variation.
-
-    That is their variance across the plane, of all. A deviation e of inverse depth is one of
-    ``distance * z * e`` from the plane; a step of a column is one of
-    ``(x_step - x_slope * z * ray) z`` along it.
-    """
-    fx, fy = focal.unbind()
-    away = u_slope * fx, v_slope * fy, origin
-    length = (away[0].square() + away[1].square() + away[2].square()).sqrt()
-    length = torch.where(length > 0, length, 1.0)
-    z = 1 / torch.where(inverse > 0, inverse, 1.0)
-    across = (z * torch.where(valid, deviation, 0.0) / length).square()
-    ray = x * x + y * y + 1
-    along = torch.zeros_like(z)
-    for side, slope, f, place in ((columns, u_slope, fx, x), (rows, v_slope, fy, y)):
-        step, spread = slope * z, (side * side - 1) / 12
-        along = along + spread * (step * step * ray - 2 / f * step * place + 1 / (f * f))
-    total = across + along * z * z
-    variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    curvature = torch.where(valid, variation, 0.0)
-    return *(-part / length for part in away), curvature
+    inverse, seen = image.values, image.seen
+    known = inverse.flatten()[places_of(seen)]
+    unit = kth_smallest(known, (len(known) - 1) // 2) if len(known) else inverse.new_ones(())
+    columns = [x.expand_as(inverse), y[:, None].expand_as(inverse), inverse / unit]
+    points = torch.stack([column.flatten() for column in columns]).T
+    return InverseCloud(points, (pixels.noise / unit).flatten(), seen)

@@ -4,13 +4,13 @@ Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Win
 apart, so that the sums over all large ones together cost less than those over the smallest.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_rows, map_tasks
+from torchrg.depth.passes import pass_over_rows, serves
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
 
@@ -27,6 +27,8 @@ _LEAST_SHARE = 0.4
 _LEAST_SPREAD = 0.2
 """Least determinant of the covariance of a window's pixels, as a share of that of a full window.
 With less, the pixels lie nearly on a line and tell no plane."""
+_NUM_MOMENTS = 10
+"""Sums of a window's pixels that its plane needs."""
 _FLAT_QUANTILE = 0.35
 """Share of the windows of an image that deviate by noise alone: at least a third of it is flat."""
 _NUM_BINS = 12
@@ -41,12 +43,25 @@ _LEAST_ROUNDING = 1e-7
 """Least noise of inverse depth as a share of it, whatever the dtype: the rounding of float32."""
 
 
-class WindowPlanes(NamedTuple):
-    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows.
+class Image(NamedTuple):
+    """Inverse depths ``(H, W)``, float64 and finite, which pixels have one, and their places.
+
+    Columns ``u`` ``(W,)`` and rows ``v`` ``(H,)`` count from the optical axis.
+    """
+
+    values: Tensor
+    seen: Tensor
+    u: Tensor
+    v: Tensor
+
+
+class Windows(NamedTuple):
+    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows, each number ``(h, w)``.
 
     ``deviation`` is the standard deviation of a window's pixels from its plane, infinite where
-    there is none, ``mean`` their mean value. All are of one shape, ``(h, w)`` for the windows
-    around the cells of an image.
+    there is none, ``mean`` their mean value. :func:`torchrg.depth.normals.rate_windows` adds limits
+    of the deviation: the noise; the noise or a slight bend; the strongest bend. ``relative`` is the
+    deviation of a flat window as a share of the second, else infinite.
     """
 
     u_slope: Tensor
@@ -54,75 +69,107 @@ class WindowPlanes(NamedTuple):
     origin: Tensor
     deviation: Tensor
     mean: Tensor
+    noise: Tensor
+    tolerance: Tensor
+    most: Tensor
+    relative: Tensor
 
-    def take(self, places: Tensor) -> "WindowPlanes":
-        """Return those at some row-major places."""
-        return WindowPlanes(*(part.flatten()[places] for part in self))
+
+NUM_PLANE = 5
+"""Numbers of a window's plane; what follows rates it."""
 
 
-def fit_windows(values: Tensor, seen: Tensor, u: Tensor, v: Tensor) -> dict[int, WindowPlanes]:
+def fit_windows(image: Image) -> dict[int, Tensor]:
     """Fit a plane by least squares to the window around each cell, for ascending sizes of cells.
 
-    The image ``(H, W)``, float64, holds anything finite where not seen; its columns are at ``u``
-    ``(W,)``, its rows at ``v`` ``(H, 1)``. Cells begin at the first pixel, and windows are cut off
-    at the borders of the image. One with too few pixels seen, or nearly on a line, has no plane.
+    Cells begin at the first pixel, and windows are cut off at the borders of the image. One with
+    too few pixels seen, or nearly on a line, has no plane. Returns tables ``(9, h, w)`` of
+    :class:`Windows`, of which the planes are filled in; they lie side by side in memory.
     """
-    ones = seen.to(values.dtype)
-    w = torch.where(seen, values, 0.0)
-    mu, mv = ones * u, ones * v
-    moments = [ones, mu, mv, w, mu * u, mu * v, mv * v, w * u, w * v, w * w]
-    sums = zip(*map_tasks(_window_sums, moments, values.device), strict=True)
-    return {
-        size: _fit_planes(some, (SIDE * size, SIDE * size))
-        for size, some in zip(sorted(CELL_SIZES), sums, strict=True)
+    values, seen, u, v = image
+    shapes = [seen.shape]
+    for _ in CELL_SIZES[1:]:
+        shapes.append(torch.Size(-(-length // 2) for length in shapes[-1]))
+    sizes = sorted(CELL_SIZES)
+    flat = values.new_empty(len(Windows._fields) * sum(shape.numel() for shape in shapes))
+    parts = torch.split(flat, [len(Windows._fields) * shape.numel() for shape in shapes])
+    tables = {
+        size: part.view(-1, *shape) for size, part, shape in zip(sizes, parts, shapes, strict=True)
     }
+    if not serves(values):
+        ones = seen.to(values.dtype)
+        w = torch.where(seen, values, 0.0)
+        mu, mv = ones * u, ones * v[:, None]
+        cells = torch.stack([ones, mu, mv, w, mu * u, mu * mv, mv * mv, w * mu, w * mv, w * w])
+        for size, table in tables.items():
+            cells = _sums_of_pairs(cells) if size > 1 else cells
+            table[:NUM_PLANE] = _planes_of_sums(_sums_around(cells), SIDE * size, SIDE * size)
+        return tables
+    cells = values
+    for size, table in tables.items():
+        height, width = table.shape[1:]
+        coarse = values.new_empty(_NUM_MOMENTS, -(-height // 2), -(-width // 2))
+        name, source = ("cell", [cells]) if size > 1 else ("pixel", [values, seen, u, v])
+        limits = _least_of(SIDE * size, SIDE * size)
+        planes = table[:NUM_PLANE]
+        pass_over_rows(f"fit_{name}_windows", height, *source, planes, coarse, *limits)
+        cells = coarse
+    return tables
 
 
-def fit_narrow_windows(
-    values: Tensor, seen: Tensor, u: Tensor, v: Tensor, pixels: Tensor
-) -> tuple[WindowPlanes, Tensor]:
+def fit_narrow_windows(image: Image, numbers: Tensor, pixels: Tensor) -> Tensor:
     """Fit a plane to the window of either narrow shape around some pixels ``(n,)``.
 
-    The other arguments are those of :func:`fit_windows`. Returns planes of shape ``(2, n)``, and
-    the pixels that the windows hold ``(2, n, 27)``, by row-major place; -1 for those not seen.
+    Only these pixels count: ``numbers`` ``(H, W)`` are their places among them, -1 of all others.
+    Returns a table ``(9, 2, n)``; see :func:`fit_windows`.
     """
-    (height, width), usable = values.shape, seen.flatten()
-    held = []
-    for rows, columns in NARROW:
-        step = torch.arange(rows * columns, device=pixels.device)
-        row = pixels[:, None] // width + step // columns - rows // 2
-        column = pixels[:, None] % width + step % columns - columns // 2
+    values, _, u, v = image
+    table = values.new_empty(len(Windows._fields), len(NARROW), len(pixels))
+    if serves(values):
+        limits, planes = _least_of(*NARROW[0]), table[:NUM_PLANE]
+        fixed = values, u, v, numbers, pixels, *limits, planes
+        pass_over_rows("fit_narrow_windows", len(pixels), *fixed)
+        return table
+    for shape, (rows, columns) in enumerate(NARROW):
+        sums = values.new_zeros(_NUM_MOMENTS, len(pixels))
+        for at, _ in held_pixels(numbers, pixels, rows, columns):
+            ones = (at >= 0).to(values.dtype)
+            at = at.clamp(min=0)
+            row, column = at // len(u), at % len(u)
+            mu, mv, w = u[column] * ones, v[row] * ones, values[row, column] * ones
+            sums += torch.stack([ones, mu, mv, w, mu * mu, mu * mv, mv * mv, w * mu, w * mv, w * w])
+        table[:NUM_PLANE, shape] = _planes_of_sums(sums, rows, columns)
+    return table
+
+
+def held_pixels(
+    numbers: Tensor, pixels: Tensor, rows: int, columns: int
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield for each place of a narrow window the pixels there ``(n,)``, and their numbers.
+
+    Row by row; where there is no pixel that counts both are -1.
+    """
+    height, width = numbers.shape
+    for step in range(rows * columns):
+        row = pixels // width + step // columns - rows // 2
+        column = pixels % width + step % columns - columns // 2
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         place = torch.where(inside, row * width + column, 0)
-        held.append(torch.where(inside & usable[place], place, -1))
-    places = torch.stack(held)
-    at, ones = places.clamp(min=0), (places >= 0).to(values.dtype)
-    mu, mv, w = u[at % width] * ones, v.flatten()[at // width] * ones, values.flatten()[at] * ones
-    products = [ones, mu, mv, w, mu * mu, mu * mv, mv * mv, w * mu, w * mv, w * w]
-    return _fit_planes([part.sum(dim=2) for part in products], NARROW[0]), places
-
-
-def _window_sums(image: Tensor) -> list[Tensor]:
-    """Return the sums of an image over the windows of each size ``(h, w)``; sizes ascend."""
-    sums = []
-    for size in sorted(CELL_SIZES):
-        image = _sums_of_pairs(image) if size > 1 else image
-        sums.append(_sums_around(image))
-    return sums
+        number = torch.where(inside, numbers.flatten()[place], -1)
+        yield torch.where(number >= 0, place, -1), number
 
 
 def _sums_of_pairs(cells: Tensor) -> Tensor:
-    """Return the sums over cells of twice the width, ``(ceil(h / 2), ceil(w / 2))``."""
-    height, width = cells.shape
-    if height % 2 or width % 2:
-        cells = torch.nn.functional.pad(cells, (0, width % 2, 0, height % 2))
-    rows = cells[0::2] + cells[1::2]
-    return rows[:, 0::2] + rows[:, 1::2]
+    """Return the sums over cells of twice the width, ``(*, ceil(h / 2), ceil(w / 2))``."""
+    height, width = cells.shape[1:]
+    cells = torch.nn.functional.pad(cells, (0, width % 2, 0, height % 2))
+    rows = cells[:, 0::2] + cells[:, 1::2]
+    return rows[:, :, 0::2] + rows[:, :, 1::2]
 
 
 def _sums_around(cells: Tensor) -> Tensor:
-    """Return the sums over the cells of the window around each, ``(h, w)``."""
-    for axis in (0, 1):
+    """Return the sums over the cells of the window around each, ``(*, h, w)``."""
+    for axis in (1, 2):
         length, total = cells.shape[axis], cells.clone()
         for step in range(1, min(REACH, length - 1) + 1):
             total.narrow(axis, step, length - step).add_(cells.narrow(axis, 0, length - step))
@@ -131,41 +178,28 @@ def _sums_around(cells: Tensor) -> Tensor:
     return cells
 
 
-def _fit_planes(sums: Sequence[Tensor], sides: tuple[int, int]) -> WindowPlanes:
-    """Return the planes of windows with so many pixels along their sides, from sums of moments."""
-    one, other = sides
-    full = (one * one - 1) * (other * other - 1) / 144
-    least = sums[0].new_tensor([_LEAST_SHARE * one * other, _LEAST_SPREAD * full])
-    columns = map_rows(_planes_of_sums, [part.flatten() for part in sums], least)
-    return WindowPlanes(*(part.view(sums[0].shape) for part in columns))
+def _least_of(rows: int, columns: int) -> tuple[float, float]:
+    """Return the count and the spread of pixels of a window that has a plane, at least."""
+    full = (rows * rows - 1) * (columns * columns - 1) / 144
+    return _LEAST_SHARE * rows * columns, _LEAST_SPREAD * full
 
 
-def _planes_of_sums(
-    count: Tensor,
-    u: Tensor,
-    v: Tensor,
-    w: Tensor,
-    uu: Tensor,
-    uv: Tensor,
-    vv: Tensor,
-    uw: Tensor,
-    vw: Tensor,
-    ww: Tensor,
-    least: Tensor,
-) -> tuple[Tensor, ...]:
-    """Return the planes of windows; ``least`` is the count and the spread of one that has any."""
+def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
+    """Return planes ``(5, *)`` of windows of so many pixels, from sums of moments ``(10, *)``."""
+    count = sums[0]
     share = 1 / count.clamp(min=1)
-    u, v, w, uu, uv, vv, uw, vw, ww = (sums * share for sums in (u, v, w, uu, uv, vv, uw, vw, ww))
+    u, v, w, uu, uv, vv, uw, vw, ww = (some * share for some in sums[1:])
     uu, uv, vv = uu - u * u, uv - u * v, vv - v * v
     uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
     spread = uu * vv - uv * uv
-    least_count, least_spread = least.unbind()
+    least_count, least_spread = _least_of(rows, columns)
     has_plane = (count >= least_count) & (spread > least_spread)
     spread = torch.where(has_plane, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
     variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
+    has_plane &= variance.isfinite()
     deviation = torch.where(has_plane, variance.sqrt(), torch.inf)
-    return u_slope, v_slope, w - u_slope * u - v_slope * v, deviation, w
+    return torch.stack([u_slope, v_slope, w - u_slope * u - v_slope * v, deviation, w])
 
 
 class WindowNoise(NamedTuple):
@@ -181,24 +215,13 @@ class WindowNoise(NamedTuple):
 
     def at(self, inverse: Tensor) -> Tensor:
         """Return the noise at inverse depths."""
-        return noise_at(inverse, *self)
-
-
-def noise_at(
-    inverse: Tensor,
-    factor: float | Tensor,
-    constant: float | Tensor,
-    growth: float | Tensor,
-    rounding: float | Tensor,
-) -> Tensor:
-    """Return the noise at inverse depths, from the parts of :class:`WindowNoise`."""
-    least = rounding * inverse
-    usual = torch.maximum(growth + constant * (inverse * inverse), least)
-    return torch.maximum(factor * usual, least)
+        least = self.rounding * inverse
+        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
+        return torch.maximum(self.factor * usual, least)
 
 
 def noise_by_size(
-    windows: Mapping[int, WindowPlanes], given: tuple[float, float] | None, dtype: torch.dtype
+    tables: Mapping[int, Tensor], given: tuple[float, float] | None, dtype: torch.dtype
 ) -> dict[int, WindowNoise]:
     """Return the noise of inverse depth as windows of each size see it.
 
@@ -212,7 +235,10 @@ def noise_by_size(
     rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING)
     if given is not None:
         constant, growth = given
-        return dict.fromkeys(windows, WindowNoise(1.0, constant, growth, rounding))
+        return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
+    windows = {size: Windows(*table) for size, table in tables.items()}
+    # Windows stand a cell apart and overlap; of the smallest a quarter are as many as of the next.
+    windows[1] = Windows(*tables[1][:, ::REACH, ::REACH])
     middle = windows[sorted(windows)[len(windows) // 2 - 1]]
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
@@ -226,7 +252,7 @@ def noise_by_size(
     return noises
 
 
-def find_jitter(windows: WindowPlanes) -> float:
+def find_jitter(table: Tensor) -> float:
     """Return by how many pixels the rays of an image are off the middles of their pixels.
 
     It is a standard deviation, from 0 for exact rays to 0.15. Jitter moves a value by as much of
@@ -235,7 +261,7 @@ def find_jitter(windows: WindowPlanes) -> float:
     flat windows deviate least.
     """
     # Windows stand a cell apart and overlap.
-    some = WindowPlanes(*(part[::REACH, ::REACH] for part in windows))
+    some = Windows(*table[:, ::REACH, ::REACH])
     slope = torch.hypot(some.u_slope, some.v_slope)
     used = some.deviation.isfinite() & (slope > 0)
     slope, order = slope[used].sort()
@@ -249,7 +275,7 @@ def _low_quantile(values: Tensor) -> Tensor:
     return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
 
 
-def _fit_noise(windows: WindowPlanes, rounding: float) -> tuple[float, float]:
+def _fit_noise(windows: Windows, rounding: float) -> tuple[float, float]:
     """Fit ``b + a w^2``, both not negative, to the deviations of flat windows; return a and b."""
     used = windows.deviation.isfinite()
     mean, order = windows.mean[used].sort()

@@ -7,6 +7,7 @@
 
 #define KERNEL extern "C" __attribute__((visibility("default"))) int64_t
 #define INLINE static inline __attribute__((always_inline))
+#define INLINE_MEMBER inline __attribute__((always_inline))
 
 // What kernels read.
 typedef const float* Floats;
@@ -70,10 +71,10 @@ struct Patch {
   alignas(32) float x[MOST], y[MOST], z[MOST], weight[MOST];
   int width;
 
-  inline __attribute__((always_inline)) Lanes along(float a, float b, float c, int j) const {
+  INLINE_MEMBER Lanes along(float a, float b, float c, int j) const {
     return load(x + j) * a + load(y + j) * b + load(z + j) * c;
   }
-  inline __attribute__((always_inline)) Lanes sq_lengths(int j) const {
+  INLINE_MEMBER Lanes sq_lengths(int j) const {
     Lanes u = load(x + j), v = load(y + j), w = load(z + j);
     return u * u + v * v + w * w;
   }
@@ -122,7 +123,7 @@ struct Plane {
   float a, b, c, offset;
   double low, middle, high;
 
-  inline __attribute__((always_inline)) Lanes residuals(const Patch& patch, int j) const {
+  INLINE_MEMBER Lanes residuals(const Patch& patch, int j) const {
     return patch.along(a, b, c, j) - offset;
   }
 };

@@ -13,8 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes
+from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
+
+_LEAST_POINTS = 2**16
+"""Points that are worth a thread's start."""
 
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -105,6 +110,9 @@ class Segments:
     """
 
     def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
+        if labels.device.type == "cpu" and kernels.serve():
+            self._take_rows(labels, most)
+            return
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
         self.rows = _ascending(labels)[num_unlabeled:]
@@ -118,6 +126,14 @@ class Segments:
             self.rows = self.rows[torch.cat(parts)] if parts else self.rows
             sizes = [len(part) for part in parts]
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
+        self.labels = torch.repeat_interleave(self.counts)
+
+    def _take_rows(self, labels: Tensor, most: int | None) -> None:
+        num_regions = int(labels.max()) + 1 if len(labels) else 0
+        self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
+        room, most = self.counts.new_empty(2, len(self.counts)), most or len(labels) + 1
+        (rows,) = kernels.call("segment_rows", labels.long(), most, self.counts, *room)
+        self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
     def split(self, most: int) -> "list[Segments]":
@@ -135,6 +151,11 @@ class Segments:
             region, row = last, end
         return parts
 
+    def shares(self, most: int) -> "list[Segments]":
+        """Return what :meth:`split` does, in about equally large parts for each thread."""
+        share = max(len(self.rows) // allowed_threads() + 1, _LEAST_POINTS)
+        return self.split(min(share, most))
+
     def take(self, values: Tensor) -> Tensor:
         """Return the values of the points that have a region, region by region."""
         return values.index_select(0, self.rows)
@@ -151,8 +172,28 @@ class Segments:
         """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
         return [self.take(column).double() for column in vectors.unbind(dim=1)]
 
+    def along(self, vectors: Tensor, centers: Tensor, axes: Tensor) -> list[Tensor]:
+        """Return coordinates of the points of vectors ``(N, 3)`` about a center ``(M, 3)``.
+
+        Along the ``axes`` ``(M, A, 3)`` of their region, A columns ``(n,)`` of float64.
+        """
+        if self.is_served(vectors) and centers.dtype == torch.float64:
+            tables = self.rows, self.counts, centers, axes
+            return list(kernels.call("segment_coordinates", *vectors.unbind(dim=1), *tables)[0])
+        about, columns = self.take_about(vectors, centers), []
+        for axis in axes.unbind(dim=1):
+            total = torch.zeros_like(about[0])
+            # Products and sums apart: their rounding must not depend on where a block ends.
+            for column, part in zip(about, axis.unbind(dim=1), strict=True):
+                total += column * self.spread(part)
+            columns.append(total)
+        return columns
+
     def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
+        if self.is_served(vectors) and centers.dtype == torch.float64:
+            eye = torch.eye(3, dtype=torch.float64, device=centers.device)
+            return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
         return [self.take(column).double() - self.spread(center) for column, center in pairs]
 
@@ -167,6 +208,59 @@ class Segments:
     def mean(self, values: Tensor) -> Tensor:
         """Return the mean of each region's values."""
         return self.sum(values) / self.counts
+
+    def moments(
+        self, columns: Sequence[Tensor], weights: Tensor, *, centered: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Return the weighted mean ``(M, 3)`` and covariance ``(M, 3, 3)`` of each region.
+
+        The columns are as :meth:`take_columns` returns them; unless ``centered`` the mean is taken
+        for zero.
+        """
+        if self.is_served(weights):
+            numbers = self.counts, centered
+            mean, covariance = kernels.call("segment_moments", *columns, weights, *numbers)
+            return mean, covariance
+        total = self.sum(weights)
+        means = [self.sum(column * weights) / total * centered for column in columns]
+        about = [c - self.spread(mean) for c, mean in zip(columns, means, strict=True)]
+        return torch.stack(means, dim=1), second_moments(about, weights, self.sum, total)
+
+    def reweigh(
+        self,
+        columns: Sequence[Tensor],
+        means: Tensor,
+        axes: Tensor,
+        least: Tensor,
+        factors: tuple[float, float],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Weigh points by Tukey's bisquare of their residuals along an axis of each region.
+
+        A point weighs nothing at a number of standard deviations, the second of the factors, and
+        the first times the median of the residuals is one; at ``least`` ``(M,)``. Returns weights
+        ``(n,)``, medians of the residuals without their signs, and mean squares, ``(M,)``.
+        """
+        if self.is_served(means):
+            tables = self.counts, means, axes, least
+            weights, medians, squares = kernels.call(
+                "reweigh_segments", *columns, *tables, *factors
+            )
+            return weights, medians, squares
+        residuals = torch.zeros_like(columns[0])
+        # Products and sums apart: their rounding must not depend on where a block of memory ends.
+        for column, mean, part in zip(columns, means.T, axes.T, strict=True):
+            residuals += (column - self.spread(mean)) * self.spread(part)
+        medians = self.median(residuals.abs())
+        cut = factors[1] * torch.maximum(factors[0] * medians, least)
+        # A region of one place at the origin has cut 0: its residuals are 0 too.
+        ratio = residuals / self.spread(torch.where(cut > 0, cut, 1.0))
+        weights = (1 - ratio * ratio).clamp(min=0).square()
+        return weights, medians, self.mean(residuals * residuals)
+
+    def is_served(self, values: Tensor) -> bool:
+        """Tell whether kernels work on values of float64 of these regions."""
+        is_plain = values.device.type == "cpu" and values.dtype == torch.float64
+        return is_plain and kernels.serve() and bool(self.counts.all())
 
     def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smallest and the largest value of each region."""

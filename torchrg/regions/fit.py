@@ -1,15 +1,14 @@
 """Planes of regions: robust fits, and what is known of the noise of their points."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_tasks
 from torchrg.config import GrowingConfig
-from torchrg.linalg import coordinate_resolution, eigh3_of_few, second_moments
+from torchrg.linalg import coordinate_resolution, eigh3_of_few
 from torchrg.linalg.moments import Segments
 from torchrg.regions.edges import GrowingCloud, neighborhood_radii
 from torchrg.robust.scale import MAD_FACTOR
@@ -130,37 +129,30 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPla
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
-    parts = [_fit_together(some, points, normals) for some in segments.split(POINTS_AT_ONCE)]
+    shares = segments.shares(POINTS_AT_ONCE)
+    parts = map_tasks(lambda some: _fit_together(some, points, normals), shares, points.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
     """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
-    columns = segments.take_columns(normals)
-    spread_of_normals = _covariances(segments, columns, torch.ones_like(columns[0]))
+    columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
+    weights = torch.ones_like(columns[0])
+    _, spread_of_normals = segments.moments(columns, weights, centered=False)
     shares, directions = eigh3_of_few(spread_of_normals)
     # The direction that the normals of a region share, signs aside, and their angle to it.
     usual = directions[:, :, 2]
     spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
     origin = segments.first(points).double()
     local = segments.take_about(points, origin)
-    weights = torch.ones_like(local[0])
     resolution = coordinate_resolution(segments.first(points)).double()
-    for last in range(_NUM_FITS):
-        total = segments.sum(weights)
-        mean = torch.stack([segments.sum(x * weights) / total for x in local], dim=1)
-        centered = [x - segments.spread(m) for x, m in zip(local, mean.unbind(dim=1), strict=True)]
-        covariance = _covariances(segments, centered, weights)
+    for _ in range(_NUM_FITS):
+        mean, covariance = segments.moments(local, weights)
         variances, axes = eigh3_of_few(covariance)
         normal = with_table_sign(_plane_normals(variances, axes, usual))
-        residuals = coordinates_along(segments, centered, normal)
-        thickness = MAD_FACTOR * segments.median(residuals.abs())
-        if last == _NUM_FITS - 1:
-            break
-        cut = BISQUARE_CUT * torch.maximum(thickness, resolution)
-        # A region of one place at the origin has cut 0: its residuals are 0 too.
-        ratio = residuals / segments.spread(torch.where(cut > 0, cut, 1.0))
-        weights = (1 - ratio * ratio).clamp(min=0).square()
+        factors = (MAD_FACTOR, BISQUARE_CUT)
+        weights, median, squares = segments.reweigh(local, mean, normal, resolution, factors)
+    thickness = MAD_FACTOR * median
     # The angle times the width across the bend, which is at least the middle one, is its height.
     height = _LEAST_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
     # Of an arc without width the plane is its own, and says nothing of its thickness.
@@ -170,7 +162,7 @@ def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> Region
         origin + mean,
         covariance,
         thickness,
-        rms=segments.mean(residuals * residuals).sqrt(),
+        rms=squares.sqrt(),
         num_points=segments.counts,
         curved=(spread > _CURVED_SPREAD_DEG) & ~(crosses & (thickness < height)),
         floor=torch.zeros_like(thickness),
@@ -223,20 +215,6 @@ class RegionFits:
         if self._known is None or not torch.equal(self._known[0], labels):
             self._known = labels, fit_regions(self._cloud, labels, self._config)
         return self._known[1]
-
-
-def coordinates_along(segments: Segments, columns: Sequence[Tensor], axes: Tensor) -> Tensor:
-    """Return coordinates of points, given by columns, along the axis ``(M, 3)`` of their region."""
-    total = torch.zeros_like(columns[0])
-    # Products and sums apart: their rounding must not depend on where a block of memory ends.
-    for column, part in zip(columns, axes.unbind(dim=1), strict=True):
-        total += column * segments.spread(part)
-    return total
-
-
-def _covariances(segments: Segments, columns: list[Tensor], weights: Tensor) -> Tensor:
-    """Return weighted second moments about zero, shape ``(M, 3, 3)``."""
-    return second_moments(columns, weights, segments.sum, segments.sum(weights))
 
 
 def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:

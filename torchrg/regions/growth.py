@@ -259,6 +259,8 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
     ``min_size`` become :data:`torchrg.UNLABELED`.
     """
+    if regions.device.type == "cpu" and kernels.serve():
+        return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
     sizes = np.bincount(old[old >= 0], minlength=len(old))
     kept = np.flatnonzero(sizes >= max(min_size, 1))

@@ -9,13 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._optional import require
+from torchrg._parallel import map_tasks, places_of
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import find_adjacency
-from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, coordinates_along, fit_planes
+from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
 
 _TIE = 1e-9
@@ -116,12 +118,14 @@ def summarize_planes(
     fit = fit_planes(segments, points, normals)
     first, second = _plane_axes(fit)
 
-    measures, start = [], 0
-    for some in segments.split(POINTS_AT_ONCE):
-        rows = slice(start, start + len(some.counts))
-        frame = (fit.center[rows], first[rows], second[rows])
-        measures.append(_measure(points, some, frame, outline=outline))
-        start = rows.stop
+    shares = segments.shares(POINTS_AT_ONCE)
+    sizes = [len(some.counts) for some in shares]
+    frames = zip(*(torch.split(part, sizes) for part in (fit.center, first, second)), strict=True)
+    measures = map_tasks(
+        lambda part: _measure(points, *part, outline=outline),
+        list(zip(shares, frames, strict=True)),
+        points.device,
+    )
     numbers, outlines = zip(*measures, strict=True)
     mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
@@ -159,9 +163,10 @@ def _measure(
 ) -> tuple[list[Tensor], _Outlines]:
     """Return mean, area, rectangle and outlines of regions, by centers and two axes ``(M, 3)``."""
     center, first, second = frame
-    centered = segments.take_about(points, center)
+    eye = torch.eye(3, dtype=first.dtype, device=first.device).expand(len(first), 3, 3)
+    axes = torch.cat([eye, torch.stack([first, second], dim=1)], dim=1)
+    *centered, u, v = segments.along(points, center, axes)
     mean = torch.stack([segments.mean(column) for column in centered], dim=1)
-    u, v = (coordinates_along(segments, centered, axis) for axis in (first, second))
     del centered
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
@@ -330,8 +335,7 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
         closed curve. Communications of the ACM 18(7), 1975.
     """
-    regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
-    angles = [_least_area_angle(places.numpy().astype(np.float64)) for places in regions]
+    angles = [_least_area_angle(places) for places in outer_places(segments, u, v)]
     cosine = u.new_tensor([math.cos(angle) for angle in angles])
     sine = u.new_tensor([math.sin(angle) for angle in angles])
     c, s = segments.spread(cosine), segments.spread(sine)
@@ -370,31 +374,45 @@ def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
     """Return the corners of the convex hull, counter-clockwise; the two ends of a line."""
     from scipy.spatial import ConvexHull, QhullError
 
-    outer = _outer_places(places)
     try:
-        corners: NDArray[np.integer] = outer[ConvexHull(places[outer]).vertices]
+        corners: NDArray[np.integer] = ConvexHull(places).vertices
     except QhullError:
         corners = np.lexsort(places.T)[[0, -1]]
     return corners
 
 
-def _outer_places(places: NDArray[np.float64]) -> NDArray[np.integer]:
-    """Return the points ``(n, 2)`` by row that may be corners of their convex hull.
+def outer_places(segments: Segments, u: Tensor, v: Tensor) -> list[NDArray[np.float64]]:
+    """Return the points ``(n, 2)`` of each region that may be corners of its convex hull.
 
     Not those inside the octagon of the farthest points in eight directions: S. Akl, G. Toussaint. A
     fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
-    along = _COMPASS @ places.T
+    if not segments.is_served(u):
+        regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
+        return [_outside_of_octagon(places.numpy().astype(np.float64)) for places in regions]
+    (outer,) = kernels.call("outer_places", u, v, segments.counts, _ROUNDING)
+    chosen = places_of(outer)
+    ends = torch.searchsorted(chosen, segments.counts.cumsum(0)).tolist()
+    places = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
+    return [places[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+
+
+def _outside_of_octagon(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Do as :func:`outer_places` for the points of one region."""
+    # BLAS would start threads of its own.
+    along = _COMPASS[:, :1] * places[:, 0] + _COMPASS[:, 1:] * places[:, 1]
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
     octagon = places[ends[ends != np.roll(ends, 1)]]
     if len(octagon) < 3:
-        return np.arange(len(places))
+        return places
     edges = np.roll(octagon, -1, axis=0) - octagon
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
     offsets = (inward * octagon).sum(axis=1)
     rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(places).max()
-    inside = (inward @ places.T > (offsets + rounding)[:, None]).all(axis=0)
-    return np.flatnonzero(~inside)
+    heights = inward[:, :1] * places[:, 0] + inward[:, 1:] * places[:, 1]
+    inside = (heights > (offsets + rounding)[:, None]).all(axis=0)
+    outside: NDArray[np.float64] = places[~inside]
+    return outside
 
 
 class _Cells(NamedTuple):

@@ -1,0 +1,609 @@
+// Planes at the pixels of a depth image: torchrg/depth/windows.py, normals.py and growth.py.
+//
+// Images are of float64 and by rows; a kernel that takes `from` and `to` does these rows alone.
+#include "plain.h"
+
+namespace {
+
+typedef const double* Doubles;
+
+constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
+constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns that are fitted together
+constexpr int LONG = 9, SHORT = 3;  // sides of narrow windows in pixels
+constexpr double FLAT = 1.35, OWN_REACH = 3.5, SAME_NOISE = 2, LEAST_QUARTERS = 0.7;
+constexpr double BEND = 0.005, MOST_BEND = 0.03, STEEPEST = 4;
+constexpr double NONE = __builtin_inf();
+
+INLINE double square(double value) { return value * value; }
+
+INLINE bool are_rows_of(int64_t from, int64_t to, int64_t height) {
+  return from >= 0 && from <= to && to <= height && from % 2 == 0;
+}
+
+// windows._planes_of_sums: slopes, origin, deviation and mean of window j.
+template <int N>
+INLINE void solve(const double (&s)[MOMENTS][N], int j, double least_count, double least_spread,
+                  double (&to)[5][N]) {
+  const double count = s[0][j], share = 1 / larger(count, 1.0);
+  const double u = s[1][j] * share, v = s[2][j] * share, w = s[3][j] * share;
+  const double uu = s[4][j] * share - u * u, uv = s[5][j] * share - u * v,
+               vv = s[6][j] * share - v * v, uw = s[7][j] * share - u * w,
+               vw = s[8][j] * share - v * w, ww = s[9][j] * share - w * w;
+  const double determinant = uu * vv - uv * uv;
+  const bool has_plane = (count >= least_count) & (determinant > least_spread);
+  const double spread = has_plane ? determinant : 1;
+  const double u_slope = (vv * uw - uv * vw) / spread, v_slope = (uu * vw - uv * uw) / spread;
+  const double rest = ww - u_slope * uw - v_slope * vw;
+  const double variance = (rest < 0 ? 0 : rest) * count / larger(count - 3, 1.0);
+  to[0][j] = u_slope, to[1][j] = v_slope, to[2][j] = w - u_slope * u - v_slope * v;
+  to[3][j] = has_plane & (variance < NONE) ? square_root(variance) : NONE, to[4][j] = w;
+}
+
+// What a pixel adds to the sums of its windows, in place j.
+template <int N>
+INLINE void write_moments(uint8_t seen, double u, double v, double value, double (*to)[N], int j) {
+  const double one = seen, mu = one * u, mv = one * v, w = one > 0 ? value : 0;
+  to[0][j] = one, to[1][j] = mu, to[2][j] = mv, to[3][j] = w, to[4][j] = mu * u;
+  to[5][j] = mu * v, to[6][j] = mv * v, to[7][j] = w * u, to[8][j] = w * v, to[9][j] = w * w;
+}
+
+// Fits planes (5, h, w) to the windows around cells, of which `read` gives the sums of a row's
+// columns, and adds cells up to those of twice the width.
+template <class Read>
+int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double least_count,
+                double least_spread, double* planes, double* coarse, Read read) {
+  alignas(32) double ring[SIDE][MOMENTS][WIDE], down[WIDE], sums[MOMENTS][TILE], solved[5][TILE];
+  const int64_t coarse_w = (w + 1) / 2, coarse_size = (h + 1) / 2 * coarse_w;
+  for (int64_t left = 0; left < w; left += TILE) {
+    const int width = int(smaller(int64_t(TILE), w - left));
+    for (int64_t row = from - REACH; row < to + REACH; row++) {
+      auto& newest = ring[(row + SIDE) % SIDE];
+      __builtin_memset(newest, 0, sizeof newest);
+      const int64_t first = larger(left - REACH, int64_t(0)), last = smaller(left + width + REACH, w);
+      if (row >= 0 && row < h) read(row, first, int(last - first), newest, int(first - left) + REACH);
+      const int64_t i = row - REACH;
+      if (i < from) continue;
+      const auto &middle = ring[(i + 5) % SIDE], &above = ring[(i + 4) % SIDE],
+                 &below = ring[(i + 1) % SIDE], &top = ring[(i + 3) % SIDE],
+                 &bottom = ring[(i + 2) % SIDE];
+      for (int m = 0; m < MOMENTS; m++) {
+        for (int j = 0; j < WIDE; j++)
+          down[j] = middle[m][j] + above[m][j] + below[m][j] + top[m][j] + bottom[m][j];
+        for (int j = 0; j < TILE; j++)
+          sums[m][j] = down[j + 2] + down[j + 1] + down[j + 3] + down[j] + down[j + 4];
+        for (int j = 0; i % 2 == 0 && j < width; j += 2) {
+          const double *one = middle[m] + j + REACH, *other = below[m] + j + REACH;
+          coarse[m * coarse_size + i / 2 * coarse_w + (left + j) / 2] =
+              (one[0] + other[0]) + (left + j + 1 < w ? one[1] + other[1] : 0);
+        }
+      }
+      for (int j = 0; j < TILE; j++) solve(sums, j, least_count, least_spread, solved);
+      for (int part = 0; part < 5; part++)
+        __builtin_memcpy(planes + (part * h + i) * w + left, solved[part], width * sizeof(double));
+    }
+  }
+  return DONE;
+}
+
+// windows.WindowNoise
+struct Noise {
+  double factor, constant, growth, rounding;
+  INLINE_MEMBER double at(double w) const {
+    const double least = rounding * w;
+    return larger(factor * larger(growth + constant * (w * w), least), least);
+  }
+};
+
+// What is known of a window: see windows.WindowPlanes.
+enum Column { U_SLOPE, V_SLOPE, ORIGIN, DEVIATION, MEAN, NOISE, TOLERANCE, STRONGEST, RELATIVE };
+
+struct Window {
+  const double* numbers;  // one in each column, `step` apart
+  int64_t step;
+  double rows, columns, row, column;  // sides, and the place of the middle
+
+  INLINE_MEMBER double operator[](Column column) const { return numbers[column * step]; }
+  INLINE_MEMBER bool holds(int64_t r, int64_t c) const {
+    return size_of(double(r) - row) <= rows / 2 && size_of(double(c) - column) <= columns / 2;
+  }
+};
+
+// The windows of an image: squares of all sizes, then n lying and n upright ones around pixels.
+struct Windows {
+  int64_t width, first[NUM_SIZES + 1], columns[NUM_SIZES], n;
+  const double *squares, *narrow;
+  const int64_t* pixels;
+
+  Windows(int64_t h, int64_t w, int64_t n, Doubles squares, Doubles narrow, Longs pixels)
+      : width(w), n(n), squares(squares), narrow(narrow), pixels(pixels) {
+    first[0] = 0;
+    for (int k = 0; k < NUM_SIZES; k++, h = (h + 1) / 2, w = (w + 1) / 2)
+      first[k + 1] = first[k] + h * w, columns[k] = w;
+  }
+  INLINE_MEMBER Window operator[](int64_t k) const {
+    int size = 0;
+    while (size < NUM_SIZES && k >= first[size + 1]) size++;
+    const int64_t cell = k - first[size];
+    if (size == NUM_SIZES) {
+      const int64_t pixel = pixels[cell % n];
+      const double tall = cell < n ? SHORT : LONG, wide = cell < n ? LONG : SHORT;
+      return {narrow + cell, 2 * n, tall, wide, double(pixel / width), double(pixel % width)};
+    }
+    const int64_t cells = first[size + 1] - first[size], wide = int64_t(1) << size;
+    const double side = double(SIDE * wide), middle = double(wide - 1) / 2;
+    return {squares + COLUMNS * first[size] + cell, cells, side, side,
+            double(cell / columns[size] * wide) + middle,
+            double(cell % columns[size] * wide) + middle};
+  }
+  INLINE_MEMBER bool has(int64_t k) const { return k >= 0 && k < first[NUM_SIZES] + 2 * n; }
+};
+
+INLINE double sq_slope_noise(const Window& window, double tolerance) {
+  const double rows = window.rows, columns = window.columns;
+  return 6 * square(tolerance) * (1 / (rows * rows) + 1 / (columns * columns)) / (rows * columns);
+}
+
+}  // namespace
+
+// The windows around pixels, as windows.fit_windows; `coarse` (10, p, q) gets cells of 2 pixels.
+KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, Doubles values, Flagged seen,
+                         Doubles u, Doubles v, double* planes, double* coarse, double least_count,
+                         double least_spread, int64_t from, int64_t to) {
+  if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
+    return TOO_WIDE;
+  const auto* ones = reinterpret_cast<const uint8_t*>(seen);
+  return fit_all(h, w, from, to, least_count, least_spread, planes, coarse,
+                 [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
+                   for (int j = 0; j < count; j++) {
+                     const int64_t pixel = row * w + first + j;
+                     write_moments(ones[pixel], u[first + j], v[row], values[pixel], sums, at + j);
+                   }
+                 });
+}
+
+// The same around larger cells.
+KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, Doubles cells,
+                        double* planes, double* coarse, double least_count, double least_spread,
+                        int64_t from, int64_t to) {
+  if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
+    return TOO_WIDE;
+  return fit_all(h, w, from, to, least_count, least_spread, planes, coarse,
+                 [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
+                   for (int k = 0; k < MOMENTS; k++)
+                     __builtin_memcpy(sums[k] + at, cells + (k * h + row) * w + first,
+                                      count * sizeof(double));
+                 });
+}
+
+// normals.rate_windows: what windows may deviate by, and whether they and their quarters do.
+KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, Doubles quarters,
+                    double factor, double constant, double growth, double rounding,
+                    double quarter_factor, double fx, double fy, double half, double jitter,
+                    int64_t size, int64_t from, int64_t to) {
+  if (!are_rows_of(from, to, h)) return TOO_WIDE;
+  const Noise noise = {factor, constant, growth, rounding};
+  const Noise finer = {quarter_factor, constant, growth, rounding};
+  double* columns[COLUMNS];
+  for (int column = 0; column < COLUMNS; column++) columns[column] = table + column * h * w;
+  for (int64_t k = from * w; k < to * w; k++) {
+    const double a = columns[U_SLOPE][k], b = columns[V_SLOPE][k], c = columns[ORIGIN][k],
+                 mean = columns[MEAN][k], usual = noise.at(mean);
+    const double by_noise = square_root(square(usual) + square(jitter) * (a * a + b * b));
+    const double nearness = square(a * fx) + square(b * fy) + c * c;
+    const double straight = nearness > square(STEEPEST * mean) ? 0 : nearness;
+    const double bend = mean > 0 ? half * straight / mean : 0;
+    columns[NOISE][k] = by_noise, columns[TOLERANCE][k] = larger(by_noise, BEND * bend);
+    columns[STRONGEST][k] = MOST_BEND * bend;
+  }
+  const double factor_of_quarters = 1 + SAME_NOISE / double(SIDE * size);
+  for (int64_t i = from; i < to; i++)
+    for (int64_t j = 0; j < w; j++) {
+      const int64_t own = i * w + j;
+      const double tolerance = columns[TOLERANCE][own], deviation = columns[DEVIATION][own];
+      bool is_flat = deviation / tolerance <= FLAT;
+      if (p * q > 0 && is_flat) {
+        double squares = 0, count = 0;
+        for (int64_t k = 2 * i - 2; k <= 2 * i + 3; k += SIDE)
+          for (int64_t l = 2 * j - 2; l <= 2 * j + 3; l += SIDE)
+            if (k >= 0 && k < p && l >= 0 && l < q && quarters[k * q + l] < NONE)
+              squares += square(quarters[k * q + l]), count += 1;
+        double usual = square_root(count > 0 ? squares / count : NONE);
+        usual = usual * (columns[NOISE][own] / finer.at(columns[MEAN][own]));
+        is_flat = deviation <= factor_of_quarters * larger(usual, LEAST_QUARTERS * tolerance);
+      }
+      columns[RELATIVE][own] = is_flat ? deviation / tolerance : NONE;
+    }
+  return DONE;
+}
+
+// normals.offer_windows: the window that pixels take, of one size, from number `first` on.
+KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values, Flagged seen,
+                     Doubles u, Doubles v, Doubles table, int64_t* windows, bool* flat, bool* edge,
+                     int64_t size, int64_t first, int64_t from, int64_t to) {
+  if (size < 1 || (p - 1) * size >= h || p * size < h || q * size < w || !are_rows_of(from, to, p))
+    return TOO_WIDE;
+  const int64_t step = p * q;
+  const double *relative = table + RELATIVE * step, *tolerance = table + TOLERANCE * step;
+  for (int64_t i = from; i < to; i++)
+    for (int64_t j = 0; j < q; j++) {
+      const int64_t own = i * q + j;
+      int64_t flattest = -1;  // unknown; none is `own` if not flat
+      for (int64_t r = i * size; r < smaller((i + 1) * size, h); r++)
+        for (int64_t c = j * size; c < smaller((j + 1) * size, w); c++) {
+          const int64_t pixel = r * w + c;
+          if (flat[pixel] || !seen[pixel]) continue;
+          const auto is_near = [&](int64_t k, double reach) {
+            const double on_plane = table[U_SLOPE * step + k] * u[c] + table[V_SLOPE * step + k] * v[r];
+            return size_of(values[pixel] - (on_plane + table[ORIGIN * step + k])) <= reach;
+          };
+          int64_t taken = -1;
+          if (relative[own] < NONE && is_near(own, OWN_REACH * tolerance[own])) taken = own;
+          if (taken < 0 && size == 1 && table[DEVIATION * step + own] <= table[STRONGEST * step + own] &&
+              is_near(own, NONE))
+            taken = own;
+          if (taken < 0) {
+            if (flattest < 0) {
+              flattest = own;
+              double least = NONE;
+              for (int64_t k = larger(i - REACH, int64_t(0)); k <= smaller(i + REACH, p - 1); k++)
+                for (int64_t l = larger(j - REACH, int64_t(0)); l <= smaller(j + REACH, q - 1); l++)
+                  if (relative[k * q + l] < least) least = relative[k * q + l], flattest = k * q + l;
+            }
+            const double reach =
+                larger(OWN_REACH * table[NOISE * step + flattest], tolerance[flattest]);
+            if (relative[flattest] < NONE && is_near(flattest, reach))
+              taken = flattest, edge[pixel] = true;
+          }
+          if (taken >= 0) windows[pixel] = first + taken, flat[pixel] = true;
+        }
+    }
+  return DONE;
+}
+
+// windows.fit_narrow_windows, lying (0) and upright (1), of pixels that `numbers` numbers.
+KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u, Doubles v,
+                          Longs numbers, Longs pixels, double least_count, double least_spread,
+                          double* planes, int64_t from, int64_t to) {
+  if (!are_rows_of(from, to, n)) return TOO_WIDE;
+  for (int64_t number = from; number < to; number++) {
+    if (pixels[number] < 0 || pixels[number] >= h * w) return NO_SUCH_ROW;
+    const int64_t row = pixels[number] / w, column = pixels[number] % w;
+    double sums[MOMENTS][2] = {}, terms[MOMENTS][1], solved[5][2];
+    for (int shape = 0; shape < 2; shape++) {
+      const int64_t tall = (shape ? LONG : SHORT) / 2, wide = (shape ? SHORT : LONG) / 2;
+      for (int64_t r = larger(row - tall, int64_t(0)); r <= smaller(row + tall, h - 1); r++)
+        for (int64_t c = larger(column - wide, int64_t(0)); c <= smaller(column + wide, w - 1); c++) {
+          if (numbers[r * w + c] < 0) continue;
+          write_moments(1, u[c], v[r], values[r * w + c], terms, 0);
+          for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m][0];
+        }
+      solve(sums, shape, least_count, least_spread, solved);
+      for (int part = 0; part < 5; part++)
+        planes[(2 * part + shape) * n + number] = solved[part][shape];
+    }
+  }
+  return DONE;
+}
+
+// normals.choose_narrow: of pixels the flatter narrow window around them, else the flattest that
+// holds them, or -1, and whether it is the latter.
+KERNEL choose_narrow(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u, Doubles v,
+                     Longs numbers, Longs pixels, Doubles table, int64_t* chosen, bool* beside,
+                     int64_t from, int64_t to) {
+  if (!are_rows_of(from, to, n)) return TOO_WIDE;
+  for (int64_t number = from; number < to; number++) {
+    const int64_t pixel = pixels[number];
+    if (pixel < 0 || pixel >= h * w) return NO_SUCH_ROW;
+    const int64_t row = pixel / w, column = pixel % w;
+    const auto at = [&](Column part, int64_t k) { return table[part * 2 * n + k]; };
+    const auto is_near = [&](int64_t k) {
+      const double on_plane = at(U_SLOPE, k) * u[column] + at(V_SLOPE, k) * v[row];
+      return size_of(values[pixel] - (on_plane + at(ORIGIN, k))) <=
+             larger(OWN_REACH * at(NOISE, k), at(TOLERANCE, k));
+    };
+    const int64_t flatter = at(RELATIVE, n + number) < at(RELATIVE, number) ? n + number : number;
+    if (at(RELATIVE, flatter) < NONE && is_near(flatter)) {
+      chosen[number] = flatter, beside[number] = false;
+      continue;
+    }
+    double least = NONE;
+    int64_t flattest = 2 * n;
+    for (int64_t shape = 0; shape < 2; shape++) {
+      const int64_t tall = (shape ? LONG : SHORT) / 2, wide = (shape ? SHORT : LONG) / 2;
+      for (int64_t r = larger(row - tall, int64_t(0)); r <= smaller(row + tall, h - 1); r++)
+        for (int64_t c = larger(column - wide, int64_t(0)); c <= smaller(column + wide, w - 1); c++) {
+          if (numbers[r * w + c] < 0) continue;
+          if (numbers[r * w + c] >= n) return NO_SUCH_ROW;
+          const int64_t k = shape * n + numbers[r * w + c];
+          if (at(RELATIVE, k) < least && is_near(k)) least = at(RELATIVE, k), flattest = k;
+        }
+    }
+    beside[number] = flattest < 2 * n, chosen[number] = beside[number] ? flattest : -1;
+  }
+  return DONE;
+}
+
+// normals.describe_pixels: normals, curvature, tolerance, noise and validity by pixels' windows.
+KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Doubles values,
+                       Flagged seen, Doubles x, Doubles y, Longs windows, Flagged flat,
+                       Doubles squares, Doubles narrow, Longs pixels, double* normals,
+                       double* curvature, double* tolerance, double* noise, bool* valid, double fx,
+                       double fy, double factor, double constant, double growth, double rounding,
+                       int64_t from, int64_t to) {
+  const Windows all(h, w, n, squares, narrow, pixels);
+  if (N != COLUMNS * all.first[NUM_SIZES] || M != COLUMNS * 2 * n || !are_rows_of(from, to, h))
+    return TOO_WIDE;
+  const Noise usual = {factor, constant, growth, rounding};
+  for (int64_t r = from; r < to; r++)
+    for (int64_t c = 0; c < w; c++) {
+      const int64_t pixel = r * w + c;
+      noise[pixel] = usual.at(values[pixel]);
+      if (!all.has(windows[pixel])) return NO_SUCH_ROW;
+      const Window window = all[windows[pixel]];
+      const double deviation = window[DEVIATION];
+      valid[pixel] = flat[pixel] || (seen[pixel] && deviation < NONE);
+      tolerance[pixel] = curvature[pixel] = 0;
+      double* normal = normals + 3 * pixel;
+      normal[0] = normal[1] = normal[2] = 0;
+      if (!valid[pixel]) continue;
+      tolerance[pixel] = deviation > FLAT * window[TOLERANCE]
+                             ? deviation
+                             : larger(window[TOLERANCE], noise[pixel]);
+      const double away[3] = {window[U_SLOPE] * fx, window[V_SLOPE] * fy, window[ORIGIN]};
+      double length = square_root(square(away[0]) + square(away[1]) + square(away[2]));
+      length = length > 0 ? length : 1;
+      for (int axis = 0; axis < 3; axis++) normal[axis] = -away[axis] / length;
+      const double z = 1 / (values[pixel] > 0 ? values[pixel] : 1);
+      const double ray = x[c] * x[c] + y[r] * y[r] + 1, across = square(z * deviation / length);
+      const double sides[2] = {window.columns, window.rows}, places[2] = {x[c], y[r]};
+      const double slopes[2] = {window[U_SLOPE], window[V_SLOPE]}, focal[2] = {fx, fy};
+      double along = 0;
+      for (int axis = 0; axis < 2; axis++) {
+        const double step = slopes[axis] * z, f = focal[axis];
+        along += (sides[axis] * sides[axis] - 1) / 12 *
+                 (step * step * ray - 2 / f * step * places[axis] + 1 / (f * f));
+      }
+      const double total = across + along * z * z;
+      curvature[pixel] = smaller(across / (total > 0 ? total : 1), 1.0 / 3);
+    }
+  return DONE;
+}
+
+// growth.join_pixels: which pixels are on one surface with the next, to the right and below.
+KERNEL join_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Longs windows,
+                   Flagged flat, Doubles normals, Doubles tolerance, Doubles squares,
+                   Doubles narrow, Longs pixels, Doubles u, Doubles v, bool* right, bool* down,
+                   double max_step, double max_sq_chord, double wider_sq_chord, int64_t from,
+                   int64_t to) {
+  const Windows all(h, w, n, squares, narrow, pixels);
+  if (N != COLUMNS * all.first[NUM_SIZES] || M != COLUMNS * 2 * n || !are_rows_of(from, to, h))
+    return TOO_WIDE;
+  const auto are_joined = [&](int64_t r, int64_t c, int64_t here, int64_t there, bool is_down) {
+    if (windows[here] == windows[there]) return true;
+    const Window own = all[windows[here]], other = all[windows[there]];
+    const double u_slope = own[U_SLOPE] - other[U_SLOPE], v_slope = own[V_SLOPE] - other[V_SLOPE];
+    const double step = u_slope * u[c] + v_slope * v[r] + own[ORIGIN] - other[ORIGIN];
+    const double limit = max_step * larger(tolerance[here], tolerance[there]);
+    if (!(size_of(step) <= limit && size_of(step + (is_down ? v_slope : u_slope)) <= limit))
+      return false;
+    const double *a = normals + 3 * here, *b = normals + 3 * there;
+    const double sign = __builtin_copysign(1.0, a[0] * b[0] + a[1] * b[1] + a[2] * b[2]);
+    const double turned =
+        square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
+    if (turned <= max_sq_chord) return true;
+    const bool alike =
+        u_slope * u_slope + v_slope * v_slope <=
+        sq_slope_noise(own, tolerance[here]) + sq_slope_noise(other, tolerance[there]);
+    return (alike || turned <= wider_sq_chord) && own.holds(r + is_down, c + !is_down) &&
+           other.holds(r, c);
+  };
+  for (int64_t r = from; r < to; r++)
+    for (int64_t c = 0; c < w; c++) {
+      const int64_t here = r * w + c;
+      const bool has_right = flat[here] && c + 1 < w && flat[here + 1],
+                 has_below = flat[here] && r + 1 < h && flat[here + w];
+      if ((has_right || has_below) && !all.has(windows[here])) return NO_SUCH_ROW;
+      if ((has_right && !all.has(windows[here + 1])) || (has_below && !all.has(windows[here + w])))
+        return NO_SUCH_ROW;
+      right[here] = has_right && are_joined(r, c, here, here + 1, false);
+      down[here] = has_below && are_joined(r, c, here, here + w, true);
+    }
+  return DONE;
+}
+
+// growth.connect_pixels: the first pixel of each one's connected component.
+KERNEL connect_pixels(int64_t h, int64_t w, Flagged flat, Flagged right, Flagged down,
+                      int64_t* roots) {
+  const auto root_of = [&](int64_t pixel) {
+    while (roots[pixel] != pixel) pixel = roots[pixel] = roots[roots[pixel]];
+    return pixel;
+  };
+  for (int64_t r = 0; r < h; r++)
+    for (int64_t c = 0; c < w; c++) {
+      const int64_t pixel = r * w + c;
+      roots[pixel] = flat[pixel] ? pixel : -1;
+      if (!flat[pixel]) continue;
+      if (c > 0 && flat[pixel - 1] && right[pixel - 1]) roots[pixel] = root_of(pixel - 1);
+      if (r > 0 && flat[pixel - w] && down[pixel - w]) {
+        const int64_t one = root_of(pixel), other = root_of(pixel - w);
+        roots[larger(one, other)] = smaller(one, other);
+      }
+    }
+  for (int64_t pixel = 0; pixel < h * w; pixel++)
+    if (flat[pixel]) roots[pixel] = roots[roots[pixel]];
+  return DONE;
+}
+
+namespace {
+
+// The eight pixels around one, those outside of the image replaced by the nearest inside.
+struct Around {
+  int64_t h, w;
+
+  template <class Visit>
+  INLINE_MEMBER void visit(int64_t pixel, const Visit& visit) const {
+    const int64_t row = pixel / w, column = pixel % w;
+    for (int64_t r = row - 1; r <= row + 1; r++)
+      for (int64_t c = column - 1; c <= column + 1; c++)
+        if (r != row || c != column)
+          visit(smaller(larger(r, int64_t(0)), h - 1) * w + smaller(larger(c, int64_t(0)), w - 1));
+  }
+};
+
+// Pixels whose label may change in a turn, each once.
+struct Front {
+  const Around& around;
+  int64_t* rows;   // (h * w)
+  int64_t* marks;  // (h * w), the turn in which a pixel came in last
+  int64_t count, turn;
+
+  INLINE_MEMBER void add(int64_t pixel) {
+    if (marks[pixel] == turn) return;
+    marks[pixel] = turn, rows[count++] = pixel;
+  }
+};
+
+INLINE bool are_labels(Longs labels, int64_t n, int64_t num) {
+  bool inside = true;
+  for (int64_t i = 0; i < n; i++) inside &= (labels[i] >= -1) & (labels[i] < num);
+  return inside;
+}
+
+}  // namespace
+
+// repair.absorb_points beside pixels; points are (3, h w).
+KERNEL absorb_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, Flagged seen,
+                     int64_t* labels, Doubles normals, Doubles centers, Doubles reach,
+                     int64_t* rows, int64_t* marks, int64_t* chosen) {
+  const int64_t n = h * w;
+  if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
+  const Around around = {h, w};
+  Front front = {around, rows, marks, 0, 0};
+  for (int64_t i = 0; i < n; i++) {
+    marks[i] = -1;
+    if (labels[i] < 0 && seen[i]) front.add(i);
+  }
+  while (front.count > 0) {
+    int64_t joined = 0;
+    for (int64_t f = 0; f < front.count; f++) {
+      const int64_t pixel = rows[f];
+      double least = NONE;
+      int64_t best = -1;
+      around.visit(pixel, [&](int64_t other) {
+        const int64_t m = labels[other];
+        if (m < 0 || m == best) return;
+        double away = 0;
+        for (int axis = 0; axis < 3; axis++)
+          away += (points[axis * n + pixel] - centers[3 * m + axis]) * normals[3 * m + axis];
+        away = size_of(away);
+        if (away <= reach[m] && (away < least || (away == least && m < best)))
+          least = away, best = m;
+      });
+      if (best >= 0) rows[joined] = pixel, chosen[joined++] = best;
+    }
+    for (int64_t f = 0; f < joined; f++) labels[rows[f]] = chosen[f], chosen[f] = rows[f];
+    front.count = 0, front.turn++;
+    for (int64_t f = 0; f < joined; f++)
+      around.visit(chosen[f], [&](int64_t other) {
+        if (labels[other] < 0 && seen[other]) front.add(other);
+      });
+  }
+  return DONE;
+}
+
+// growth.move_to_creases; planes (M, 3) are over rays, points (3, h w).
+KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, int64_t* labels,
+                       Doubles planes, Doubles middles, Doubles reach, int64_t num_turns,
+                       double straight, int64_t* rows, int64_t* marks, int64_t* chosen) {
+  const int64_t n = h * w;
+  if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
+  const double *x = points, *y = points + n, *z = points + 2 * n;
+  const Around around = {h, w};
+  Front front = {around, rows, marks, 0, 0};
+  for (int64_t i = 0; i < n; i++) {
+    marks[i] = -1;
+    bool is_border = false;
+    if (labels[i] >= 0)
+      around.visit(i, [&](int64_t other) {
+        is_border |= labels[other] >= 0 && labels[other] != labels[i];
+      });
+    if (is_border) front.add(i);
+  }
+  for (int64_t turn = 0; turn < num_turns && front.count > 0; turn++) {
+    int64_t moved = 0;
+    for (int64_t f = 0; f < front.count; f++) {
+      const int64_t pixel = rows[f], own = labels[pixel];
+      double least = NONE;
+      int64_t best = -1;
+      around.visit(pixel, [&](int64_t q) {
+        const int64_t other = labels[q];
+        if (other < 0 || other == own) return;
+        const double *one = planes + 3 * own, *two = planes + 3 * other;
+        const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
+        const auto over = [&](double u, double v) { return a * u + b * v + c; };
+        const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
+        const double mine = over(middles[2 * own], middles[2 * own + 1]),
+                     theirs = over(middles[2 * other], middles[2 * other + 1]);
+        const double slope = square_root(a * a + b * b);
+        const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
+        const double away =
+            size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
+        const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
+                          here * mine < 0 && mine * theirs < 0 && away <= reach[other] &&
+                          size_of(mine) > reach[other] && size_of(theirs) > reach[own];
+        if (goes && (away < least || (away == least && other < best))) least = away, best = other;
+      });
+      if (best >= 0) rows[moved] = pixel, chosen[moved++] = best;
+    }
+    for (int64_t f = 0; f < moved; f++) labels[rows[f]] = chosen[f], chosen[f] = rows[f];
+    front.count = 0, front.turn++;
+    for (int64_t f = 0; f < moved; f++) {
+      front.add(chosen[f]);
+      around.visit(chosen[f], [&](int64_t other) {
+        if (labels[other] >= 0) front.add(other);
+      });
+    }
+  }
+  return DONE;
+}
+
+// faces._count_lines for pairs of regions; lines are points (3, n, L), and what is seen of them.
+KERNEL count_lines(int64_t n, int64_t L, int64_t M, int64_t p, Doubles points, Flagged seen,
+                   Longs labels, Doubles normals, Doubles centers, Doubles reach, Longs pairs,
+                   double least_nearer, int64_t* counts, int64_t* firsts, int64_t* lasts) {
+  if (!are_labels(labels, n * L, M)) return NO_SUCH_ROW;
+  for (int64_t m = 0; m < M; m++) firsts[m] = n, lasts[m] = -1;
+  for (int64_t i = 0; i < n * L; i++)
+    if (labels[i] >= 0)
+      firsts[labels[i]] = smaller(firsts[labels[i]], i / L), lasts[labels[i]] = i / L;
+  for (int64_t q = 0; q < p; q++) {
+    const int64_t first = pairs[2 * q], second = pairs[2 * q + 1];
+    if (first < 0 || first >= M || second < 0 || second >= M) return NO_SUCH_ROW;
+    counts[q] = 0;
+    for (int64_t line = larger(firsts[first], firsts[second]);
+         line <= smaller(lasts[first], lasts[second]); line++) {
+      int64_t previous = -1, passed = 0;
+      bool leads = false;
+      for (int64_t i = line * L; i < (line + 1) * L && !leads; i++) {
+        const int64_t label = labels[i];
+        const bool is_end = label == first || label == second;
+        // Before the first of either nothing counts.
+        if (!is_end && (previous < 0 || !seen[i])) continue;
+        double height = 0;
+        for (int axis = 0; axis < 3 && seen[i]; axis++)
+          height += (points[axis * n * L + i] - centers[3 * first + axis]) *
+                    normals[3 * first + axis];
+        if (is_end || (seen[i] && height < -reach[first])) {
+          const int64_t gap = i - previous - 1;
+          leads = is_end && previous >= 0 && gap > 0 && labels[previous] != label &&
+                  (labels[previous] == first || labels[previous] == second) &&
+                  double(passed) >= least_nearer * double(gap);
+          previous = i, passed = 0;
+        }
+        passed += seen[i] && height > reach[first] && !is_end;
+      }
+      counts[q] += leads;
+    }
+  }
+  return DONE;
+}
