@@ -76,7 +76,6 @@ class NormalsConfig:
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
         _require(self, "irls_decay", "> 1", self.irls_decay > 1)
 
-
     def at_sampling(self, sampling: Sampling) -> "NormalsConfig":
         """Return the settings with a choice; see :meth:`PipelineConfig.at_sampling`."""
         if self.noise_scope != "auto":
@@ -132,7 +131,7 @@ class GrowingConfig:
     min_size: int | Auto = "auto"
     """Regions of fewer points are not labelled. With absorb, points at the borders of a region
     count as well. By default the points on a square whose side is a 27th of the height of the
-    cloud, 10 cm in a room, but 20 to 50."""
+    cloud, 10 cm in a room, but 20 to 50; more where points are drawn from a mesh."""
     cut_bridges: bool = True
     """Whether a region of several faces that only a few points join is split, as faces 12 degrees
     apart and floors with furniture on them are. It takes consensus about a twentieth more time."""
@@ -140,7 +139,7 @@ class GrowingConfig:
     """After growth, regions that touch become one when they lie within this root mean square
     distance of one plane, in the unit of the cloud. It is for points drawn from a mesh, which lie
     exactly on its facets, of which a flat face has several, and for reconstructions that bend flat
-    faces. By default 1/225 of the height of the cloud, 12 mm in a room, where deviations grow with
+    faces. By default 1/240 of the height of the cloud, 11 mm in a room, where deviations grow with
     scale, and none where noise is white. None: they stay apart."""
     max_plane_residual: float | None = None
     """After growth, a point loses its label when it is farther from the plane of its region than
@@ -177,7 +176,7 @@ class GrowingConfig:
             _require(self, name, ">= 0 or none", value is None or value >= 0)
         facets = self.facet_tolerance
         is_open = facets is None or facets == "auto"
-        _require(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets) > 0)
+        _require(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets or 0) > 0)
         least = self.min_size
         _require(self, "min_size", ">= 1 or auto", least == "auto" or int(least) >= 1)
         residual = self.max_plane_residual
@@ -186,18 +185,20 @@ class GrowingConfig:
         _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
-
     def at_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Return the settings with numbers; see :meth:`PipelineConfig.at_sampling`."""
         least, tolerance = self.min_size, self.facet_tolerance
         if least == "auto":
-            side = _SIDE_OF_REGION * sampling.height
-            low, high = _LEAST_SIZES
-            least = min(max(round(sampling.density * side**2), low), high)
+            side, (low, high) = _SIDE_OF_REGION, _LEAST_SIZES
+            drawn = _facets(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
+            side += drawn * (_SIDE_OF_FACETS - side)
+            high += round(drawn * (_LEAST_OF_FACETS - high))
+            size = round(sampling.density * (side * sampling.height) ** 2)
+            least = min(max(size, low), high)
         if tolerance == "auto":
             reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
             most = min(_FACETS_BY_HEIGHT * sampling.height, _FACETS_BY_REACH * reach)
-            tolerance = _facets(sampling) * most or None
+            tolerance = float(f"{_facets(sampling) * most:.3g}") or None
         return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance)
 
 
@@ -205,19 +206,28 @@ _WHITENESS = 0.4, 0.6
 """Whiteness up to which faces are in facets or bent, and from which on noise is white."""
 _VARIATION = 0.34
 """Variation of spacing below which points are vertices of a mesh or of a grid."""
-_FACETS_BY_HEIGHT, _FACETS_BY_REACH = 1 / 225, 0.3
+_FACETS_BY_HEIGHT, _FACETS_BY_REACH = 1 / 240, 0.3
 """Tolerance of facets by the height of the cloud, and at most by the reach of 50 neighbours, that
 scans of many storeys do not have a larger one."""
 _SIDE_OF_REGION = 1 / 27
 """Side of the least region by the height of the cloud: 10 cm in a room of 2.7 m."""
 _LEAST_SIZES = 20, 50
 """Bounds of the points of the least region: fewer have no sure plane, and 50 is the paper's."""
+_EXACTNESS = 0.1, 0.2
+"""Exactness up to which points are measured, and from which on they are drawn from a mesh."""
+_SIDE_OF_FACETS, _LEAST_OF_FACETS = 1 / 13, 200
+"""Side of the least region by the height of the cloud, and its most points, where points are drawn
+from a mesh: smaller ones are facets of what is curved, 20 cm in a room."""
 
 
 def _facets(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is form and not noise, in [0, 1]."""
-    low, high = _WHITENESS
-    return min(max((high - sampling.whiteness) / (high - low), 0.0), 1.0)
+    return 1 - _ramp(sampling.whiteness, *_WHITENESS)
+
+
+def _ramp(value: float, low: float, high: float) -> float:
+    """Return 0 up to the lower number, 1 from the higher one on, and what is even between."""
+    return min(max((value - low) / (high - low), 0.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -273,7 +283,6 @@ class PipelineConfig:
         }
         return dataclasses.replace(self, **parts)
 
-
     @property
     def is_measured(self) -> bool:
         """Whether a setting that counts is ``auto``, so that the cloud has to be measured."""
@@ -283,16 +292,18 @@ class PipelineConfig:
     def at_sampling(self, sampling: Sampling) -> "PipelineConfig":
         """Return the settings with numbers in place of ``auto``, by how a cloud samples surfaces.
 
-        Where whiteness is below 0.4, faces are bent or in facets, and ``facet_tolerance`` is 1/225
+        Where whiteness is below 0.4, faces are bent or in facets, and ``facet_tolerance`` is 1/240
         of the height of the cloud, but at most 0.3 of the reach of 50 neighbours; from 0.6 on noise
         is white, and there is none; between, it falls evenly. The noise of a region counts where it
         is white and distances to the nearest point vary by less than 0.34, as only those of
-        vertices and grids do.
+        vertices and grids do. The least region is a square of a 27th of the height, of a 13th where
+        points are drawn from a mesh, whose facets on curved things are no planes.
 
         Example:
-            >>> config = load_config().at_sampling(Sampling(0.06, 0.5, 4400.0, 2.7))
+            >>> mesh = Sampling(0.06, variation=0.5, exactness=0.6, density=4e3, height=2.7)
+            >>> config = load_config().at_sampling(mesh)
             >>> config.growing.facet_tolerance, config.growing.min_size, config.normals.noise_scope
-            (0.012, 44, 'local')
+            (0.0113, 173, 'local')
         """
         return dataclasses.replace(
             self,

@@ -16,6 +16,8 @@ _NUM_FOR_HEIGHT = 20_000
 """Points that the height is measured on."""
 _SMALL, _LARGE = 16, 100
 """Points of the two neighbourhoods whose deviations from a plane are compared."""
+_NEAREST, _EXACT = 9, 1e-3
+"""Points of the neighbourhood that is in a plane, and the deviation by its radius up to which."""
 _LENDERS = 3
 """Every third neighbour of a point lends its neighbours to the larger neighbourhood."""
 _OUTLIERS = 0.001
@@ -61,6 +63,7 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
     radius, first = distances[:, -1], distances[:, 1]
     density = k / (math.pi * float(np.median(radius)) ** 2)
     variation = float(first.std() / first.mean())
+    exact = _deviations(patches[:, :_NEAREST]) <= _EXACT * distances[:, _NEAREST - 1]
     flatness = _deviations(patches) / radius
     flat = flatness <= np.median(flatness)
     small = np.median(_deviations(patches[flat, :_SMALL]))
@@ -68,7 +71,7 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
     lent = indices[indices[rows, ::_LENDERS]].reshape(len(rows), -1)
     large = np.median(_deviations(_nearest(points, rows, lent, _LARGE)[-1]))
     whiteness = min(float(small / large), 1.0) if large > 0 else 1.0
-    measures = whiteness, variation, density, _height(points)
+    measures = whiteness, variation, float(exact.mean()), density, _height(points)
     return Sampling(*(float(f"{measure:.{_DIGITS}g}") for measure in measures))
 
 
@@ -105,7 +108,7 @@ def _nearest(
 
 
 def _deviations(patches: Array) -> Array:
-    """Return the deviation of points ``(n, k, 3)`` from their plane, of k - 3 degrees of freedom."""
+    """Return how far points ``(n, k, 3)`` are from their plane, with k - 3 degrees of freedom."""
     centered = patches - patches.mean(axis=1, keepdims=True)
     moments = np.linalg.eigvalsh(centered.swapaxes(1, 2) @ centered)
     lowest: Array = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))

@@ -159,7 +159,8 @@ def label_regions(
             labels = number_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
         contacts = NearestPoints(cloud.neighbors).contacts(labels)
-        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=float(config.facet_tolerance))
+        tolerance = float(config.facet_tolerance)
+        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
         labels = number_by_size(labels, least)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
