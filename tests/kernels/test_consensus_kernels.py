@@ -53,7 +53,7 @@ def assert_same_planes(found, expected, unit, share=1.0, rows=slice(None)):
 
 
 def test_broken_planes(points, near, survey):
-    fit, (_, _, noise, radius) = survey
+    fit, (_, _, noise, _) = survey
     # The kernel is for points of equally many neighbours.
     count = near.counted().sum(dim=1)
     rows = (fit.valid & noise.isfinite() & (count == count.mode().values)).nonzero().squeeze(1)
@@ -62,10 +62,9 @@ def test_broken_planes(points, near, survey):
         if near.valid is None
         else both(broken_planes, points, type(near)(*near.at(rows)), noise[rows], fit.normals[rows])
     )
-    assert_same_planes(voted, voted_too, radius[rows], ALIKE)
-    assert_same_planes(meeting[:2], meeting_too[:2], radius[rows], 0.9)
-    explained, explained_too = (m.deviations <= 1.3 * noise[rows] for m in (meeting, meeting_too))
-    assert (explained == explained_too).float().mean() >= ALIKE
+    # To the bit: rounding would decide between planes that are as good.
+    for found, expected in zip((*voted, *meeting), (*voted_too, *meeting_too), strict=True):
+        assert torch.equal(found.nan_to_num(), expected.nan_to_num())
 
 
 def test_paraboloids(points, near, survey):
