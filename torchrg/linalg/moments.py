@@ -234,23 +234,16 @@ def sum_neighbors(values: Tensor) -> Tensor:
         >>> sum_neighbors(torch.arange(10.0))
         tensor(45.)
     """
-    padded = torch.nn.functional.pad(values, (0, -values.shape[-1] % _NUM_LANES))
-    first, *others = padded.split(_NUM_LANES, dim=-1)
+    num_neighbors = max(values.shape[-1], 1)
+    width = -(-num_neighbors // _NUM_LANES) * _NUM_LANES
+    padded = torch.nn.functional.pad(values, (0, width - values.shape[-1]))
+    first, *others = torch.split(padded, _NUM_LANES, dim=-1)
     for part in others:
         first = first + part
     while first.shape[-1] > 1:
         half = first.shape[-1] // 2
         first = first[..., :half] + first[..., half:]
     return first.squeeze(-1)
-
-
-def square_root(values: Tensor) -> Tensor:
-    """Return square roots of float32, rounded as IEEE 754 asks and kernels do.
-
-    Those of torch come from a library of vector functions, of which every fifth is the float beside
-    it.
-    """
-    return values.double().sqrt().to(values.dtype)
 
 
 def sq_lengths(columns: Columns) -> Tensor:
@@ -278,16 +271,18 @@ def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tens
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset``, and the
     eigenvalues of the weighted covariance ``(n, 3)``, ascending.
     """
-    means, covariance = _moments(columns, weights)
+    means, covariance = weighted_moments(columns, weights)
     values, normals = smallest_eigenvector3(covariance)
-    return normals, _dot(normals, means), values
+    return normals, dot(normals, means), values
 
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
     """Fit a plane to the neighbours with each of the weights; see :func:`fit_weighted_planes`."""
-    means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
+    means, covariances = zip(
+        *(weighted_moments(columns, weights) for weights in groups), strict=True
+    )
     normals = smallest_eigenvector3(torch.stack(covariances))[1]
-    offsets = _dot(normals, torch.stack(means))
+    offsets = dot(normals, torch.stack(means))
     return list(zip(normals.unbind(), offsets.unbind(), strict=True))
 
 
@@ -300,25 +295,30 @@ def fit_parallel_planes(
     residual of all ``(n,)``.
     """
     totals = torch.stack([weights.sum(dim=1) for weights in groups])
-    means, covariances = zip(*(_moments(columns, weights) for weights in groups), strict=True)
+    means, covariances = zip(
+        *(weighted_moments(columns, weights) for weights in groups), strict=True
+    )
     shares = totals / totals.sum(dim=0).clamp(min=1)
     pooled = (shares[:, :, None, None] * torch.stack(covariances)).sum(dim=0)
     values, normals = smallest_eigenvector3(pooled)
-    offsets = _dot(normals, torch.stack(means))
+    offsets = dot(normals, torch.stack(means))
     return normals, offsets, values[:, 0].clamp(min=0)
 
 
-def _moments(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean ``(n, 3)`` and covariance ``(n, 3, 3)`` of each neighbourhood."""
+def weighted_moments(columns: Sequence[Tensor], weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean ``(*, 3)`` and covariance ``(*, 3, 3)`` of each neighbourhood.
+
+    Its three columns and the weights are of shape ``(*, K)``.
+    """
     total = sum_neighbors(weights)
     inverse = 1 / torch.where(total > 0, total, 1.0)
     means = [sum_neighbors(weights * column) * inverse for column in columns]
-    centered = [column - mean[:, None] for column, mean in zip(columns, means, strict=True)]
-    matrix = second_moments(centered, weights * inverse[:, None], sum_neighbors)
+    centered = [column - mean[..., None] for column, mean in zip(columns, means, strict=True)]
+    matrix = second_moments(centered, weights * inverse[..., None], sum_neighbors)
     return torch.stack(means, dim=-1), matrix
 
 
-def _dot(vectors: Tensor, others: Tensor) -> Tensor:
+def dot(vectors: Tensor, others: Tensor) -> Tensor:
     """Return the products ``(*)`` of vectors ``(*, 3)``, added from the first coordinate on."""
     x, y, z = (vectors * others).unbind(dim=-1)
     return x + y + z

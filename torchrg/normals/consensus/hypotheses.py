@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.linalg import above, at_most
+from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
     Columns,
     along,
@@ -17,7 +18,6 @@ from torchrg.linalg.moments import (
     fit_weighted_planes,
     residuals,
     sq_lengths,
-    square_root,
     sum_neighbors,
 )
 from torchrg.normals.consensus import constants
