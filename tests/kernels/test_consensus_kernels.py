@@ -106,9 +106,10 @@ def test_inliers(points, near, survey):
     assert error[same].max() < 1e-5
 
 
-def test_normals_of_a_cloud_hardly_change(points):
+def test_normals_of_a_cloud_are_the_same(points):
     near = lists(points, 50, masked=False)
     found, expected = both(estimate_consensus, points, near, NormalsConfig(), 1024)
-    angle = unsigned_angle_deg(found.normals, expected.normals)
-    assert (angle < 0.1).float().mean() > ALIKE
-    assert (found.sharp == expected.sharp).float().mean() > ALIKE
+    # Double precision hides that roots in torch are off by a bit, but not from each of many points.
+    for one, other in zip(found, expected, strict=True):
+        same = one.nan_to_num() == other.nan_to_num()
+        assert same.float().mean() > 0.9995

@@ -79,7 +79,7 @@ def fit_normals_pca(
         tensor([0., 0., 1.])
     """
     check_patches("fit_normals_pca", patches, mask, resolution)
-    return fit_plane(patches, mask, resolution, _decompose_for_normals)[0]
+    return fit_plane(patches, mask, resolution)[0]
 
 
 _Decomposition = tuple[Tensor, PrincipalFrame]
@@ -124,13 +124,18 @@ def fit_plane(
     return fit, frame
 
 
+def _fit_normals(patches: Tensor, mask: Tensor | None, *, resolution: Tensor) -> NormalFit:
+    """Do as :func:`fit_normals_pca`, with the bits of its kernel."""
+    return fit_plane(patches, mask, resolution, _decompose_for_normals)[0]
+
+
 def fit_points_pca(
     points: Tensor, neighbors: Neighbors, *, chunk_size: int = CHUNK_SIZE
 ) -> NormalFit:
     """Fit the neighbourhoods of a cloud ``(N, 3)``; :func:`fit_points` of least squares."""
     num_neighbors = neighbors.indices.shape[1]
     if not kernels.serve(points, *neighbors, k=num_neighbors):
-        return fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+        return fit_points(points, neighbors, _fit_normals, chunk_size=chunk_size)
     places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
 
     def work(rows: slice) -> tuple[Tensor, ...]:
@@ -144,7 +149,7 @@ def fit_points_pca(
     rows = places_of(narrow)
     if len(rows) == 0:
         return fit
-    again = fit_points(points, neighbors, fit_normals_pca, rows=rows, chunk_size=chunk_size)
+    again = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
     return replace_rows(fit, rows, again)
 
 
