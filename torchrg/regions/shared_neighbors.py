@@ -58,6 +58,7 @@ class SharedNeighbors:
         self._counted = None if neighbors.valid is None else neighbors.valid.cpu().numpy()
         self._min_shared = min_shared
         self._free_numbers: list[NDArray[np.intp]] = []
+        self._buffers: list[Tensor] = []
 
     def connected(self, rows: slice, asked: Tensor) -> Tensor:
         """Tell which of a block's edges join connected points, eq. (10).
@@ -69,9 +70,14 @@ class SharedNeighbors:
             return asked.clone()
         k = asked.shape[1]
         if k <= _MOST_IN_KERNEL and kernels.serve(*self._neighbors, asked, k=k):
-            numbers = asked.new_empty(len(self._indices), dtype=torch.int32)
+            try:
+                numbers = self._buffers.pop()
+            except IndexError:
+                numbers = torch.empty(len(self._indices), dtype=torch.int32, device="cpu")
             edges = *self._neighbors, asked, numbers, rows.start, self._min_shared
-            return kernels.call("connected", *edges)[0]
+            (joined,) = kernels.call("connected", *edges)
+            self._buffers.append(numbers)
+            return joined
         result = asked.cpu().numpy().copy()
 
         def test(block: slice) -> None:
