@@ -53,7 +53,7 @@ def assert_same_planes(found, expected, unit, share=1.0, rows=slice(None)):
 
 
 def test_broken_planes(points, near, survey):
-    fit, (_, _, noise, radius) = survey
+    fit, (_, _, noise, _) = survey
     # The kernel is for points of equally many neighbours.
     count = near.counted().sum(dim=1)
     rows = (fit.valid & noise.isfinite() & (count == count.mode().values)).nonzero().squeeze(1)
@@ -62,10 +62,9 @@ def test_broken_planes(points, near, survey):
         if near.valid is None
         else both(broken_planes, points, type(near)(*near.at(rows)), noise[rows], fit.normals[rows])
     )
-    assert_same_planes(voted, voted_too, radius[rows], ALIKE)
-    assert_same_planes(meeting[:2], meeting_too[:2], radius[rows], 0.9)
-    explained, explained_too = (m.deviations <= 1.3 * noise[rows] for m in (meeting, meeting_too))
-    assert (explained == explained_too).float().mean() >= ALIKE
+    # To the bit: rounding would decide between planes that are as good.
+    for found, expected in zip((*voted, *meeting), (*voted_too, *meeting_too), strict=True):
+        assert torch.equal(found.nan_to_num(), expected.nan_to_num())
 
 
 def test_paraboloids(points, near, survey):
@@ -107,9 +106,10 @@ def test_inliers(points, near, survey):
     assert error[same].max() < 1e-5
 
 
-def test_normals_of_a_cloud_hardly_change(points):
+def test_normals_of_a_cloud_are_the_same(points):
     near = lists(points, 50, masked=False)
     found, expected = both(estimate_consensus, points, near, NormalsConfig(), 1024)
-    angle = unsigned_angle_deg(found.normals, expected.normals)
-    assert (angle < 0.1).float().mean() > ALIKE
-    assert (found.sharp == expected.sharp).float().mean() > ALIKE
+    # Double precision hides that roots in torch are off by a bit, but not from each of many points.
+    for one, other in zip(found, expected, strict=True):
+        same = one.nan_to_num() == other.nan_to_num()
+        assert same.float().mean() > 0.9995

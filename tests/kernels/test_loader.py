@@ -10,7 +10,7 @@ import torch
 
 from tests.kernels.clouds import needs_library
 from torchrg import kernels
-from torchrg.kernels.signatures import SIGNATURES
+from torchrg.kernels import SIGNATURES
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 

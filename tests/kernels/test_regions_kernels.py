@@ -11,6 +11,7 @@ from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals.pca import fit_points_pca
 from torchrg.regions.edges import GrowingCloud, accept_edges
 from torchrg.regions.growth import by_column, grow
+from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.scenes import make_room
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
@@ -75,6 +76,22 @@ def test_edges_are_those_of_the_definition(name, signed, masked):
             with definitions():
                 expected, _ = accept_edges(cloud, config, rows, None)
             assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("k", [1, 9, 50, 64])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_shared_neighbors_are_those_of_the_definition(name, k, masked):
+    near = lists(CLOUDS[name], k, masked)
+    num_points, width = near.indices.shape
+    draws = torch.rand(num_points, width, generator=torch.Generator().manual_seed(2))
+    asked = near.counted() & (draws < 0.8)
+    for least in (1, width // 3, width):
+        shared = SharedNeighbors(near, least)
+        for rows in (slice(0, num_points), slice(100, 250)):
+            found = shared.connected(rows, asked[rows])
+            with definitions():
+                assert torch.equal(found, shared.connected(rows, asked[rows]))
 
 
 @pytest.mark.parametrize("k", [9, 50, 70])

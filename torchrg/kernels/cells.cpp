@@ -1,4 +1,4 @@
-// Nearest neighbours by cells: torchrg/neighbors/grid.py.
+// Nearest neighbours by cells: torchrg/neighbors/cells.py.
 #include "plain.h"
 
 namespace {

@@ -35,9 +35,8 @@ INLINE void residuals(const Patch& patch, const Plane& plane, float* rests) {
 INLINE void refit(const Patch& patch, const float* weights, float reach, bool bisquare,
                   Plane& plane) {
   alignas(32) float shares[MOST];
-  const float inverse = 1 / reach;
   for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes rest = plane.residuals(patch, j) * inverse;
+    const Lanes rest = plane.residuals(patch, j) / reach;
     Lanes near = positive(1 - rest * rest);
     if (bisquare) near *= near;
     store(shares + j, load(weights + j) * near);
@@ -50,16 +49,15 @@ INLINE void refit(const Patch& patch, const float* weights, float reach, bool bi
 Plane vote(const Patch& patch, const float* counted, float noise, const float* start,
            const int64_t* ranks, int64_t num_pairs, const Constants& constants) {
   alignas(32) float weights[MOST], nearness[MOST];
-  const float far = farthest(patch, counted), inverse = far > 0 ? 1 / far : 1;
+  const float most = farthest(patch, counted), far = most > 0 ? most : 1;
   for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes near = patch.sq_lengths(j) * inverse;
+    const Lanes near = patch.sq_lengths(j) / far;
     store(nearness + j, near);
     store(weights + j, (1 - constants.vote_falloff * near) * load(counted + j));
   }
-  const float reach = constants.vote_reach * noise, per_reach = 1 / reach;
+  const float reach = constants.vote_reach * noise;
   Plane plane = {start[0], start[1], start[2], 0, 0, 0, 0};
-  float best = support(patch, weights, plane.a * per_reach, plane.b * per_reach,
-                       plane.c * per_reach, 0);
+  float best = support(patch, weights, plane.a / reach, plane.b / reach, plane.c / reach, 0);
   for (int64_t pair = 0; pair < num_pairs; pair++) {
     const int64_t p = ranks[2 * pair], q = ranks[2 * pair + 1];
     float a = patch.y[p] * patch.z[q] - patch.z[p] * patch.y[q];
@@ -69,7 +67,7 @@ Plane vote(const Patch& patch, const float* counted, float noise, const float* s
     if (!(sq_area > 0)) continue;
     const float length = square_root(sq_area);
     a /= length, b /= length, c /= length;
-    const float score = support(patch, weights, a * per_reach, b * per_reach, c * per_reach, 0);
+    const float score = support(patch, weights, a / reach, b / reach, c / reach, 0);
     if (score > best) best = score, plane.a = a, plane.b = b, plane.c = c;
   }
   for (int i = 0; i < constants.num_refits; i++) refit(patch, weights, reach, false, plane);
@@ -122,7 +120,9 @@ Meeting alternate(const Patch& patch, int count, float* first, float* second, fl
     }
     if (third) {
       last = fit_plane(patch, third, width), residuals(patch, last, t);
-      const float w = side(product(t, first, width) + product(t, second, width));
+      for (int j = 0; j < width; j += LANES)
+        store(first + j, load(first + j) + load(second + j));
+      const float w = side(product(t, first, width));
       if (cuts == 0) cuts = side(product(outer, third, width));
       for (int j = 0; j < width; j += LANES) {
         const Lanes pair = load(outer + j) * cuts, added = load(t + j) * w;

@@ -95,3 +95,44 @@ KERNEL number_by_size(int64_t n, Longs regions, int64_t min_size, int64_t* numbe
   }
   return DONE;
 }
+
+// shared_neighbors.SharedNeighbors.connected: whether ends of edges from rows `first` on share
+// `least` neighbours. Lists of a block of rows are bits over the points that occur in them, its
+// members; `numbers` need no values before, as a number counts where the member so numbered is it.
+KERNEL connected(int64_t num_points, int64_t k, int64_t num_rows, Ints indices, Flagged mask,
+                 Flagged asked, int32_t* numbers, int64_t first, int64_t least, bool* joined) {
+  constexpr int WORDS = MOST / 64;
+  if (k < 1 || k > MOST || first < 0 || num_rows > num_points - first) return TOO_WIDE;
+  uint64_t bits[MOST][WORDS];
+  int32_t members[MOST];
+  int count = 0;
+  const auto find = [&](int64_t point) {
+    const int32_t number = numbers[point];
+    return uint32_t(number) < uint32_t(count) && members[number] == point ? number : -1;
+  };
+  for (int64_t start = first, stop = first; start < first + num_rows; start = stop) {
+    for (count = 0; stop < first + num_rows && count + k <= MOST; stop++) {
+      if (!are_rows(indices + stop * k, k, num_points)) return NO_SUCH_ROW;
+      for (int64_t e = stop * k; e < (stop + 1) * k; e++)
+        if ((!mask || mask[e]) && find(indices[e]) < 0)
+          numbers[indices[e]] = count, members[count++] = indices[e];
+    }
+    for (int m = 0; m < count; m++) {
+      const int64_t list = members[m] * k;
+      if (!are_rows(indices + list, k, num_points)) return NO_SUCH_ROW;
+      for (uint64_t& word : bits[m]) word = 0;
+      for (int64_t e = list; e < list + k; e++) {
+        const int number = !mask || mask[e] ? find(indices[e]) : -1;
+        if (number >= 0) bits[m][number / 64] |= uint64_t(1) << number % 64;
+      }
+    }
+    for (int64_t e = start * k, edge = e - first * k; e < stop * k; e++, edge++) {
+      const int own = asked[edge] ? find(e / k) : -1, other = asked[edge] ? find(indices[e]) : -1;
+      int64_t shared = 0;
+      for (int word = 0; own >= 0 && other >= 0 && word < WORDS; word++)
+        shared += __builtin_popcountll(bits[own][word] & bits[other][word]);
+      joined[edge] = asked[edge] && shared >= least;
+    }
+  }
+  return DONE;
+}

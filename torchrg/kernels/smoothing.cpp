@@ -41,23 +41,21 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       most = larger(most, u * u + v * v + w * w);
     }
     const float sq_radius = largest(most);
-    const float per_sq = sq_radius > 0 ? 1 / sq_radius : 1;
-    const float per_radius = sq_radius > 0 ? 1 / square_root(sq_radius) : 1;
-    const float per_reach = 1 / (float(reach) * noise[i]);
-    const float sq_agreement = float(agreement * agreement);
+    const float far = sq_radius > 0 ? sq_radius : 1, radius = square_root(far);
+    const float within = float(reach) * noise[i], sq_agreement = float(agreement * agreement);
     Lanes s[9] = {};
     for (int j = 0; j < width; j += LANES) {
       Lanes u = load(x + j), v = load(y + j), w = load(z + j);
       const Lanes p = load(a + j), q = load(b + j), r = load(c + j), error = load(errors + j);
       const Lanes cosine = p * own_a + q * own_b + r * own_c, sq_error = error * error;
-      const Lanes rest = -(p * u + q * v + r * w) - load(rests + j), share = rest * per_reach;
+      const Lanes rest = -(p * u + q * v + r * w) - load(rests + j), share = rest / within;
       const Lanes sq_angle = sq_agreement * (sq_error + sq_first);
       Lanes agrees = positive(1 - 2 * (1 - magnitude(cosine)) / sq_angle);
-      agrees *= agrees * (sq_first / sq_error);
+      agrees *= agrees, agrees *= sq_first / sq_error;
       agrees *= positive(1 - share * share);
-      agrees *= 1 - float(falloff) * (u * u + v * v + w * w) * per_sq;
+      agrees *= 1 - float(falloff) * (u * u + v * v + w * w) / far;
       const Lanes weight = where(load(weights + j) > 0, agrees, all(0));
-      u *= per_radius, v *= per_radius, w *= per_radius;
+      u /= radius, v /= radius, w /= radius;
       store(x + j, u), store(y + j, v), store(z + j, w), store(rests + j, rest);
       store(weights + j, weight), store(errors + j, where(cosine >= 0, all(1), all(-1)));
       const Lanes wu = weight * u, wv = weight * v, ww = weight * w;
@@ -107,14 +105,14 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
     const int64_t i = rows[q];
     if (!gather(lists, i, patch)) return NO_SUCH_ROW;
     const int32_t* row = indices + i * k;
-    const float far = farthest(patch, patch.weight), per_far = 1 / (far > 0 ? far : 1);
+    const float most = farthest(patch, patch.weight), far = most > 0 ? most : 1;
     Lanes sum{};
     for (int j = 0; j < patch.width; j += LANES) {
-      const Lanes near = patch.sq_lengths(j) * per_far;
-      const Lanes weight = (1 - float(vote_falloff) * near) * load(patch.weight + j);
+      const Lanes near = float(vote_falloff) * patch.sq_lengths(j) / far;
+      const Lanes weight = (1 - near) * load(patch.weight + j);
       store(weights + j, weight), sum += weight;
     }
-    const float noise = table[ROW * i + NUMBER], per_reach = 1 / (float(vote_reach) * noise);
+    const float noise = table[ROW * i + NUMBER], within = float(vote_reach) * noise;
     const float all_weights = total(sum);
     const float* best = table + ROW * i;
     float highest = -INFINITE, best_offset = best[OFFSET];
@@ -126,8 +124,8 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                                            c * (other[2] - first[2]));
       const float own = moved / noise;
       if (!(size_of(own) < float(inlier_reach)) || !(a * a + b * b + c * c > 0)) continue;
-      const float voted = support(patch, weights, a * per_reach, b * per_reach, c * per_reach,
-                                  moved * per_reach);
+      const float voted = support(patch, weights, a / within, b / within, c / within,
+                                  moved / within);
       const float score = voted / all_weights - float(cost) * own * own;
       if (score > highest) highest = score, best = other, best_offset = moved;
     }

@@ -312,7 +312,16 @@ def principal_frame(matrices: Tensor) -> PrincipalFrame:
     return PrincipalFrame(vectors[..., 0], smallest, values.detach(), vectors.detach())
 
 
+def square_root(values: Tensor) -> Tensor:
+    """Return square roots of float32, rounded as IEEE 754 asks and kernels do.
+
+    Those of torch come from a library of vector functions, of which every fifth is the float beside
+    it.
+    """
+    return values.double().sqrt().to(values.dtype)
+
+
 def root(squares: Tensor) -> Tensor:
     """Return square roots whose gradient at zero is zero."""
     positive = squares > 0
-    return torch.where(positive, squares, 1.0).sqrt() * positive
+    return square_root(torch.where(positive, squares, 1.0)) * positive

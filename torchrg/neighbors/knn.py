@@ -20,8 +20,7 @@ from torchrg._parallel import (
 )
 from torchrg.errors import ShapeError
 from torchrg.neighbors.blocks import search_blocks
-from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, sort_ties
-from torchrg.neighbors.grid import search_grid
+from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, search_grid, sort_ties
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 

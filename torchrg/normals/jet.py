@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchrg._checks import in_own_precision
 from torchrg.linalg import rank_tolerance
-from torchrg.linalg.eigen import PrincipalFrame, root
-from torchrg.linalg.moments import Columns, along, sq_lengths
+from torchrg.linalg.eigen import PrincipalFrame, root, square_root
+from torchrg.linalg.moments import Columns, along, sq_lengths, sum_neighbors
 from torchrg.normals.pca import about_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
@@ -136,22 +136,22 @@ def fit_paraboloids(
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``,
     and standard deviations of the residuals ``(n,)``, six degrees of freedom less.
     """
-    radius = sq_lengths(columns).mul_(counted).amax(dim=1).sqrt_()
+    radius = square_root(sq_lengths(columns).mul_(counted).amax(dim=1))
     scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None] * counted
     first, second = _tangents(normals)
     u, v, height = (along(columns, axis) * scale for axis in (first, second, normals))
     terms = _quadratic_terms(counted, u, v)
     matrix = {
-        (j, i): (terms[i] * terms[j]).sum(dim=1)
+        (j, i): sum_neighbors(terms[i] * terms[j])
         for i, j in combinations_with_replacement(range(_NUM_TERMS), 2)
     }
-    solution = _solve(matrix, [(term * height).sum(dim=1) for term in terms])
+    solution = _solve(matrix, [sum_neighbors(term * height) for term in terms])
     for coefficient, term in zip(solution, terms, strict=True):
         height.sub_(term * coefficient[:, None])
     freedom = (counted.sum(dim=1) - _NUM_TERMS).clamp_(min=1)
-    deviations = (height.square_().sum(dim=1) / freedom).sqrt_() * radius
+    deviations = square_root(sum_neighbors(height.square_()) / freedom) * radius
     a, b, c = solution[:3]
-    length = (1 + b * b + c * c).sqrt_()
+    length = square_root(1 + b * b + c * c)
     tilted = normals - b[:, None] * first - c[:, None] * second
     return tilted / length[:, None], a * radius / length, deviations
 

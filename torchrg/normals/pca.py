@@ -19,8 +19,14 @@ from torchrg.linalg import (
     eigh3,
     rank_tolerance,
 )
-from torchrg.linalg.eigen import PrincipalFrame, principal_frame, root
-from torchrg.linalg.moments import covariance_of_columns
+from torchrg.linalg.eigen import (
+    PrincipalFrame,
+    principal_frame,
+    root,
+    smallest_eigenvector3,
+    square_root,
+)
+from torchrg.linalg.moments import covariance_of_columns, weighted_moments
 from torchrg.neighbors import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 
@@ -76,13 +82,35 @@ def fit_normals_pca(
     return fit_plane(patches, mask, resolution)[0]
 
 
+_Decomposition = tuple[Tensor, PrincipalFrame]
+"""Covariances ``(*, 3, 3)``, and their frame."""
+
+
+def _decompose(patches: Tensor, mask: Tensor | None) -> _Decomposition:
+    _, matrix = covariance_of_columns(patches.unbind(dim=-1), mask)
+    return matrix, principal_frame(matrix)
+
+
+def _decompose_for_normals(patches: Tensor, mask: Tensor | None) -> _Decomposition:
+    """Decompose as kernels do, to the bit, where nothing but values and normals is asked for."""
+    if patches.dtype != torch.float32 or patches.requires_grad or not has_values(patches, mask):
+        return _decompose(patches, mask)
+    columns = about_first(patches, mask)[1].unbind(dim=-1)
+    counted = torch.ones_like(columns[0]) if mask is None else mask.to(patches.dtype)
+    _, matrix = weighted_moments(columns, counted)
+    values, normals = smallest_eigenvector3(matrix)
+    return matrix, PrincipalFrame(normals, values[..., 0], values, normals[..., None])
+
+
 def fit_plane(
-    patches: Tensor, mask: Tensor | None, resolution: Tensor | None
+    patches: Tensor,
+    mask: Tensor | None,
+    resolution: Tensor | None,
+    decompose: Callable[[Tensor, Tensor | None], _Decomposition] = _decompose,
 ) -> tuple[NormalFit, PrincipalFrame]:
     """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
-    _, matrix = covariance_of_columns(patches.unbind(dim=-1), mask)
-    frame = principal_frame(matrix)
-    total = matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+    matrix, frame = decompose(patches, mask)
+    total = matrix[..., 0, 0] + matrix[..., 1, 1] + matrix[..., 2, 2]
     with torch.no_grad():
         valid = _spans_plane(patches, mask, frame.values, resolution)
     normals, smallest = frame.normals, frame.smallest
@@ -96,13 +124,18 @@ def fit_plane(
     return fit, frame
 
 
+def _fit_normals(patches: Tensor, mask: Tensor | None, *, resolution: Tensor) -> NormalFit:
+    """Do as :func:`fit_normals_pca`, with the bits of its kernel."""
+    return fit_plane(patches, mask, resolution, _decompose_for_normals)[0]
+
+
 def fit_points_pca(
     points: Tensor, neighbors: Neighbors, *, chunk_size: int = CHUNK_SIZE
 ) -> NormalFit:
     """Fit the neighbourhoods of a cloud ``(N, 3)``; :func:`fit_points` of least squares."""
     num_neighbors = neighbors.indices.shape[1]
     if not kernels.serve(points, *neighbors, k=num_neighbors):
-        return fit_points(points, neighbors, fit_normals_pca, chunk_size=chunk_size)
+        return fit_points(points, neighbors, _fit_normals, chunk_size=chunk_size)
     places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
 
     def work(rows: slice) -> tuple[Tensor, ...]:
@@ -116,7 +149,7 @@ def fit_points_pca(
     rows = places_of(narrow)
     if len(rows) == 0:
         return fit
-    again = fit_points(points, neighbors, fit_normals_pca, rows=rows, chunk_size=chunk_size)
+    again = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
     return replace_rows(fit, rows, again)
 
 
@@ -140,7 +173,7 @@ def _spans_plane(
     """
     if resolution is None:
         resolution = patch_resolution(patches, mask)
-    lengths, widths = (values[..., axis].clamp(min=0).sqrt() for axis in (2, 1))
+    lengths, widths = (square_root(values[..., axis].clamp(min=0)) for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     narrow = widths < _NARROW * lengths
     if not has_values(patches, mask, values):

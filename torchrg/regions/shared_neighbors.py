@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._parallel import chunks_of, map_tasks
 from torchrg.structures import Neighbors
 
@@ -20,6 +21,10 @@ bit sets."""
 _PATCH_SIZE = 1024
 """Points worked on together, several blocks: each step is long enough for threads to go on side by
 side."""
+
+_MOST_IN_KERNEL = kernels.MOST_NEIGHBORS // 8
+"""Neighbours up to which the kernel is the faster one: the points that occur in the lists of one of
+its blocks are at most eight times as many."""
 
 
 def min_shared_neighbors(connectivity: float, k: int) -> int:
@@ -48,10 +53,12 @@ class SharedNeighbors:
     """
 
     def __init__(self, neighbors: Neighbors, min_shared: int) -> None:
+        self._neighbors = neighbors
         self._indices = neighbors.indices.cpu().numpy()
         self._counted = None if neighbors.valid is None else neighbors.valid.cpu().numpy()
         self._min_shared = min_shared
         self._free_numbers: list[NDArray[np.intp]] = []
+        self._buffers: list[Tensor] = []
 
     def connected(self, rows: slice, asked: Tensor) -> Tensor:
         """Tell which of a block's edges join connected points, eq. (10).
@@ -61,6 +68,16 @@ class SharedNeighbors:
         """
         if self._min_shared <= 0:
             return asked.clone()
+        k = asked.shape[1]
+        if k <= _MOST_IN_KERNEL and kernels.serve(*self._neighbors, asked, k=k):
+            try:
+                numbers = self._buffers.pop()
+            except IndexError:
+                numbers = torch.empty(len(self._indices), dtype=torch.int32, device="cpu")
+            edges = *self._neighbors, asked, numbers, rows.start, self._min_shared
+            (joined,) = kernels.call("connected", *edges)
+            self._buffers.append(numbers)
+            return joined
         result = asked.cpu().numpy().copy()
 
         def test(block: slice) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, chunks_of
 from torchrg.linalg import above, at_most
+from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
     Columns,
     along,
@@ -17,6 +18,7 @@ from torchrg.linalg.moments import (
     fit_weighted_planes,
     residuals,
     sq_lengths,
+    sum_neighbors,
 )
 from torchrg.normals.consensus import constants
 
@@ -63,9 +65,9 @@ def vote_planes(
 
 def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
     """Return the score ``(*, n)`` of planes by their residuals ``(*, n, K)`` per reach."""
-    support = (1 - rests * rests).clamp_(min=0).mul_(weights).sum(dim=-1)
-    over = above(rests, 1).mul_(weights).sum(dim=-1)
-    under = above(-rests, 1).mul_(weights).sum(dim=-1)
+    support = sum_neighbors((1 - rests * rests).clamp_(min=0).mul_(weights))
+    over = sum_neighbors(above(rests, 1).mul_(weights))
+    under = sum_neighbors(above(-rests, 1).mul_(weights))
     return support - torch.minimum(over, under)
 
 
@@ -116,7 +118,7 @@ def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
     sq_area = x * x + y * y + z * z
     spanned = sq_area > 0
-    length = torch.where(spanned, sq_area, 1.0).sqrt_()
+    length = square_root(torch.where(spanned, sq_area, 1.0))
     return torch.stack([x / length, y / length, z / length], dim=-1), spanned
 
 
@@ -276,7 +278,7 @@ def _corner(
     rests = [residuals(columns, *plane) for plane in planes]
     inside = _inside(rests[0], second), _inside(rests[1], first)
     wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
-    side = torch.where(side == 0, _side((wedge * third).sum(dim=1)).squeeze(1), side)
+    side = torch.where(side == 0, _side(sum_neighbors(wedge * third)).squeeze(1), side)
     wedge *= side[:, None]
     outer = torch.minimum(added, wedge) * side[:, None]
     third = above(wedge, added)
@@ -323,7 +325,7 @@ def _beyond(rests: Tensor, noise: Tensor) -> Tensor:
 
 def _inside(rests: Tensor, others: Tensor) -> Tensor:
     """Return distances from a plane, positive on the side where other points are."""
-    return rests * _side((rests * others).sum(dim=1))
+    return rests * _side(sum_neighbors(rests * others))
 
 
 def _side(totals: Tensor) -> Tensor:
@@ -350,6 +352,6 @@ def _summary(
         normals = torch.where(own[:, None], normal, normals)
         offsets = torch.where(own, offset, offsets)
     freedom = max(outer.shape[1] - _PLANE_PARAMETERS * len(planes), 1)
-    deviations = ((outer * outer).sum(dim=1) / freedom).sqrt_()
+    deviations = square_root(sum_neighbors(outer * outer) / freedom)
     deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
     return MeetingPlanes(normals, offsets, deviations)

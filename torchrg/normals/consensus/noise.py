@@ -10,13 +10,16 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg import above, coordinate_resolution
+from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
     along,
+    dot,
     fit_parallel_planes,
     fit_weighted_planes,
     residuals,
     split_columns,
     sq_lengths,
+    sum_neighbors,
 )
 from torchrg.neighbors import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
@@ -148,13 +151,14 @@ def _deviations(
     columns = gather_columns(points, indices)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
     count = counted.sum(dim=1)
-    center = [(column * counted).sum(dim=1) / count.clamp(min=1) for column in columns]
-    offsets = (normals * torch.stack(center, dim=-1)).sum(dim=1)
+    center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
+    offsets = dot(normals, torch.stack(center, dim=-1))
     rests = residuals(columns, normals, offsets)
     squares = rests * rests * counted
-    second, fourth = squares.sum(dim=1), squares.square().sum(dim=1)
-    whole = torch.where(valid & (count > 3), (second / (count - 3).clamp(min=1)).sqrt_(), torch.inf)
-    radius = (sq_lengths(columns) * counted).amax(dim=1).sqrt_()
+    second, fourth = sum_neighbors(squares), sum_neighbors(squares.square())
+    deviations = square_root(second / (count - 3).clamp(min=1))
+    whole = torch.where(valid & (count > 3), deviations, torch.inf)
+    radius = square_root((sq_lengths(columns) * counted).amax(dim=1))
     low = fourth * count < constants.MAX_LAYERED_KURTOSIS * second * second
     moves = sum((column[:, 1:] - column[:, :-1]).abs_() for column in columns)
     assert isinstance(moves, Tensor)  # noqa: S101
@@ -166,8 +170,8 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
     columns = gather_columns(points, near.indices)
     counted = near.counted().to(points.dtype)
     count = counted.sum(dim=1)
-    center = [(column * counted).sum(dim=1) / count.clamp(min=1) for column in columns]
-    offsets = (normals * torch.stack(center, dim=-1)).sum(dim=1)
+    center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
+    offsets = dot(normals, torch.stack(center, dim=-1))
     upper = above(residuals(columns, normals, offsets), 0) * counted
     for _ in range(constants.NUM_REFITS):
         normals, two, rest = fit_parallel_planes(columns, (upper, counted - upper))
@@ -206,9 +210,9 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     counted = counted[:, :count]
     normals, offsets, values = fit_weighted_planes(columns, counted)
     rests = residuals(columns, normals, offsets)
-    spread = (rests * rests).sum(dim=1) / (count - 3)
+    spread = sum_neighbors(rests * rests) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
-    return torch.where(broad, spread.sqrt_(), torch.inf)
+    return torch.where(broad, square_root(spread), torch.inf)
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:

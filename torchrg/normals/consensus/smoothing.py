@@ -6,12 +6,15 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
 from torchrg.linalg import signs
+from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
     Columns,
     along,
+    dot,
     fit_weighted_planes,
     residuals,
     sq_lengths,
+    sum_neighbors,
 )
 from torchrg.neighbors import gather_columns
 from torchrg.normals.consensus import constants
@@ -102,12 +105,13 @@ def _smoothed(
     if near.valid is not None:
         weights *= near.valid
     weights = _balanced(columns, weights) * sign
-    mean = torch.stack([(weights * part).sum(dim=1) for part in (x, y, z)], dim=-1)
-    length = (mean * mean).sum(dim=1).sqrt_()
+    mean = torch.stack([sum_neighbors(weights * part) for part in (x, y, z)], dim=-1)
+    length = square_root(dot(mean, mean))
     has_mean = length > 0
     safe = torch.where(has_mean, length, 1.0)
     normals = torch.where(has_mean[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
-    moved = -(weights * rests).sum(dim=1) / torch.where(has_mean, (weights * sign).sum(dim=1), 1.0)
+    total = torch.where(has_mean, sum_neighbors(weights * sign), 1.0)
+    moved = -sum_neighbors(weights * rests) / total
     return normals, torch.where(has_mean, moved, offsets[rows])
 
 
@@ -177,13 +181,14 @@ def _chosen(
     other = near.indices.index_select(1, ranks).long()
     axes = normals[other]
     places = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
-    moved = offsets[other] + (axes * places).sum(dim=-1)
-    rests = along((columns[0][:, None], columns[1][:, None], columns[2][:, None]), axes)
-    rests = (rests - moved[:, :, None]) / (constants.VOTE_REACH * scale)[:, :, None]
+    moved = offsets[other] + dot(axes, places)
+    reach = constants.VOTE_REACH * scale
+    x, y, z = (column[:, None] for column in columns)
+    rests = along((x, y, z), axes / reach[:, :, None]) - (moved / reach)[:, :, None]
     own = moved / scale
-    support = support_scores(rests, weights[:, None]) / weights.sum(dim=1)[:, None]
+    support = support_scores(rests, weights[:, None]) / sum_neighbors(weights)[:, None]
     score = support - constants.CHOICE_COST * own * own
-    usable = (own.abs() < constants.INLIER_REACH) & ((axes * axes).sum(dim=-1) > 0)
+    usable = (own.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
     best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
     has_choice = usable.gather(1, best)
     normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
@@ -274,11 +279,11 @@ def _falling(columns: Columns, share: float) -> Tensor:
 
 def _balanced(columns: Columns, weights: Tensor) -> Tensor:
     """Return weights tilted such that the weighted mean of the positions is nearly the point."""
-    radius = sq_lengths(columns).amax(dim=1, keepdim=True).sqrt_()
+    radius = square_root(sq_lengths(columns).amax(dim=1, keepdim=True))
     x, y, z = (column / torch.where(radius > 0, radius, 1.0) for column in columns)
     wx, wy, wz = weights * x, weights * y, weights * z
-    xx, xy, xz = (wx * x).sum(dim=1), (wx * y).sum(dim=1), (wx * z).sum(dim=1)
-    yy, yz, zz = (wy * y).sum(dim=1), (wy * z).sum(dim=1), (wz * z).sum(dim=1)
+    xx, xy, xz = sum_neighbors(wx * x), sum_neighbors(wx * y), sum_neighbors(wx * z)
+    yy, yz, zz = sum_neighbors(wy * y), sum_neighbors(wy * z), sum_neighbors(wz * z)
     ridge = constants.TILT_RIDGE * (xx + yy + zz)
     xx, yy, zz = xx + ridge, yy + ridge, zz + ridge
     # Cramer's rule for a symmetric positive definite 3x3 system.
@@ -286,7 +291,7 @@ def _balanced(columns: Columns, weights: Tensor) -> Tensor:
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
     determinant = xx * a + xy * b + xz * c
     inverse = torch.where(determinant > 0, 1 / determinant, 0.0)
-    mx, my, mz = wx.sum(dim=1), wy.sum(dim=1), wz.sum(dim=1)
+    mx, my, mz = sum_neighbors(wx), sum_neighbors(wy), sum_neighbors(wz)
     tilt_x = (a * mx + b * my + c * mz) * inverse
     tilt_y = (b * mx + d * my + e * mz) * inverse
     tilt_z = (c * mx + e * my + f * mz) * inverse
