@@ -21,6 +21,8 @@ NormalMethod = Literal[
 DEFAULT_PRESET = "consensus"
 Auto = Literal["auto"]
 """A setting that is measured; see :meth:`PipelineConfig.at_sampling`."""
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""Axis of the coordinates that points up."""
 NO_FLAG = {"is_flag": False}
 """Metadata of a setting that files and Python change, and no flag of the command line."""
 
@@ -202,7 +204,7 @@ class GrowingConfig:
         return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance)
 
 
-_WHITENESS = 0.4, 0.6
+WHITENESS = 0.4, 0.6
 """Whiteness up to which faces are in facets or bent, and from which on noise is white."""
 _VARIATION = 0.34
 """Variation of spacing below which points are vertices of a mesh or of a grid."""
@@ -222,7 +224,7 @@ from a mesh: smaller ones are facets of what is curved, 20 cm in a room."""
 
 def _facets(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is form and not noise, in [0, 1]."""
-    return 1 - _ramp(sampling.whiteness, *_WHITENESS)
+    return 1 - _ramp(sampling.whiteness, *WHITENESS)
 
 
 def _ramp(value: float, low: float, high: float) -> float:
@@ -234,7 +236,7 @@ def _ramp(value: float, low: float, high: float) -> float:
 class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    up: Up | None = None
     """Axis that points up. With it the table gives each plane a role: floor, ceiling, wall or
     another. None: planes are not told apart."""
     outline: bool = False
@@ -310,6 +312,24 @@ class PipelineConfig:
             normals=self.normals.at_sampling(sampling),
             growing=self.growing.at_sampling(sampling),
         )
+
+    def measured(self, sampling: Sampling | None) -> dict[str, Any]:
+        """Return what was measured and the settings that it chose, by name, as JSON holds them.
+
+        Example:
+            >>> load_config("classic").measured(None)
+            {}
+        """
+        if sampling is None:
+            return {}
+        chosen = self.at_sampling(sampling)
+        settings = {
+            f"{part}.{name}": getattr(getattr(chosen, part), name)
+            for part in ("normals", "growing")
+            for name in ("noise_scope", "facet_tolerance", "min_size")
+            if getattr(getattr(self, part), name, None) == "auto"
+        }
+        return {"sampling": sampling._asdict(), "settings": settings}
 
 
 _ANGLES = {"normals": "sharp_angle_deg", "growing": "max_angle_deg"}
@@ -490,6 +510,10 @@ def _read_values(path: Path) -> object:
     return _merged(_read_values(base), values)
 
 
+_MEASURED_NOW = ("s3dis", "scannet", "laser", "rgbd")
+"""Presets of earlier versions, each for a kind of data."""
+
+
 def _merged(base: Any, values: Any) -> Any:  # noqa: ANN401
     """Return nested mappings as one; what both have is taken from the second."""
     if not isinstance(base, dict) or not isinstance(values, dict):
@@ -499,6 +523,11 @@ def _merged(base: Any, values: Any) -> Any:  # noqa: ANN401
 
 def _preset_file(name: object, *, expected: str) -> Path:
     """Return the file of a preset, or say what was expected."""
+    if name in _MEASURED_NOW:
+        raise ConfigError(
+            f"{expected} {', '.join(preset_names())}, got {name!r}; leave it out: the default "
+            "measures what that preset set. planes.up tells which axis points up."
+        )
     if name not in preset_names():
         raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}.")
     return _preset_folder() / f"{name}.yaml"

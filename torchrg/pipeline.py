@@ -295,7 +295,7 @@ def segment_mesh(
     seg_min_verts: int = 20,
     *,
     colors: Tensor | NDArray[np.generic] | None = None,
-    config: PipelineConfig | str = "scannet",
+    config: PipelineConfig | str | None = None,
 ) -> Tensor:
     """Return superpoints of the vertices of a mesh, in the shape of ScanNet's Segmentator.
 
@@ -310,7 +310,8 @@ def segment_mesh(
             :class:`torchrg.config.SuperpointsConfig`.
         seg_min_verts: Smaller superpoints join a neighbour, in vertices.
         colors: As of :func:`make_superpoints`; Segmentator knows none.
-        config: How planes are found, settings or the name of a preset.
+        config: How planes are found, settings or the name of a preset. Default: that of
+            :func:`torchrg.load_config`.
 
     Returns:
         Superpoint of each vertex, shape ``(V,)``, int64, consecutive from 0 on by descending size;

@@ -69,6 +69,7 @@ def write_record(folder: Path, description: Record, report: TaskReport) -> None:
         "regions": report.num_regions,
         "repairs": list(report.repairs),
         "warnings": list(report.warnings),
+        "measured": report.measured,
         "outputs": {name: fingerprint(folder / name) for name in report.files},
     }
     with atomic_path(folder / RECORD) as beside:

@@ -106,7 +106,9 @@ class CloudSource(Source):
         what, place = (reading, seg, superpoints), _place_of(scan)
         files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)
         sizes, told = (len(cloud), len(seg.planes.count)), (*notes, *reading.notes)
-        return TaskReport(scan.name, "converted", *sizes, tuple(files), reading.repairs, told)
+        measured = self.settings.measured(seg.sampling)
+        told_of = tuple(files), reading.repairs, told, measured
+        return TaskReport(scan.name, "converted", *sizes, *told_of)
 
     def describe(self) -> Record:
         """Return the kind of the source, and the settings that differ from their defaults."""

@@ -32,6 +32,7 @@ class TaskReport:
         files: Names of the files written now, in the folder of the scan.
         repairs: What was put right in the input, a line each.
         warnings: What a user should know, a line each.
+        measured: What was measured of the cloud, and the settings that it chose.
         seconds: Time of each stage by its name.
         peak_memory: Largest resident memory of the process, in bytes.
         reason: Why it failed, a line.
@@ -48,6 +49,7 @@ class TaskReport:
     files: tuple[str, ...] = ()
     repairs: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    measured: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory: int = 0
     reason: str = ""

@@ -37,7 +37,7 @@ from torchrg.cli.ending import (
 )
 from torchrg.cli.loop import Progress, tell_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
-from torchrg.config import DEFAULT_PRESET, DepthConfig, SuperpointsConfig
+from torchrg.config import DepthConfig, SuperpointsConfig, Up
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
 from torchrg.io.files import check_place, free_space, make_folder
@@ -105,8 +105,8 @@ class CloudArguments(Arguments):
     objects there. S3DIS has neither scannet nor spformer, ScanNet++ no other with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
-    usual_preset: ClassVar[str] = DEFAULT_PRESET
-    """Settings to start from where no flag names any."""
+    up: ClassVar[Up | None] = None
+    """Axis that points up in all scans of the data set."""
 
     @property
     def output(self) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class FolderArguments(CloudArguments):
 class S3DISArguments(CloudArguments):
     """Convert S3DIS as it is released into Pointcept's layout, with normals and planes.
 
-    Settings are those of the preset s3dis unless told otherwise.
+    Few points of a region are wanted? --growing.min-size 200 leaves a third of the regions.
 
     Examples:
         torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --dry-run
@@ -157,7 +157,7 @@ class S3DISArguments(CloudArguments):
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
     """What the numbers in segment.npy mean. Other layouts have the order pointcept."""
-    usual_preset: ClassVar[str] = "s3dis"
+    up: ClassVar[Up | None] = "z"
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the rooms of the areas."""
@@ -171,8 +171,7 @@ class ScanNetArguments(CloudArguments):
 
     Points are the vertices of the meshes. Results are in OUT/train, val and test, by the lists of
     the data set in ROOT, ROOT/splits or ROOT/meta_data. segment200 needs the table
-    scannetv2-labels.combined.tsv there; labels of ScanNet++ need its metadata. Settings are those
-    of the preset scannet unless told otherwise.
+    scannetv2-labels.combined.tsv there; labels of ScanNet++ need its metadata.
 
     Examples:
         torchrg convert scannet scannet out --dry-run
@@ -180,7 +179,7 @@ class ScanNetArguments(CloudArguments):
         torchrg convert scannet scannet out --layout mmdet3d
     """
 
-    usual_preset: ClassVar[str] = "scannet"
+    up: ClassVar[Up | None] = "z"
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the scans."""
@@ -248,7 +247,7 @@ def run(argv: list[str]) -> int:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
     if issubclass(chosen, CloudArguments):
-        start["settings"] = flags.PlaneSettings.asked_for(rest, chosen.usual_preset)
+        start["settings"] = flags.PlaneSettings.asked_for(rest, chosen.up)
     arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()

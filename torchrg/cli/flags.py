@@ -12,7 +12,14 @@ from typing import Annotated, Literal
 import torch
 
 from torchrg.cli.arguments import Argument
-from torchrg.config import DEFAULT_PRESET, PipelineConfig, SuperpointsConfig, load_config
+from torchrg.config import (
+    DEFAULT_PRESET,
+    WHITENESS,
+    PipelineConfig,
+    SuperpointsConfig,
+    Up,
+    load_config,
+)
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
@@ -73,9 +80,9 @@ class PlaneSettings:
     """How planes are found: what the preset or the file says, where no flag says otherwise."""
 
     preset: str = DEFAULT_PRESET
-    """Settings to start from: those of a method (classic, classic_increment, detmm, paper,
-    algorithm2, consensus), or those for a kind of data (s3dis, scannet, laser, rgbd). Flags change
-    them one by one."""
+    """Settings to start from: consensus, which measures what kind of data it has, or those of
+    another method (classic, classic_increment, detmm, paper, algorithm2). Flags change them one by
+    one."""
     config: Path | None = None
     """YAML file with settings, in place of a preset; what it does not name has its default."""
     angle_deg: float | None = None
@@ -86,27 +93,49 @@ class PlaneSettings:
     )
 
     @classmethod
-    def asked_for(cls, argv: list[str], preset: str = DEFAULT_PRESET) -> "PlaneSettings":
+    def asked_for(cls, argv: list[str], up: Up | None = None) -> "PlaneSettings":
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
 
-        ``preset`` is that of commands which name none.
+        ``up`` is the axis that points up in a data set, where they do not say.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
             'pca'
         """
-        values = {"--preset": preset, "--config": "", "--angle-deg": ""}
+        values = {"--preset": DEFAULT_PRESET, "--config": "", "--angle-deg": ""}
         for argument, following in pairwise((*argv, "")):
             name, equals, value = argument.partition("=")
             name = name.replace("_", "-")
             if name in values:
                 values[name] = value if equals else following
         resolved = load_config(values["--config"] or values["--preset"])
+        planes = dataclasses.replace(resolved.planes, up=resolved.planes.up or up)
+        resolved = dataclasses.replace(resolved, planes=planes)
         try:
             angle = float(values["--angle-deg"])
         except ValueError:  # It is not given, or a word that the parser refuses.
-            return cls(preset, resolved=resolved)
-        return cls(preset, resolved=resolved.at_angle(angle))
+            return cls(resolved=resolved)
+        return cls(resolved=resolved.at_angle(angle))
+
+
+def choice_of(sampling: Sampling, settings: Mapping[str, Any]) -> str:
+    """Return in words what was measured of a cloud, and the settings that it chose.
+
+    Example:
+        >>> choice_of(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
+        'faces in facets or bent (whiteness 0.06): min_size 173'
+    """
+    low, high = WHITENESS
+    kind = "faces partly bent, noise partly white"
+    if sampling.whiteness <= low:
+        kind = "faces in facets or bent"
+    elif sampling.whiteness >= high:
+        kind = "white noise"
+    chosen = ", ".join(
+        f"{name.partition('.')[2]} {'none' if value is None else value}"
+        for name, value in settings.items()
+    )
+    return f"{kind} (whiteness {sampling.whiteness:g}): {chosen}"
 
 
 SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]

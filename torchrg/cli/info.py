@@ -5,18 +5,24 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import torch
 
 from torchrg import kernels
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say
-from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
+from torchrg.cli.flags import ColumnsFlag, check_columns, choice_of, columns_of
+from torchrg.config import load_config
 from torchrg.io import read_cloud
-from torchrg.neighbors import canonical_order, search_knn
+from torchrg.neighbors import canonical_order, measure_sampling, search_knn
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
 """Digits of a coordinate that are shown, by its bytes. float32 holds no more than six, and ten are
 millimetres at a thousand kilometres."""
+
+
+_NUM_NEIGHBORS = 50
+"""Neighbours that the surfaces are measured by, as by the default."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +72,15 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         facts["duplicates"] = f"{len(kept) - len(places):,}"
         facts["spacing"] = "none"
         if len(places) > 1:
-            nearest = places[search_knn(places, 2).indices[:, 1].numpy()]
+            near = search_knn(places, min(_NUM_NEIGHBORS, len(places)), canonical=True)
+            nearest = places[near.indices[:, 1].numpy()]
             spacing = np.median(np.linalg.norm(places - nearest, axis=1))
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
+            sampling = measure_sampling(torch.from_numpy(places), near)
+            chosen = load_config().measured(sampling)["settings"]
+            facts["height"] = f"{sampling.height:g} (least extent along the principal axes)"
+            facts["density"] = f"{sampling.density:g} points on a square of side 1"
+            facts["surfaces"] = choice_of(sampling, chosen)
     for name, values in cloud.fields.items():
         shape = " x ".join(map(str, values.shape[1:])) or "1"
         facts[name] = f"{shape} {values.dtype}"

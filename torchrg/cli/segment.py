@@ -72,7 +72,7 @@ class Arguments:
 
     Examples:
         torchrg segment scan.pcd --out planes.npz
-        torchrg segment scan.laz --out planes.laz --preset laser --picture planes.png
+        torchrg segment scan.laz --out planes.laz --planes.up z --picture planes.png
         torchrg segment *.ply --out results --picture pictures --pages
         torchrg segment part1.e57 part2.e57 --merge --out hall.npz --voxel 0.02
         torchrg segment scan.ply --out parts.npz --superpoints 1000,300
@@ -211,7 +211,7 @@ def _segment(
             begin=advance,
         )
     if arguments.layout is None:
-        provenance = _describe(arguments, sources)
+        provenance = _describe(arguments, sources, seg)
         write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
     else:
         _write_layout(arguments, target, cloud, seg, superpoints)
@@ -221,6 +221,9 @@ def _segment(
         levels = superpoints.by_level().values()
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
         say(f"{source}: superpoints of each level: {counts}")
+    if seg.sampling is not None:
+        settings = arguments.settings.resolved.measured(seg.sampling)["settings"]
+        say(f"{source}: {flags.choice_of(seg.sampling, settings)}")
     place = f"{target}{left_out(target, cloud.fields)}"
     _report(source, seg, cloud, place, time.perf_counter() - begin)
 
@@ -271,12 +274,14 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
         )
 
 
-def _describe(arguments: Arguments, sources: tuple[Path, ...]) -> Record:
+def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation) -> Record:
     """Return the provenance of a cloud of one file or of several."""
     settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
     options = {"columns": arguments.columns, "voxel": arguments.voxel}
     provenance |= {name: value for name, value in options.items() if value is not None}
+    if measured := settings.measured(seg.sampling):
+        provenance["measured"] = measured
     if arguments.superpoints:
         provenance["superpoints"] = dataclasses.asdict(arguments.partition)
     if len(sources) > 1:
