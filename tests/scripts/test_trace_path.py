@@ -3,7 +3,10 @@
 import pytest
 import trace_path
 
+from torchrg import kernels
 
+
+@pytest.mark.skipif(kernels.name_of_library() is None, reason="needs the kernels")
 @pytest.mark.parametrize("preset", trace_path.LONGEST)
 def test_path_of_a_preset_stays_short(preset, monkeypatch):
     # The same files as of twice as many points.

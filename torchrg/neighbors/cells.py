@@ -328,13 +328,6 @@ def search_grid(
 
     Returns:
         The rows that are left, ascending. What is in ``found`` for them means nothing.
-
-    Example:
-        >>> points, rows = np.random.default_rng(0).random((3000, 3)), np.arange(3000)
-        >>> found = np.empty((3000, 2), np.int32)
-        >>> left = search_grid(points, rows, np.full(9, 0.1), found)
-        >>> len(left) < 300, bool((found[:, 0] == rows)[~np.isin(rows, left)].all())
-        (True, True)
     """
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     places = torch.from_numpy(np.ascontiguousarray(points))

@@ -354,6 +354,8 @@ def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, difference: Tensor) 
         return _Borders(*(column[: int(rows[-1])] for column in rows[1:-1]))
     different = places_of(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
+    if len(a) == 0:
+        return _Borders(a, b, contacts, difference)
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)
     contacts, difference = (
