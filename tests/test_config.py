@@ -15,6 +15,7 @@ from torchrg.config import (
     preset_names,
 )
 from torchrg.errors import ConfigError
+from torchrg.structures import Sampling
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -162,23 +163,51 @@ def changes(settings, base):
     }
 
 
-OF_S3DIS = {"facet_tolerance": 0.009, "max_plane_residual": 2.5, "min_size": 200}
+@pytest.mark.parametrize("name", ["s3dis", "scannet", "laser", "rgbd"])
+def test_presets_for_a_kind_of_data_say_what_took_their_place(name, tmp_path):
+    for ask in (load_config, lambda name: load_config(base_file(tmp_path, name))):
+        with pytest.raises(ConfigError, match=f"got '{name}'; leave it out: the default measures"):
+            ask(name)
+
+
+def base_file(folder, name):
+    path = folder / "mine.yaml"
+    path.write_text(f"base: {name}\n")
+    return path
+
+
+FACETS = Sampling(whiteness=0.1, variation=0.5, exactness=0.5, density=4000.0, height=2.7)
+VERTICES = Sampling(whiteness=0.8, variation=0.28, density=700.0, height=2.7)
+RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"),
+    ("sampling", "scope", "tolerance", "least"),
     [
-        ("s3dis", {f"growing.{key}": v for key, v in OF_S3DIS.items()} | {"planes.up": "z"}),
-        (
-            "scannet",
-            {"normals.noise_scope": "regional", "growing.min_size": 20, "planes.up": "z"},
-        ),
-        ("laser", {"planes.up": "z"}),
-        ("rgbd", {"normals.k": 100, "growing.min_size": 100}),
+        # A square of a 13th of 2.7 m has 173 of 4,000 points, of a 27th 7 of 700 and 70 of 7,000.
+        (FACETS, "local", 0.0113, 173),
+        (FACETS._replace(exactness=0.0), "local", 0.0113, 40),
+        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0189, 50),
+        (VERTICES, "regional", None, 20),
+        (VERTICES._replace(whiteness=0.5), "local", 0.00563, 20),
+        (RAYS, "local", None, 50),
+        (Sampling(), "local", None, 20),
     ],
 )
-def test_settings_for_a_kind_of_data_are_consensus_but_for_what_they_say(name, expected):
-    assert changes(load_config(name), load_config("consensus")) == expected
+def test_settings_follow_from_how_a_cloud_samples_surfaces(sampling, scope, tolerance, least):
+    config = load_config().at_sampling(sampling)
+    assert config.normals.noise_scope == scope
+    assert config.growing.facet_tolerance == tolerance
+    assert config.growing.min_size == least
+    told = load_config().measured(sampling)["settings"]
+    assert [*told.values()] == [scope, tolerance, least]
+
+
+def test_settings_that_are_numbers_stay():
+    fixed = dataclasses.replace(load_config().growing, min_size=7, facet_tolerance=None)
+    config = dataclasses.replace(load_config("classic"), growing=fixed)
+    assert config.at_sampling(FACETS).growing == fixed
+    assert "growing.min_size" not in config.measured(FACETS)["settings"]
 
 
 def test_a_file_holds_differences_to_its_base(tmp_path):
@@ -187,5 +216,5 @@ def test_a_file_holds_differences_to_its_base(tmp_path):
     settings = load_config(path)
     assert changes(settings, load_config("consensus")) == {"growing.min_size": 7}
     assert settings.chunk_size == 99
-    path.write_text("base: s3dis\n")
-    assert load_config(path) == load_config("s3dis")
+    path.write_text("base: paper\n")
+    assert load_config(path) == load_config("paper")

@@ -18,7 +18,7 @@ from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
-PRESETS = ("classic", "paper", "algorithm2", "consensus", "s3dis", "scannet")
+PRESETS = ("classic", "paper", "algorithm2", "consensus")
 
 
 @pytest.fixture

@@ -285,12 +285,6 @@ class PipelineConfig:
         }
         return dataclasses.replace(self, **parts)
 
-    @property
-    def is_measured(self) -> bool:
-        """Whether a setting that counts is ``auto``, so that the cloud has to be measured."""
-        scope = self.normals.method == "consensus" and self.normals.noise_scope
-        return "auto" in (scope, self.growing.min_size, self.growing.facet_tolerance)
-
     def at_sampling(self, sampling: Sampling) -> "PipelineConfig":
         """Return the settings with numbers in place of ``auto``, by how a cloud samples surfaces.
 

@@ -158,7 +158,7 @@ def _segment(
         k = min(config.normals.k, len(cloud.points))
         neighbors = search_knn(cloud.points, k, canonical=True)
     sampling = None
-    if config.is_measured:
+    if _has_auto(config):
         sampling = measure_sampling(cloud.points, neighbors)
         config = config.at_sampling(sampling)
 
@@ -196,6 +196,12 @@ def _segment(
     begin("done")
     kept = neighbors if voxel is None else None
     return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
+
+
+def _has_auto(config: PipelineConfig) -> bool:
+    """Return whether a setting that counts is measured."""
+    scope = config.normals.method == "consensus" and config.normals.noise_scope
+    return "auto" in (scope, config.growing.min_size, config.growing.facet_tolerance)
 
 
 def _numbered_by_points(labels: Tensor, num_planes: int) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,5 @@
 """Values that one step gives to the next: clouds, neighbours, fits, planes, segmentations."""
 
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -218,7 +217,7 @@ class Sampling(NamedTuple):
     """
 
     whiteness: float = 1.0
-    variation: float = math.inf
+    variation: float = 1.0
     exactness: float = 0.0
     density: float = 0.0
     height: float = 0.0

@@ -13,6 +13,7 @@ from torchrg.regions.edges import GrowingCloud, accept_edges
 from torchrg.regions.growth import by_column, grow
 from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.scenes import make_room
+from torchrg.structures import Sampling
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 
@@ -98,7 +99,7 @@ def test_shared_neighbors_are_those_of_the_definition(name, k, masked):
 @pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
 @pytest.mark.parametrize("name", ["room", "grid", "doubled"])
 def test_regions_are_those_of_the_definition(name, preset, k):
-    config = load_config(preset).growing
+    config = load_config(preset).at_sampling(Sampling()).growing
     late = {"connectivity": 0.3, "connectivity_scope": "seed"}
     by_region = {
         "curvature_scope": "neighborhood",

@@ -105,10 +105,16 @@ class CloudSource(Source):
         begin("write")
         what, place = (reading, seg, superpoints), _place_of(scan)
         files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)
-        sizes, told = (len(cloud), len(seg.planes.count)), (*notes, *reading.notes)
-        measured = self.settings.measured(seg.sampling)
-        told_of = tuple(files), reading.repairs, told, measured
-        return TaskReport(scan.name, "converted", *sizes, *told_of)
+        return TaskReport(
+            scan.name,
+            "converted",
+            len(cloud),
+            len(seg.planes.count),
+            tuple(files),
+            repairs=reading.repairs,
+            warnings=(*notes, *reading.notes),
+            measured=self.settings.measured(seg.sampling),
+        )
 
     def describe(self) -> Record:
         """Return the kind of the source, and the settings that differ from their defaults."""

@@ -7,7 +7,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError

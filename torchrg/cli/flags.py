@@ -3,11 +3,11 @@
 import dataclasses
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 
@@ -23,6 +23,7 @@ from torchrg.config import (
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
+from torchrg.structures import Sampling
 
 _MOST_THREADS = 1024
 """More than any machine has cores; many more cannot be started, and torch ends with the process."""
@@ -96,21 +97,23 @@ class PlaneSettings:
     def asked_for(cls, argv: list[str], up: Up | None = None) -> "PlaneSettings":
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
 
-        ``up`` is the axis that points up in a data set, where they do not say.
+        ``up`` is the axis that points up in a data set, where they name neither.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
             'pca'
         """
-        values = {"--preset": DEFAULT_PRESET, "--config": "", "--angle-deg": ""}
+        values = {"--preset": "", "--config": "", "--angle-deg": ""}
         for argument, following in pairwise((*argv, "")):
             name, equals, value = argument.partition("=")
             name = name.replace("_", "-")
             if name in values:
                 values[name] = value if equals else following
-        resolved = load_config(values["--config"] or values["--preset"])
-        planes = dataclasses.replace(resolved.planes, up=resolved.planes.up or up)
-        resolved = dataclasses.replace(resolved, planes=planes)
+        named = values["--config"] or values["--preset"]
+        resolved = load_config(named or DEFAULT_PRESET)
+        if not named:
+            planes = dataclasses.replace(resolved.planes, up=up)
+            resolved = dataclasses.replace(resolved, planes=planes)
         try:
             angle = float(values["--angle-deg"])
         except ValueError:  # It is not given, or a word that the parser refuses.
