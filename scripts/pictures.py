@@ -6,6 +6,7 @@
 playwright, and stays as it is where they are missing.
 """
 
+import dataclasses
 import io
 import shutil
 import tempfile
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import torchrg
-from torchrg.config import SuperpointsConfig
+from torchrg.config import PlanesConfig, SuperpointsConfig
 from torchrg.render import color_planes, make_page, render_cloud, write_page
 from torchrg.result import Result
 
@@ -37,7 +38,8 @@ _GREY = 205
 def draw_rooms(path: Path) -> Result:
     """Draw a room before, with its planes, and with its superpoints; return the result."""
     room = torchrg.scenes.make_room(NUM_POINTS, noise=NOISE, seed=SEED)
-    seg = torchrg.segment_planes(room.points, torchrg.load_config("laser"))
+    upright = dataclasses.replace(torchrg.load_config(), planes=PlanesConfig(up="z"))
+    seg = torchrg.segment_planes(room.points, upright)
     parts = torchrg.make_superpoints(room.points, seg, SuperpointsConfig(counts=(NUM_PARTS,)))
     grey = torch.full((NUM_POINTS, 3), _GREY, dtype=torch.uint8)
     pictures = [
