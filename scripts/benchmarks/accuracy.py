@@ -1,22 +1,27 @@
 """torchrg beside PCL's region growing and Open3D's planar patches by three known protocols.
 
 Clouds with exact truth: made rooms at four levels of noise and at three densities, rendered depth
-frames without noise and with a Kinect's, and a scan of SynPEB's test set if its file is given.
-FOLDER holds the program ``pclrg`` (PCL's normals and region growing), PYTHON has Open3D; what is
-missing is left out. Open3D finds boxes: a point goes to the nearest within 5 cm. ``depth`` sees a
-frame as an image, all others as a cloud. Published figures stand below the table, and are of other
-data.
+frames without noise and with a Kinect's, a scan of SynPEB's test set, scans with labelled parts (0
+is none), and folders of rooms as scanners and reconstructions give them, ``NAME_SEED.npz`` with
+``points`` and ``labels`` (-1 is no plane). FOLDER holds the program ``pclrg`` (PCL's normals and
+region growing), PYTHON has Open3D; what is missing is left out. Open3D finds boxes: a point goes to
+the nearest within 5 cm. ``depth`` sees a frame as an image, all others as a cloud. Settings of a
+folder's rooms are chosen on one folder, and another is held out. The first table has means over the
+clouds of a kind. Published figures stand below the tables, and are of other data.
 
     python scripts/bench.py accuracy --programs FOLDER --open3d-python PYTHON --synpeb FILE.pcd
+        --parts office_parts.pcd --rooms CHOSEN HELD_OUT --out accuracy.json
     python scripts/bench.py accuracy --scale 0.1 --only classic consensus
 """
 
 import dataclasses
+import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +29,7 @@ import torch
 from torch import Tensor
 
 import torchrg
-from benchmarks.harness import Benchmark, Figures, Results, run_program, table
+from benchmarks.harness import Benchmark, Figures, Results, markdown, medians, run_program, table
 from benchmarks.peers import MIN_SIZE, pcl_command
 from benchmarks.protocols import count_segcomp, score_evops, score_voxels
 from tests.made import DepthFrame, cameras_around, render_depth
@@ -46,6 +51,12 @@ SYNPEB_MIN_SIZE = 10
 """Points of the smallest region, and of the smallest face, as smaller ones are void there."""
 SYNPEB_VOID = 3
 """Label of SynPEB's points of no plane."""
+PARTS_MIN_SIZE = 500
+"""Points of the smallest part of a scan that is a face."""
+ROOMS_MIN_SIZES = {"s3dis": 300, "laser": 300, "rgbd": 200, "scannet": 60}
+"""Points of the smallest face of a room, by what its name has in it."""
+VOID = -2
+"""Truth of points that do not count."""
 EVOPS = ("precision", "recall", "mean_iou")
 """Indices of its protocol."""
 VOXEL_SIZE = 0.05
@@ -83,8 +94,9 @@ class Labelled(NamedTuple):
     """A cloud with its truth."""
 
     points: Tensor  # shape ``(N, 3)``
-    truth: Tensor  # shape ``(N,)``, -1 for points of no plane
-    min_size: int = MIN_SIZE  # points of the smallest region
+    truth: Tensor  # shape ``(N,)``, -1 for points of no plane, VOID for those that do not count
+    # Points of the smallest region, but where the method measures it.
+    min_size: int = MIN_SIZE
     # The depth image that the points are of, in the order of its pixels with depth.
     frame: DepthFrame | None = None
 
@@ -101,8 +113,12 @@ class Case(Benchmark):
     """A Python that has Open3D."""
     synpeb: Path | None = None
     """A scan with labels in the field intensity."""
+    parts: tuple[Path, ...] = ()
+    """Scans with labelled parts."""
+    rooms: tuple[Path, ...] = ()
+    """Folders of rooms with truth."""
     scale: float = 1.0
-    """Share of the points."""
+    """Share of the points of what is made."""
 
     def clouds(self) -> Mapping[str, Callable[[], Clouds]]:
         rooms = {f"room, {1000 * noise:g} mm": (POINTS, noise) for noise in NOISES}
@@ -115,6 +131,10 @@ class Case(Benchmark):
             makers[f"{NUM_FRAMES} frames, {sensor}"] = partial(_frames, sensor, self.scale)
         if self.synpeb is not None:
             makers["SynPEB, test 100"] = partial(_read_synpeb, self.synpeb)
+        makers |= {path.stem: partial(_read_parts, path) for path in self.parts}
+        for folder in self.rooms:
+            for path in sorted(folder.glob("*.npz")):
+                makers[f"{folder.name}/{path.stem}"] = partial(_read_room, path)
         return makers
 
     def contenders(self) -> Mapping[str, Callable[[Clouds], Figures | None]]:
@@ -129,8 +149,17 @@ class Case(Benchmark):
         return {name: partial(_mean_scores, run) for name, run in runs.items()}
 
     def report(self, results: Results) -> str:
-        """Return a row for each cloud and contender, and published figures."""
-        return f"{table(results)}\n\n{PUBLISHED}"
+        """Return means and worst of each kind, all rows, and published figures."""
+        kinds: dict[str, list[str]] = {}
+        for cloud in results:
+            kinds.setdefault(re.split(r", |_[^_]*$", cloud)[0], []).append(cloud)
+        names = list(dict.fromkeys(name for by in results.values() for name in by))
+        rows = [
+            [kind, *(_summary([results[cloud].get(name) for cloud in clouds]) for name in names)]
+            for kind, clouds in kinds.items()
+        ]
+        head = ["found / mean best IoU (worst) / regions", *names]
+        return f"{markdown(head, rows)}\n\n{table(results)}\n\n{PUBLISHED}"
 
 
 def _made_room(num_points: int, noise: float) -> Clouds:
@@ -164,10 +193,45 @@ def _read_synpeb(path: Path) -> Clouds:
     return [Labelled(torch.as_tensor(cloud.points)[known], labels[known], SYNPEB_MIN_SIZE)]
 
 
+def _read_parts(path: Path) -> Clouds:
+    """Return a scan whose field ``labels`` tells its parts, 0 for none."""
+    cloud = torchrg.read_cloud(path)
+    parts = torch.as_tensor(cloud.fields["labels"]).long() - 1
+    return [Labelled(torch.as_tensor(cloud.points), _large_faces(parts, PARTS_MIN_SIZE))]
+
+
+def _read_room(path: Path) -> Clouds:
+    """Return a room; points of faces that are too small to be seen do not count."""
+    least = next((least for kind, least in ROOMS_MIN_SIZES.items() if kind in path.stem), MIN_SIZE)
+    with np.load(path) as room:
+        truth = _large_faces(torch.as_tensor(room["labels"]).long(), least)
+        return [Labelled(torch.as_tensor(room["points"]).float(), truth)]
+
+
+def _large_faces(truth: Tensor, least: int) -> Tensor:
+    """Return a truth in which points of smaller faces are void."""
+    is_face = truth >= 0
+    sizes = torch.bincount(truth[is_face])
+    return truth.where(~is_face | (sizes[truth.clamp(min=0)] >= least), VOID)
+
+
+def _summary(runs: Sequence[Sequence[Figures] | None]) -> str:
+    """Return the mean share of the faces, the mean and the worst of the best IoU, and regions."""
+    figures = [medians(rows) for rows in runs if rows]
+    if not figures:
+        return ""
+    found, iou, regions = (
+        [each[name] for each in figures] for name in ("recall_iou50", "mean_best_iou", "regions")
+    )
+    return f"{fmean(found):.3f} / {fmean(iou):.3f} ({min(iou):.3f}) / {fmean(regions):.0f}"
+
+
 def _run_preset(name: str, cloud: Labelled) -> Tensor:
     """Return the labels of a preset."""
     config = torchrg.load_config(name)
-    growing = dataclasses.replace(config.growing, min_size=cloud.min_size)
+    growing = config.growing
+    if growing.min_size != "auto":
+        growing = dataclasses.replace(growing, min_size=cloud.min_size)
     return torchrg.segment_planes(cloud.points, dataclasses.replace(config, growing=growing)).labels
 
 
@@ -205,6 +269,8 @@ def _mean_scores(run: Callable[[Labelled], Tensor], clouds: Clouds) -> Figures |
 
 def _score(cloud: Labelled, labels: Tensor) -> Figures:
     """Return the indices of all protocols."""
+    counts = cloud.truth != VOID
+    cloud, labels = Labelled(cloud.points[counts], cloud.truth[counts]), labels[counts]
     found = score_labels(labels, cloud.truth)
     voxels = score_voxels(cloud.points, labels, cloud.truth, voxel_size=VOXEL_SIZE)
     table = contingency_table(labels, cloud.truth)
