@@ -25,6 +25,9 @@ _NUM_LINKS = 12
 """Nearest neighbours over which signs spread: as many as reach between the faces of a thin
 plate."""
 
+_NUM_FOLLOWED = 6
+"""Nearest points with a sign that are asked by one without."""
+
 _MOST_SPREADING = 2**19
 """Points over which signs spread. Of larger clouds so many stand for all, which takes a kilobyte
 each, and the others follow those near to them."""
@@ -160,19 +163,24 @@ def orient_normals(
     rows = rows[(upright[rows] != 0).any(dim=-1)]
     if len(rows) == 0:
         return upright
-    spreading = rows[_evenly_spread(len(rows))]
+    spreads = _evenly_spread(len(rows)).to(rows.device)
+    spreading, following = rows[spreads], rows[~spreads]
     kept, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
     near = search_knn(kept, min(NUM_NEIGHBORS, len(kept)), canonical=True)
-    signs = turn(kept, units, near)
-    if len(spreading) < len(rows):
-        signs = _follow(cloud, upright, rows, kept, units * signs[:, None])
-    return upright.index_copy(0, rows, upright[rows] * signs[:, None].to(given.dtype))
+    oriented = units * turn(kept, units, near)[:, None]
+    turned = upright.index_copy(0, spreading, oriented.to(given.dtype))
+    if len(following) == 0:
+        return turned
+    signs = _follow(cloud, upright, following, kept, oriented)
+    return turned.index_copy(0, following, upright[following] * signs[:, None].to(given.dtype))
 
 
 def _evenly_spread(num_points: int) -> Tensor:
     """Return which points in canonical order stand for all: every so many along the curve."""
     count = min(num_points, max(_MOST_SPREADING, int(_SPREADING_SHARE * num_points)))
-    return torch.arange(count) * num_points // count
+    spreads = torch.zeros(num_points, dtype=torch.bool)
+    spreads[torch.arange(count) * num_points // count] = True
+    return spreads
 
 
 def _follow(
@@ -189,7 +197,7 @@ def _follow(
 
     def follow(chunk: slice) -> Tensor:
         own = rows[chunk]
-        _, found = tree.query(points[own].cpu().numpy(), min(_NUM_LINKS, tree.n))
+        _, found = tree.query(points[own].cpu().numpy(), min(_NUM_FOLLOWED, tree.n))
         near = torch.from_numpy(found).to(points.device)
         arms = nearest[near] - points[own, None]
         cosine, slope = _agreement(arms, normals[own, None].to(points.dtype), oriented[near])
