@@ -12,7 +12,7 @@ Functions of patches (``covariance``, ``eigh3``, ``median``, ``mad``, ``qn``, ``
 ``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are like those of torch:
 they have gradients, and run under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``,
 ``torch.export`` and ``torch.autocast``. The robust fits, scales and ``fit_normals_irls`` are one
-operation of their own to ``vmap`` (from torch 2.5), ``torch.func`` and compilers, and have no
+operation of their own to ``vmap``, ``torch.func`` and compilers, and have no
 second derivatives there. Functions of clouds (``search_knn``,
 ``estimate_normals``, ``orient_normals``, ``grow_regions``, ``segment_planes``,
 ``make_superpoints``, ``segment_depth``) search neighbours and grow regions on the CPU: a compiler

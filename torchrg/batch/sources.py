@@ -257,7 +257,7 @@ class S3DISSource(CloudSource):
                 f"expected --class-order with --layout pointcept, got layout {self.layout}, which "
                 "has the order pointcept; leave it out."
             )
-        require("pyarrow", extra="s3dis", purpose="read S3DIS")
+        require("pyarrow", extra="text", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
