@@ -109,7 +109,7 @@ class CloudSource(Source):
             scan.name,
             "converted",
             len(cloud),
-            len(seg.planes.count),
+            len(seg.planes),
             tuple(files),
             repairs=reading.repairs,
             warnings=(*notes, *reading.notes),
@@ -384,7 +384,7 @@ class RGBDSource(Source):
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = tuple(write_results(folder, coord, seg))
-        num_planes = len(seg.planes.count)
+        num_planes = len(seg.planes)
         notes = () if num_planes else ("no plane found",)
         return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)
 
