@@ -26,7 +26,8 @@ def flags_of(kind: type) -> list[Flag]:
     """Return the arguments of a command; the defaults of settings are those of the preset."""
     start = None
     if "settings" in {field.name for field in dataclasses.fields(kind)}:
-        start = {"settings": PlaneSettings.asked_for([], getattr(kind, "up", None))}
+        up = kind.up if issubclass(kind, convert.CloudArguments) else None
+        start = {"settings": PlaneSettings.asked_for([], up)}
     return list(list_flags(kind, start))
 
 
@@ -36,7 +37,8 @@ def _section(prog: str, kind: type) -> Iterator[str]:
     needed = " ".join(flag.spelling for flag in groups.get(NEEDED, ()))
     yield f"## {prog}"
     yield _escaped(describe(kind))
-    yield "\n".join(["```console", f"{prog} {needed} [options]", *example_lines(kind), "```"])
+    yield f"```text\n{prog} {needed} [options]\n```"
+    yield "\n".join(["Examples:", "", "```console", *example_lines(kind), "```"])
     yield f"```{{program}} {prog}\n```"
     for title, flags in groups.items():
         yield f"```{{rubric}} {title[0].upper()}{title[1:]}\n```"

@@ -269,7 +269,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         The cloud and what is known about it. ``.npz`` files hold all of a result, folders all but
         the masks, other files what :func:`torchrg.write_cloud` puts beside each point. A plane
         table that is not of the labels, as somebody changed them since, is left out, and
-        :attr:`Cloud.notes` says so.
+        ``notes`` of the cloud say so.
 
     Raises:
         FormatError: If there is no such file, or it is damaged; see :func:`torchrg.read_cloud`.

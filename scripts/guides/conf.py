@@ -9,14 +9,17 @@ from sphinx.application import Sphinx
 from torchrg.version import __version__
 
 project = author = "torchrg"
+project_copyright = "the torchrg authors"
 release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
 exclude_patterns = ["made"]
 """Where the examples of guides run: pages are not looked for there, pictures are."""
 
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"PinholeCamera|Template|Arguments|.*\[.*")]
-"""Types that are only there for type checkers, and pieces of long ones."""
+nitpick_ignore_regex = [("py:.*", "PinholeCamera|Template|Arguments")]
+"""Types that are only there for type checkers."""
+smartquotes = False
+"""Else flags lose a dash."""
 myst_heading_anchors = 3
 napoleon_custom_sections = ["Convention"]
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -52,6 +55,11 @@ def keep_colons(*event: Any) -> None:  # noqa: ANN401
         event[-1][:0] = ["..", ""]
 
 
+def leave_out_factories(*event: Any) -> tuple[str, str]:  # noqa: ANN401
+    """Write defaults that are made anew as dots: as Python writes them they are no expression."""
+    return (event[-2] or "").replace("<factory>", "..."), event[-1]
+
+
 def find_elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:  # noqa: ANN401
     """Lead a name to where it is described, though a package shows it, or another module has it.
 
@@ -76,4 +84,5 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-bases", show_public_bases)
     app.connect("autodoc-skip-member", leave_out_aliases)
     app.connect("autodoc-process-docstring", keep_colons, priority=400)  # Before napoleon.
+    app.connect("autodoc-process-signature", leave_out_factories)
     app.connect("missing-reference", find_elsewhere)

@@ -25,7 +25,7 @@ def write_rooms(room):
     truth = {"labels": scene.labels.numpy(), "normals": scene.normals.float().numpy()}
     for name in CLOUDS:
         Path(name).parent.mkdir(exist_ok=True)
-        has_truth = name.startswith(("room", "truth"))
+        has_truth = name.startswith(("room", "truth", "scan.ply"))
         write_cloud(Path(name), Cloud(points, truth if has_truth else {}))
     write_cloud(Path("truth.ply"), Cloud(points, truth))
     np.savetxt("scan.txt", np.column_stack([points, points[:, :1]]))
@@ -50,12 +50,13 @@ def write_frames():
     rows, columns = np.mgrid[0:480, 0:640]
     depth = 2000.0 + 0.5 * columns
     image = depth.astype(np.uint16)
-    for path in ("frame.png", "frames/0.png", "rgbd_dataset_freiburg1_xyz/depth/1.0.png"):
+    tum = Path("rgbd_dataset_freiburg1_xyz")
+    for path in ("frame.png", "frames/0.png", tum / "depth/1.0.png", tum / "rgb/1.0.png"):
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_png(Path(path), image)
-    for name in ("depth", "rgb", "groundtruth"):
-        line = "1.0 depth/1.0.png\n" if name == "depth" else ""
-        Path(f"rgbd_dataset_freiburg1_xyz/{name}.txt").write_text(f"# {name}\n{line}")
+    for name in ("depth", "rgb"):
+        (tum / f"{name}.txt").write_text(f"1.0 {name}/1.0.png\n")
+    (tum / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n")
     axes = (columns - 319.5) / 525, (rows - 239.5) / 525, np.ones(depth.shape)
     pixels = np.stack([axis * depth / 1000 for axis in axes], axis=-1).astype(np.float32)
     write_cloud(Path("kinect.pcd"), Cloud(pixels.reshape(-1, 3), grid_shape=depth.shape))
@@ -89,11 +90,10 @@ def test_example_runs(line, room, run, tmp_path, monkeypatch):
     if "*.ply" in line:
         Path("truth.ply").unlink()
     words = [name for word in shlex.split(line) for name in sorted(glob_of(word))]
-    before = set(tmp_path.rglob("*"))
     done = run(*words[1:])
     assert done.code == 0, done.err
-    says_only = {"info", "score", "--dry-run"} & set(words)
-    assert says_only or set(tmp_path.rglob("*")) > before or "--out" in words
+    if "--out" in words:
+        assert Path(words[words.index("--out") + 1]).exists()
 
 
 def glob_of(word):
