@@ -50,7 +50,7 @@ def write_frames():
     rows, columns = np.mgrid[0:480, 0:640]
     depth = 2000.0 + 0.5 * columns
     image = depth.astype(np.uint16)
-    tum = Path("rgbd_dataset_freiburg1_xyz")
+    tum = Path("capture")
     for path in ("frame.png", "frames/0.png", tum / "depth/1.0.png", tum / "rgb/1.0.png"):
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_png(Path(path), image)
