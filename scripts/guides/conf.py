@@ -6,11 +6,11 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from torchrg.version import __version__
+import torchrg
 
 project = author = "torchrg"
 project_copyright = "the torchrg authors"
-release = __version__
+release = torchrg.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
 exclude_patterns = ["made"]
 """Where the examples of guides run: pages are not looked for there, pictures are."""
@@ -55,9 +55,10 @@ def keep_colons(*event: Any) -> None:  # noqa: ANN401
         event[-1][:0] = ["..", ""]
 
 
-def leave_out_factories(*event: Any) -> tuple[str, str]:  # noqa: ANN401
+def leave_out_factories(*event: Any) -> tuple[str, str] | None:  # noqa: ANN401
     """Write defaults that are made anew as dots: as Python writes them they are no expression."""
-    return (event[-2] or "").replace("<factory>", "..."), event[-1]
+    *_, signature, returned = event
+    return (signature.replace("<factory>", "..."), returned) if signature else None
 
 
 def find_elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:  # noqa: ANN401

@@ -1,5 +1,6 @@
 """The examples of commands, which their help and the page of commands show, run as they stand."""
 
+import json
 import shlex
 from pathlib import Path
 
@@ -46,17 +47,17 @@ def write_stations(points):
 
 
 def write_frames():
-    """Depth images of a wall, alone, in a folder, and as TUM has them; and an organised cloud."""
+    """Depth images of a wall, alone, in a folder, and in a capture; and an organised cloud."""
     rows, columns = np.mgrid[0:480, 0:640]
     depth = 2000.0 + 0.5 * columns
     image = depth.astype(np.uint16)
-    tum = Path("capture")
-    for path in ("frame.png", "frames/0.png", tum / "depth/1.0.png", tum / "rgb/1.0.png"):
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
+    for path in ("frame.png", "frames/0.png", "capture/0.png"):
+        Path(path).parent.mkdir(exist_ok=True)
         write_png(Path(path), image)
-    for name in ("depth", "rgb"):
-        (tum / f"{name}.txt").write_text(f"1.0 {name}/1.0.png\n")
-    (tum / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n")
+    camera = {"fl_x": 525, "fl_y": 525, "cx": 320, "cy": 240, "w": 640, "h": 480}
+    frame = {"depth_file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
+    content = camera | {"frames": [frame | {"file_path": "0.jpg"}]}
+    Path("capture/transforms.json").write_text(json.dumps(content))
     axes = (columns - 319.5) / 525, (rows - 239.5) / 525, np.ones(depth.shape)
     pixels = np.stack([axis * depth / 1000 for axis in axes], axis=-1).astype(np.float32)
     write_cloud(Path("kinect.pcd"), Cloud(pixels.reshape(-1, 3), grid_shape=depth.shape))

@@ -38,6 +38,5 @@ def test_notebook_shows_what_it_is_stored_with(tmp_path):
     pytest.importorskip("pydeck", reason="needs the extra view")
     client = pytest.importorskip("nbclient", reason="needs the extra dev")
     stored = nbformat.read(NOTEBOOK, as_version=4)
-    place = {"metadata": {"path": str(tmp_path)}}
-    again = client.execute(nbformat.read(NOTEBOOK, as_version=4), resources=place)
+    again = client.execute(nbformat.read(NOTEBOOK, as_version=4), cwd=str(tmp_path))
     assert texts_of(again) == texts_of(stored)
