@@ -45,6 +45,7 @@ OPENED = {
         "ISBNet/dataset/s3dis/preprocess/Area_5_office_1_inst_nostuff.pth",
     ],
     "OneFormer3D and UniDet3D": ["oneformer3d/data/scannet/super_points/scene0000_00.bin"],
+    "UniDet3D": ["unidet3d/data/scannet/super_points/scene0000_00.bin"],
     "OneFormer3D with S3DIS": ["oneformer3d/data/s3dis/points/Area_5_office_1.bin"],
     "Mask3D": [
         "Mask3D/data/processed/scannet/validation_database.yaml",
@@ -72,7 +73,9 @@ def recipes():
         title: re.findall(r"^```console\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
         for title, text in zip(parts[1::2], parts[2::2], strict=True)
     }
-    return {title: "".join(found) for title, found in blocks.items() if found}
+    found = {title: "".join(lines) for title, lines in blocks.items() if lines}
+    lines = found["OneFormer3D and UniDet3D"].replace("oneformer3d_1xb4", "unidet3d_1xb8")
+    return found | {"UniDet3D": lines.replace("oneformer3d", "unidet3d")}
 
 
 def commands():
@@ -121,7 +124,7 @@ def write_processed(folder, name, room):
 def releases(tmp_path_factory):
     """Small releases of ScanNet, ScanNet++ and S3DIS, and a scan."""
     root = tmp_path_factory.mktemp("releases")
-    room = make_room(16_000, noise=0.003, seed=1)
+    room = make_room(24_000, noise=0.003, seed=1)
     coord, faces = room.points.float().numpy(), room.labels.numpy()
     color = np.random.default_rng(0).integers(0, 256, coord.shape).astype(np.uint8)
     words = [*WORDS]
