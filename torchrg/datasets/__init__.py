@@ -11,7 +11,8 @@ The guide on training says how the loaders of Pointcept, Superpoint Transformer,
 and networks on superpoints take these results.
 
 A new data set is a :class:`~torchrg.datasets.folder.SceneDataset` in a file of its own, exported
-here, and a test; a new folder of depth frames is a row of :data:`~torchrg.datasets.rgbd.LAYOUTS`.
+here, and a test; a new folder of depth frames is a row of
+:data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
 """
 
 from torchrg.datasets.collate import collate_offset

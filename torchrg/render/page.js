@@ -13,7 +13,7 @@ const SLOW_MS = 45, FAST_MS = 22; // Frames between these times keep the number 
 // either side, that with the nearer middle is in front. With more, one sees through thin plates.
 const DOME = "1.0";
 // Radius of a disc in units of the spacing: smaller ones leave gaps between random points.
-const RADIUS = 1.6;
+const RADIUS = 1.75;
 const STILL_MS = 250; // After so long without a turn all points are drawn again.
 
 // ---- What the file holds ---------------------------------------------------------------------
