@@ -279,6 +279,11 @@ class ScanNetSource(CloudSource):
 
     kind: ClassVar[str] = "scannet"
 
+    @property
+    def in_place(self) -> bool:
+        """Whether results may go beside the folders of meshes, where programs look for them."""
+        return self.layout != "scannet"
+
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
         scans = []
