@@ -1,5 +1,11 @@
-"""The plane table in files: as arrays in ``.npz``, and as JSON in folders of arrays."""
+"""The plane table in files: arrays in ``.npz``, JSON in folders of arrays, CSV for other programs.
 
+All have the columns of :func:`describe_planes`; CSV, and data frames, those of :data:`CSV_COLUMNS`.
+"""
+
+import csv
+import io
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +20,14 @@ Arrays = dict[str, Array]
 """Parts of the table by their names in ``.npz``."""
 Json = dict[str, Any]
 """Parts of the table as JSON can hold them, by name."""
+CSV_COLUMNS = (
+    "id", "kind", "object", "normal", "offset", "centroid", "area", "count", "rms", "dip_deg",
+    "dip_direction_deg", "curved", "outline",
+)  # fmt: skip
+"""Columns of a table of single values, empty where nothing is known. Directions and places become
+three of them, as ``normal_x``; an outline is text, a WKT ``POLYGON Z``."""
+TABLE_SUFFIXES = (".csv", ".json")
+"""Suffixes of files of tables."""
 
 
 def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
@@ -42,6 +56,8 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
     arrays |= {f"plane_{name}": moved(getattr(planes, name)) for name in ("centroid", "center")}
     if planes.kind is not None:
         arrays["plane_kind"] = np.array(PLANE_KINDS)[planes.kind.numpy(force=True)]
+    if planes.object is not None:
+        arrays["plane_object"] = planes.object.numpy(force=True)
     if planes.adjacency is not None:
         for name, values in planes.adjacency._asdict().items():
             arrays[f"adjacency_{name}"] = values.numpy(force=True)
@@ -80,10 +96,12 @@ def planes_from_arrays(
     }
     columns["offset"] = columns["offset"] - columns["normal"] @ origin
     columns |= {name: columns[name] - origin for name in ("centroid", "center")}
-    table = Planes._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), None, None, None])
+    table = Planes._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), *[None] * 4])
     if "plane_kind" in arrays:
         kinds = [PLANE_KINDS.index(word) for word in read("plane_kind", "U", (num_planes,))]
         table = table._replace(kind=torch.tensor(kinds, dtype=torch.int64))
+    if "plane_object" in arrays:
+        table = table._replace(object=tensor(read("plane_object", "i8", (num_planes,))))
     if "adjacency_pairs" in arrays:
         num_pairs = len(arrays["adjacency_pairs"])
         pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
@@ -123,6 +141,8 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     Returns:
         ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
         :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
+        With z up and y north, ``dip_deg`` is the angle to the horizontal, in [0, 90], and
+        ``dip_direction_deg`` where the plane falls, clockwise from north, 0 if it is level.
         ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
 
     Example:
@@ -132,19 +152,98 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         >>> plane["count"], plane["normal"], plane["offset"]
         (81, [0.0, 0.0, 1.0], 6.0)
     """
-    arrays = planes_to_arrays(
-        planes, np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
-    )
+    columns, pairs = _columns(planes, origin)
+    table: Json = {"planes": _rows(columns)}
+    if planes.adjacency is not None:
+        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
+    return table
+
+
+def tabulate_planes(
+    planes: Planes,
+    *,
+    origin: Sequence[float] | None = None,
+    names: Sequence[int] | None = None,
+) -> Json:
+    """Return a plane table as columns of single values by name, those of :data:`CSV_COLUMNS`.
+
+    Numbers are those of :func:`describe_planes`, whose arguments these are, to the last digit;
+    with ``names`` these are the ids.
+
+    Example:
+        >>> from torchrg.pipeline import segment_planes
+        >>> slope = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.zeros(1))
+        >>> slope[:, 2] = slope[:, 1]
+        >>> columns = tabulate_planes(segment_planes(slope, "classic").planes)
+        >>> [round(value) for value in columns["dip_deg"] + columns["dip_direction_deg"]]
+        [45, 180]
+    """
+    described, _ = _columns(planes, origin)
+    described["id"] = described["id"] if names is None else names
+    columns: Json = {}
+    for name in CSV_COLUMNS:
+        values = described.get(name, [None] * len(planes.count))
+        if name == "outline" and planes.outline is not None:
+            values = map(_to_wkt, values, described["normal"])
+        if name in ("normal", "centroid"):
+            rows = np.array(values, dtype=np.float64).reshape(-1, 3)
+            columns |= {f"{name}_{x}": rows[:, i].tolist() for i, x in enumerate("xyz")}
+        else:
+            columns[name] = [*values]
+    return columns
+
+
+def encode_table(
+    suffix: str,
+    planes: Planes,
+    *,
+    origin: Sequence[float] | None = None,
+    names: Sequence[int] | None = None,
+) -> bytes:
+    """Return the file of a table whose name ends so, one of :data:`TABLE_SUFFIXES`."""
+    if suffix.lower() == ".json":
+        return json.dumps(describe_planes(planes, origin=origin), indent=1).encode()
+    columns, text = tabulate_planes(planes, origin=origin, names=names), io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue().encode()
+
+
+def _columns(planes: Planes, origin: Sequence[float] | None) -> tuple[Json, Json]:
+    """Return the columns of a table as lists, and those of its adjacency."""
+    start = np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
+    arrays = planes_to_arrays(planes, start)
     columns = {"id": [*range(len(planes.count))]} | _lists(arrays, "plane_")
+    normal = arrays["plane_normal"].astype(np.float64)
+    x, y, z = (normal * np.where(normal[:, 2:] < 0, -1, 1)).T
+    columns["dip_deg"] = np.degrees(np.arctan2(np.hypot(x, y), z)).tolist()
+    columns["dip_direction_deg"] = (np.degrees(np.arctan2(x, y)) % 360).tolist()
     if planes.outline is not None:
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
         columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
-    table: Json = {"planes": _rows(columns)}
-    if planes.adjacency is not None:
-        pairs = _lists(arrays, "adjacency_")
-        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
-    return table
+    return columns, _lists(arrays, "adjacency_")
+
+
+def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float]) -> str:
+    """Return rings as a WKT polygon, or several: outer ones run counter-clockwise, then holes.
+
+    Example:
+        >>> _to_wkt([[[0.0, 0.0, 7.5], [1.0, 0.0, 7.5], [0.0, 1.0, 7.5]]], [0, 0, 1])
+        'POLYGON Z ((0.0 0.0 7.5, 1.0 0.0 7.5, 0.0 1.0 7.5, 0.0 0.0 7.5))'
+    """
+    polygons: list[list[str]] = []
+    for ring in rings:
+        places = np.array(ring) - ring[0]
+        if np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0) @ normal > 0:
+            polygons.append([])
+        corners = (" ".join(map(repr, place)) for place in [*ring, ring[0]])
+        polygons[-1].append(f"({', '.join(corners)})")
+    texts = [f"({', '.join(polygon)})" for polygon in polygons]
+    if len(texts) > 1:
+        return f"MULTIPOLYGON Z ({', '.join(texts)})"
+    return f"POLYGON Z {texts[0]}" if texts else "POLYGON Z EMPTY"
 
 
 def _lists(arrays: Arrays, prefix: str) -> Json:
@@ -164,8 +263,9 @@ def arrays_of_description(described: Json) -> Arrays:
         f"plane_{name}": np.array([row[name] for row in rows], dtype).reshape(len(rows), *shape)
         for name, (dtype, shape) in PLANE_COLUMNS.items()
     }
-    if rows and "kind" in rows[0]:
-        arrays["plane_kind"] = np.array([row["kind"] for row in rows])
+    for name in ("kind", "object"):
+        if rows and name in rows[0]:
+            arrays[f"plane_{name}"] = np.array([row[name] for row in rows])
     if rows and "outline" in rows[0]:
         rings = [(row["id"], ring) for row in rows for ring in row["outline"]]
         arrays["outline_points"] = np.array([p for _, ring in rings for p in ring]).reshape(-1, 3)

@@ -293,6 +293,8 @@ class Planes(NamedTuple):
         outline: Rings around each region, of shape ``(V, 3)``: outer ones counter-clockwise seen
             against the normal, holes clockwise; None where not asked for.
         adjacency: Which planes meet; None where the neighbours were not given.
+        object: Object that each plane is of, shape ``(M,)``, int64; None where planes were not kept
+            within objects.
     """
 
     normal: Tensor
@@ -308,6 +310,15 @@ class Planes(NamedTuple):
     kind: Tensor | None = None
     outline: tuple[tuple[Tensor, ...], ...] | None = None
     adjacency: PlaneAdjacency | None = None
+    object: Tensor | None = None
+
+    def to_pandas(self) -> Any:  # noqa: ANN401
+        """Return a ``pandas.DataFrame``, the columns of :data:`torchrg.plane_table.CSV_COLUMNS`.
+
+        Raises:
+            MissingDependencyError: If pandas is not installed.
+        """
+        return _display.call("as_frame", self)
 
 
 PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {

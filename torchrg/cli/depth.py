@@ -14,13 +14,21 @@ from torchrg.batch.sources import orient_image
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
-from torchrg.cli.loop import check_apart, note_input, output_paths, picture_paths, run_each
+from torchrg.cli.loop import (
+    check_apart,
+    note_input,
+    output_paths,
+    paths_beside,
+    run_each,
+    write_table,
+)
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
 from torchrg.depth import DepthConfig, find_intrinsics, make_intrinsics, segment_depth
 from torchrg.depth.camera import points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
+from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render import color_planes, write_png
 from torchrg.structures import Cloud, Segmentation
 
@@ -38,8 +46,8 @@ class Arguments:
     """Label the planes of depth images, or of organised clouds taken as such.
 
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
-    beside it, or as a cloud in camera coordinates. For folders and sequences of depth images there
-    is torchrg convert rgbd.
+    and a table of the planes beside it, or as a cloud, all in camera coordinates. For folders and
+    sequences of depth images there is torchrg convert rgbd.
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
@@ -58,6 +66,14 @@ class Arguments:
     picture: Path | None = None
     """Place of the coloured picture, a .png file; for several inputs a directory. Default: beside
     labels that are written as .png, with _planes in its name."""
+    table: Annotated[
+        Path | None,
+        Argument(
+            metavar="PLANES.csv",
+            text="Table of the planes, .csv or .json; for several inputs a directory. Default: "
+            "beside labels that are written as .png, with .json in place of .png.",
+        ),
+    ] = None
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
     orient: flags.ImageOrientFlag = "auto"
@@ -71,14 +87,17 @@ def run(argv: list[str]) -> int:
     _check_inputs(arguments)
     inputs = arguments.inputs
     targets = output_paths(inputs, arguments.out, suffix=".png")
-    pictures = picture_paths(targets, arguments.picture, suffixes=(".png",))
+    pictures = paths_beside(targets, arguments.picture, suffixes=(".png",))
     if arguments.picture is None:
         pictures = [t.with_name(f"{t.stem}_planes.png") if _is_png(t) else None for t in targets]
-    drawn = [picture for picture in pictures if picture is not None]
-    check_apart([*targets, *drawn], inputs)
-    for picture in drawn:
-        check_place(picture)
-    return run_each(_label, arguments, inputs, targets, pictures)
+    tables = paths_beside(targets, arguments.table, suffixes=TABLE_SUFFIXES)
+    if arguments.table is None:
+        tables = [target.with_suffix(".json") if _is_png(target) else None for target in targets]
+    beside = [path for path in (*pictures, *tables) if path is not None]
+    check_apart([*targets, *beside], inputs)
+    for path in beside:
+        check_place(path)
+    return run_each(_label, arguments, inputs, targets, pictures, tables)
 
 
 def _check_inputs(arguments: Arguments) -> None:
@@ -95,7 +114,9 @@ def _check_inputs(arguments: Arguments) -> None:
             raise ConfigError(f"{path}: expected {flag}, which depth images do not hold; pass it.")
 
 
-def _label(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
+def _label(
+    arguments: Arguments, source: Path, target: Path, picture: Path | None, table: Path | None
+) -> None:
     """Label an image, write its result, and print one line about it."""
     begin = time.perf_counter()
     _check_memory(source)
@@ -121,6 +142,8 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
         write_png(target, seg.labels + 1)
     else:
         _write_cloud(arguments, source, target, cloud, seg)
+    if table is not None:
+        write_table(table, seg.planes, cloud.origin.tolist())
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
     say(

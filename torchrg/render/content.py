@@ -11,11 +11,12 @@ from torch.nn import functional
 
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
+from torchrg.plane_table import describe_planes, encode_table
 from torchrg.regions.table import classify_planes, summarize_planes
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import Surface, sample_surface
-from torchrg.result import Result, describe_planes
+from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
@@ -136,11 +137,9 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     angle and along which length. Kinds go by the upward direction of the page where the result has
     none.
     """
-    planes, origin = result.planes, result.cloud.origin
-    if planes is None or len(planes.count) == 0:
+    planes, origin = _with_kinds(result, frame), result.cloud.origin
+    if planes is None:
         return []
-    if planes.kind is None:
-        planes = planes._replace(kind=classify_planes(planes, frame.rotation[2]))
     table = describe_planes(planes, origin=origin.tolist())
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
     for found in table.get("adjacency", []):
@@ -160,6 +159,24 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
             table["planes"], result.names.tolist(), rings, corners, meets, strict=True
         )
     ]
+
+
+def table_of_page(result: Result, frame: Frame) -> bytes:
+    """Return the table of the planes as CSV, which a page gives to other programs."""
+    planes, origin = _with_kinds(result, frame), result.cloud.origin.tolist()
+    if planes is None:
+        return b""
+    return encode_table(".csv", planes, origin=origin, names=result.names.tolist())
+
+
+def _with_kinds(result: Result, frame: Frame) -> Planes | None:
+    """Return the table of a result with the roles that it has on a page; None without planes."""
+    planes = result.planes
+    if planes is None or len(planes.count) == 0:
+        return None
+    if planes.kind is not None:
+        return planes
+    return planes._replace(kind=classify_planes(planes, frame.rotation[2]))
 
 
 def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:

@@ -41,6 +41,7 @@ from torchrg.render.content import (
     planes_of_page,
     radii_of,
     rounded,
+    table_of_page,
 )
 from torchrg.render.cutaway import LEAST_FACING, View, choose_viewpoint
 from torchrg.result import Result
@@ -233,6 +234,8 @@ def _describe_cloud(
     arrays["covered"] = covered.numpy()
     radii = radii_of(shown.surface)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
+    if planes:
+        arrays["table"] = np.frombuffer(table_of_page(result, frame), np.uint8)
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
