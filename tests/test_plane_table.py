@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,12 +90,12 @@ def test_the_outline_is_a_polygon_that_shapely_reads(square):
 def test_parts_that_do_not_touch_are_one_line(square):
     shapely = pytest.importorskip("shapely")
     far = tuple(ring + torch.tensor([9.0, 0, 0]) for ring in square.outline[0])
-    two = square._replace(outline=((*square.outline[0], *far),))
+    two = replace(square, outline=((*square.outline[0], *far),))
     (row,) = rows_of(encode_table(".csv", two))
     polygons = shapely.from_wkt(row["outline"])
     assert polygons.geom_type == "MultiPolygon"
     assert [len(part.interiors) for part in polygons.geoms] == [1, 1]
-    (row,) = rows_of(encode_table(".csv", square._replace(outline=((),))))
+    (row,) = rows_of(encode_table(".csv", replace(square, outline=((),))))
     assert shapely.from_wkt(row["outline"]).is_empty
 
 
@@ -121,12 +122,12 @@ def test_the_columns_are_the_same_without_planes_and_with_all(square):
     plain = {name for name in CSV_COLUMNS if name not in ("normal", "centroid")}
     expected = plain | {f"{name}_{x}" for name in ("normal", "centroid") for x in "xyz"}
     none = segment_planes(torch.zeros(5, 3)).planes
-    for planes in (none, square, square._replace(object=torch.tensor([4]))):
+    for planes in (none, square, replace(square, object=torch.tensor([4]))):
         header = encode_table(".csv", planes).decode().splitlines()[0].split(",")
         assert set(header) == expected
         assert list(tabulate_planes(planes)) == header
     assert encode_table(".csv", none).count(b"\n") == 1
-    assert tabulate_planes(square._replace(object=torch.tensor([4])))["object"] == [4]
+    assert tabulate_planes(replace(square, object=torch.tensor([4])))["object"] == [4]
     assert tabulate_planes(square)["kind"] == ["oblique"]
 
 

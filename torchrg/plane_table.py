@@ -7,6 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,12 +97,13 @@ def planes_from_arrays(
     }
     columns["offset"] = columns["offset"] - columns["normal"] @ origin
     columns |= {name: columns[name] - origin for name in ("centroid", "center")}
-    table = Planes._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), *[None] * 4])
+    known: Json = {name: tensor(values) for name, values in columns.items()}
+    table = Planes(**known)
     if "plane_kind" in arrays:
         kinds = [PLANE_KINDS.index(word) for word in read("plane_kind", "U", (num_planes,))]
-        table = table._replace(kind=torch.tensor(kinds, dtype=torch.int64))
+        table = replace(table, kind=torch.tensor(kinds, dtype=torch.int64))
     if "plane_object" in arrays:
-        table = table._replace(object=tensor(read("plane_object", "i8", (num_planes,))))
+        table = replace(table, object=tensor(read("plane_object", "i8", (num_planes,))))
     if "adjacency_pairs" in arrays:
         num_pairs = len(arrays["adjacency_pairs"])
         pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
@@ -110,7 +112,7 @@ def planes_from_arrays(
         )
         _check_planes(pairs, num_planes)
         adjacency = PlaneAdjacency(tensor(pairs), tensor(length), tensor(angle))
-        table = table._replace(adjacency=adjacency)
+        table = replace(table, adjacency=adjacency)
     if "outline_points" in arrays:
         num_rings = len(arrays["outline_ring_sizes"])
         sizes = read("outline_ring_sizes", "i8", (num_rings,))
@@ -120,7 +122,7 @@ def planes_from_arrays(
         outline: list[tuple[Tensor, ...]] = [()] * num_planes
         for owner, end, size in zip(owners, sizes.cumsum(), sizes, strict=True):
             outline[owner] += (tensor(points[end - size : end]),)
-        table = table._replace(outline=tuple(outline))
+        table = replace(table, outline=tuple(outline))
     return table
 
 
@@ -182,7 +184,7 @@ def tabulate_planes(
     described["id"] = described["id"] if names is None else names
     columns: Json = {}
     for name in CSV_COLUMNS:
-        values = described.get(name, [None] * len(planes.count))
+        values = described.get(name, [None] * len(planes))
         if name == "outline" and planes.outline is not None:
             values = map(_to_wkt, values, described["normal"])
         if name in ("normal", "centroid"):
@@ -214,7 +216,7 @@ def _columns(planes: Planes, origin: Sequence[float] | None) -> tuple[Json, Json
     """Return the columns of a table as lists, and those of its adjacency."""
     start = np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
     arrays = planes_to_arrays(planes, start)
-    columns = {"id": [*range(len(planes.count))]} | _lists(arrays, "plane_")
+    columns = {"id": [*range(len(planes))]} | _lists(arrays, "plane_")
     normal = arrays["plane_normal"].astype(np.float64)
     x, y, z = (normal * np.where(normal[:, 2:] < 0, -1, 1)).T
     columns["dip_deg"] = np.degrees(np.arctan2(np.hypot(x, y), z)).tolist()

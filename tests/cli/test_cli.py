@@ -143,7 +143,7 @@ def mistakes(tmp_path, monkeypatch):
         ("ROOM", ["--preset", "clasic"], "classic, classic_increment"),
         ("ROOM", ["--angle-deg", "91"], "expected angle_deg in [0, 90], got 91.0"),
         ("ROOM", ["--angle-deg", "five"], "--angle-deg"),
-        ("ROOM", ["--config", "wrong.yaml"], "unknown key 'max_angle'"),
+        ("ROOM", ["--config", "wrong.yaml"], "unknown setting 'max_angle'"),
         ("ROOM", ["--config", "none.yaml"], "No such file"),
         ("ROOM", ["--normals.k", "2"], "expected k >= 3, got 2"),
         ("ROOM", ["--normals.k", "many"], "--normals.k"),

@@ -128,7 +128,7 @@ class CloudSource(Source):
             scan.name,
             "converted",
             len(cloud),
-            len(seg.planes.count),
+            len(seg.planes),
             tuple(files),
             repairs=reading.repairs,
             warnings=(*notes, *reading.notes),
@@ -279,7 +279,7 @@ class S3DISSource(CloudSource):
                 f"expected --class-order with --layout pointcept, got layout {self.layout}, which "
                 "has the order pointcept; leave it out."
             )
-        require("pyarrow", extra="s3dis", purpose="read S3DIS")
+        require("pyarrow", extra="text", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
@@ -406,7 +406,7 @@ class RGBDSource(Source):
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = tuple(write_results(folder, coord, seg, table=self.table))
-        num_planes = len(seg.planes.count)
+        num_planes = len(seg.planes)
         notes = () if num_planes else ("no plane found",)
         return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)
 

@@ -130,7 +130,7 @@ def _label(
     seg = segment_depth(depth, camera, arguments.depth, pose=pose)
     points = cloud.points.view(*depth.shape, 3)
     seg = orient_image(seg, points, arguments.orient)
-    num_planes = len(seg.planes.count)
+    num_planes = len(seg.planes)
     if num_planes == 0:
         warn(f"{source}: no plane found: no region is large enough.")
     if picture is not None:

@@ -1,5 +1,6 @@
 """What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
 
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import NamedTuple
 
@@ -171,12 +172,10 @@ def table_of_page(result: Result, frame: Frame) -> bytes:
 
 def _with_kinds(result: Result, frame: Frame) -> Planes | None:
     """Return the table of a result with the roles that it has on a page; None without planes."""
-    planes = result.planes
-    if planes is None or len(planes.count) == 0:
-        return None
-    if planes.kind is not None:
+    planes = result.planes or None
+    if planes is None or planes.kind is not None:
         return planes
-    return planes._replace(kind=classify_planes(planes, frame.rotation[2]))
+    return replace(planes, kind=classify_planes(planes, frame.rotation[2]))
 
 
 def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:
