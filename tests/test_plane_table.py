@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import math
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ from torchrg.config import load_config
 from torchrg.plane_table import (
     CSV_COLUMNS,
     describe_planes,
-    encode_table,
+    encode_csv,
     tabulate_planes,
 )
 from torchrg.regions import summarize_planes
@@ -71,7 +70,7 @@ def test_dip_is_that_of_a_compass(normal, dip, direction):
 
 def test_the_outline_is_a_polygon_that_shapely_reads(square):
     shapely = pytest.importorskip("shapely")
-    (row,) = rows_of(encode_table(".csv", square, origin=UTM))
+    (row,) = rows_of(encode_csv(describe_planes(square, origin=UTM)))
     polygon = shapely.from_wkt(row["outline"])
     assert polygon.geom_type == "Polygon"
     assert polygon.has_z
@@ -91,19 +90,18 @@ def test_parts_that_do_not_touch_are_one_line(square):
     shapely = pytest.importorskip("shapely")
     far = tuple(ring + torch.tensor([9.0, 0, 0]) for ring in square.outline[0])
     two = replace(square, outline=((*square.outline[0], *far),))
-    (row,) = rows_of(encode_table(".csv", two))
+    (row,) = rows_of(encode_csv(describe_planes(two)))
     polygons = shapely.from_wkt(row["outline"])
     assert polygons.geom_type == "MultiPolygon"
     assert [len(part.interiors) for part in polygons.geoms] == [1, 1]
-    (row,) = rows_of(encode_table(".csv", replace(square, outline=((),))))
+    (row,) = rows_of(encode_csv(describe_planes(replace(square, outline=((),)))))
     assert shapely.from_wkt(row["outline"]).is_empty
 
 
 def test_csv_has_the_numbers_of_the_json_to_the_last_digit(room):
     planes = segment_planes(room(4000).points.double(), load_config("classic")).planes
-    described = json.loads(encode_table(".json", planes, origin=UTM))
-    assert described == describe_planes(planes, origin=UTM)
-    found = rows_of(encode_table(".csv", planes, origin=UTM))
+    described = describe_planes(planes, origin=UTM)
+    found = rows_of(encode_csv(describe_planes(planes, origin=UTM)))
     for row, expected in zip(found, described["planes"], strict=True):
         assert int(row["id"]) == expected["id"]
         assert [float(row[f"centroid_{x}"]) for x in "xyz"] == expected["centroid"]
@@ -123,23 +121,21 @@ def test_the_columns_are_the_same_without_planes_and_with_all(square):
     expected = plain | {f"{name}_{x}" for name in ("normal", "centroid") for x in "xyz"}
     none = segment_planes(torch.zeros(5, 3)).planes
     for planes in (none, square, replace(square, object=torch.tensor([4]))):
-        header = encode_table(".csv", planes).decode().splitlines()[0].split(",")
+        header = encode_csv(describe_planes(planes)).decode().splitlines()[0].split(",")
         assert set(header) == expected
-        assert list(tabulate_planes(planes)) == header
-    assert encode_table(".csv", none).count(b"\n") == 1
-    assert tabulate_planes(replace(square, object=torch.tensor([4])))["object"] == [4]
-    assert tabulate_planes(square)["kind"] == ["oblique"]
-
-
-def test_names_take_the_place_of_numbers(square):
-    assert tabulate_planes(square, names=[17])["id"] == [17]
+        assert list(tabulate_planes(describe_planes(planes))) == header
+    assert encode_csv(describe_planes(none)).count(b"\n") == 1
+    assert tabulate_planes(describe_planes(replace(square, object=torch.tensor([4]))))[
+        "object"
+    ] == [4]
+    assert tabulate_planes(describe_planes(square))["kind"] == ["oblique"]
 
 
 def test_a_data_frame_has_the_columns_of_the_table(room):
     pytest.importorskip("pandas", reason="needs the extra report")
     seg = segment_planes(room(4000).points, load_config("classic"))
     frame = seg.planes.to_pandas()
-    assert list(frame) == list(tabulate_planes(seg.planes))
+    assert list(frame) == list(tabulate_planes(describe_planes(seg.planes)))
     assert frame["count"].tolist() == seg.planes.count.tolist()
     assert frame["normal_z"].tolist() == seg.planes.normal[:, 2].tolist()
     assert len(segment_planes(torch.zeros(5, 3)).planes.to_pandas()) == 0

@@ -24,13 +24,13 @@ from torchrg.errors import ShapeError
 from torchrg.neighbors import (
     canonical_order,
     finite_rows,
-    keep_within,
     measure_sampling,
     restore_points,
     restore_rows,
     sample_voxels,
     search_knn,
 )
+from torchrg.neighbors.knn import keep_within
 from torchrg.normals import ESTIMATORS
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes

@@ -1,11 +1,10 @@
 """The plane table in files: arrays in ``.npz``, JSON in folders of arrays, CSV for other programs.
 
-All have the columns of :func:`describe_planes`; CSV, and data frames, those of :data:`CSV_COLUMNS`.
+:func:`describe_planes` says what is known of a plane; the others are made of it.
 """
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -25,8 +24,8 @@ CSV_COLUMNS = (
     "id", "kind", "object", "normal", "offset", "centroid", "area", "count", "rms", "dip_deg",
     "dip_direction_deg", "curved", "outline",
 )  # fmt: skip
-"""Columns of a table of single values, empty where nothing is known. Directions and places become
-three of them, as ``normal_x``; an outline is text, a WKT ``POLYGON Z``."""
+"""Columns of CSV and of data frames, empty where nothing is known. Directions and places are three
+of them, as ``normal_x``; an outline is text, a WKT ``POLYGON Z``."""
 TABLE_SUFFIXES = (".csv", ".json")
 """Suffixes of files of tables."""
 
@@ -154,78 +153,54 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         >>> plane["count"], plane["normal"], plane["offset"]
         (81, [0.0, 0.0, 1.0], 6.0)
     """
-    columns, pairs = _columns(planes, origin)
-    table: Json = {"planes": _rows(columns)}
-    if planes.adjacency is not None:
-        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
-    return table
-
-
-def tabulate_planes(
-    planes: Planes,
-    *,
-    origin: Sequence[float] | None = None,
-    names: Sequence[int] | None = None,
-) -> Json:
-    """Return a plane table as columns of single values by name, those of :data:`CSV_COLUMNS`.
-
-    Numbers are those of :func:`describe_planes`, whose arguments these are, to the last digit;
-    with ``names`` these are the ids.
-
-    Example:
-        >>> from torchrg.pipeline import segment_planes
-        >>> slope = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.zeros(1))
-        >>> slope[:, 2] = slope[:, 1]
-        >>> columns = tabulate_planes(segment_planes(slope, "classic").planes)
-        >>> [round(value) for value in columns["dip_deg"] + columns["dip_direction_deg"]]
-        [45, 180]
-    """
-    described, _ = _columns(planes, origin)
-    described["id"] = described["id"] if names is None else names
-    columns: Json = {}
-    for name in CSV_COLUMNS:
-        values = described.get(name, [None] * len(planes))
-        if name == "outline" and planes.outline is not None:
-            values = map(_to_wkt, values, described["normal"])
-        if name in ("normal", "centroid"):
-            rows = np.array(values, dtype=np.float64).reshape(-1, 3)
-            columns |= {f"{name}_{x}": rows[:, i].tolist() for i, x in enumerate("xyz")}
-        else:
-            columns[name] = [*values]
-    return columns
-
-
-def encode_table(
-    suffix: str,
-    planes: Planes,
-    *,
-    origin: Sequence[float] | None = None,
-    names: Sequence[int] | None = None,
-) -> bytes:
-    """Return the file of a table whose name ends so, one of :data:`TABLE_SUFFIXES`."""
-    if suffix.lower() == ".json":
-        return json.dumps(describe_planes(planes, origin=origin), indent=1).encode()
-    columns, text = tabulate_planes(planes, origin=origin, names=names), io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    return text.getvalue().encode()
-
-
-def _columns(planes: Planes, origin: Sequence[float] | None) -> tuple[Json, Json]:
-    """Return the columns of a table as lists, and those of its adjacency."""
-    start = np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
-    arrays = planes_to_arrays(planes, start)
+    arrays = planes_to_arrays(
+        planes, np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
+    )
     columns = {"id": [*range(len(planes))]} | _lists(arrays, "plane_")
-    normal = arrays["plane_normal"].astype(np.float64)
-    x, y, z = (normal * np.where(normal[:, 2:] < 0, -1, 1)).T
-    columns["dip_deg"] = np.degrees(np.arctan2(np.hypot(x, y), z)).tolist()
-    columns["dip_direction_deg"] = (np.degrees(np.arctan2(x, y)) % 360).tolist()
+    x, y, z = arrays["plane_normal"].T.astype(np.float64)
+    columns["dip_deg"] = np.degrees(np.arctan2(np.hypot(x, y), np.abs(z))).tolist()
+    falls = np.arctan2(x * np.copysign(1, z), y * np.copysign(1, z))
+    columns["dip_direction_deg"] = (np.degrees(falls) % 360).tolist()
     if planes.outline is not None:
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
         columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
-    return columns, _lists(arrays, "adjacency_")
+    table: Json = {"planes": _rows(columns)}
+    if planes.adjacency is not None:
+        pairs = _lists(arrays, "adjacency_")
+        table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
+    return table
+
+
+def tabulate_planes(described: Json) -> Json:
+    """Return what :func:`describe_planes` described as columns of single values by name.
+
+    Example:
+        >>> plane = {"id": 0, "normal": [0.0, 0.6, 0.8], "centroid": [1.0, 2.0, 3.0], "area": 2.5}
+        >>> columns = tabulate_planes({"planes": [plane]})
+        >>> columns["normal_z"], columns["area"], columns["kind"]
+        ([0.8], [2.5], [None])
+    """
+    rows, columns = described["planes"], Json()
+    for name in CSV_COLUMNS:
+        values = [row.get(name) for row in rows]
+        if name in ("normal", "centroid"):
+            columns |= {f"{name}_{x}": [v[i] for v in values] for i, x in enumerate("xyz")}
+        elif name == "outline":
+            columns[name] = [
+                None if rings is None else _to_wkt(rings, row["normal"])
+                for rings, row in zip(values, rows, strict=True)
+            ]
+        else:
+            columns[name] = values
+    return columns
+
+
+def encode_csv(described: Json) -> bytes:
+    """Return what :func:`describe_planes` described as CSV, with a line of names."""
+    columns, text = tabulate_planes(described), io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
+    return text.getvalue().encode()
 
 
 def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float]) -> str:
@@ -240,12 +215,11 @@ def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float])
         places = np.array(ring) - ring[0]
         if np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0) @ normal > 0:
             polygons.append([])
-        corners = (" ".join(map(repr, place)) for place in [*ring, ring[0]])
-        polygons[-1].append(f"({', '.join(corners)})")
-    texts = [f"({', '.join(polygon)})" for polygon in polygons]
+        polygons[-1].append(", ".join(" ".join(map(repr, place)) for place in [*ring, ring[0]]))
+    texts = [f"(({'), ('.join(polygon)}))" for polygon in polygons]
     if len(texts) > 1:
         return f"MULTIPOLYGON Z ({', '.join(texts)})"
-    return f"POLYGON Z {texts[0]}" if texts else "POLYGON Z EMPTY"
+    return f"POLYGON Z {''.join(texts) or 'EMPTY'}"
 
 
 def _lists(arrays: Arrays, prefix: str) -> Json:

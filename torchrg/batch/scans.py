@@ -6,6 +6,7 @@ source of clouds and for ``torchrg segment``.
 
 import contextlib
 import hashlib
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
@@ -30,13 +31,14 @@ from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig, SuperpointsConfig
 from torchrg.datasets.folder import folded_name
 from torchrg.datasets.layouts import LayoutScan, split_name, stem_of, write_layout
-from torchrg.datasets.pointcept import write_files, write_pointcept_scene
+from torchrg.datasets.pointcept import write_arrays, write_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io.fields import are_whole
 from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.result import PLANES_FILE, describe_planes, write_table
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints
 
 _LOOKED_AT = 10_000
@@ -229,11 +231,19 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         if path == job.out:
             break
     check_place(folder / RECORD)
-    earlier = read_record(folder, is_ours=True) or {"outputs": {}}
+    earlier, table = read_record(folder, is_ours=True) or {"outputs": {}}, job.source.table
+    if table is not None and table not in earlier["outputs"] and (folder / table).exists():
+        raise FormatError(
+            f"{folder / table}: was not written by torchrg; move it away, or give another --table."
+        )
     job.clean()
     (folder / RECORD).unlink(missing_ok=True)
     with marked_parts(job.mark):
         report = job.source.convert(job.scan, folder, begin)
+        if table is not None:
+            described = json.loads((folder / PLANES_FILE).read_text("utf-8"))
+            write_table(folder / table, {k: v for k, v in described.items() if k != "written"})
+            report = replace(report, files=(*report.files, table))
         begin("record")
         remove_earlier(folder, earlier, report.files)
         write_record(folder, description, report)
@@ -325,19 +335,15 @@ def find_objects(
     """
     if name is None:
         return None
-    values = fields.get(name, fields.get(f"{name}20"))
+    values, wanted = fields.get(name, fields.get(f"{name}20")), f"the field {name} of --within"
     if values is None:
         names = ", ".join(sorted(fields)) or "none"
         names += "".join(f" ({note})" for note in cloud.notes if name in note)
-        raise FormatError(
-            f"{cloud.source}: expected the field {name} of --within, got {names}; name one of "
-            "these, or leave out what has no objects."
-        )
+        raise FormatError(f"{cloud.source}: expected {wanted}, got {names}; name one of these.")
     if values.dtype.kind not in "iubf" or len(values) != len(cloud) or not are_whole(values):
-        what = f"{values.dtype} of shape {values.shape}"
         raise FormatError(
-            f"{cloud.source}: expected the field {name} of --within to hold a whole number for "
-            f"each of {len(cloud):,} points, got {what}; number the objects."
+            f"{cloud.source}: expected {wanted} to be a whole number for each of {len(cloud):,} "
+            f"points, got {values.dtype} of shape {values.shape}; number the objects."
         )
     return values.reshape(len(values), -1)[:, 0].astype(np.int64)
 
@@ -391,13 +397,11 @@ def write_scan(
     *,
     level: int = 0,
     place: str | None = None,
-    table: str | None = None,
 ) -> list[str]:
     """Write a scan in a layout, into the folder of its name; return the files by their paths there.
 
     Every layout but ``"pointcept"`` needs superpoints, of which it takes one ``level``. ``place``
     is where the scan is in its data set, which some layouts keep; the default is its name.
-    ``table`` is the name of a further table of planes in the folder.
     """
     cloud, arrays = reading.cloud, reading.arrays
     levels = [] if superpoints is None else [*superpoints.by_level().values()][level:]
@@ -405,12 +409,9 @@ def write_scan(
     if layout == "pointcept" or superpoint is None:
         origin = cloud.origin.tolist()
         if "coord" in arrays:
-            return write_pointcept_scene(
-                folder, arrays, seg, superpoint=superpoint, origin=origin, table=table
-            )
+            return write_pointcept_scene(folder, arrays, seg, superpoint=superpoint, origin=origin)
         fields = arrays if superpoint is None else {**arrays, "superpoint": superpoint}
-        coord = cloud.coordinates
-        return write_results(folder, coord, seg, fields=fields, origin=origin, table=table)
+        return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
     split, stem = split_name(name)
     scan = LayoutScan(
         stem,
@@ -426,7 +427,7 @@ def write_scan(
         coarser=levels[1:],
     )
     out = folder.parents[name.count("/")]
-    return write_layout(layout, folder, out, scan, seg.planes, cloud.origin, table)
+    return write_layout(layout, folder, out, scan, seg.planes, cloud.origin)
 
 
 def write_results(
@@ -436,15 +437,13 @@ def write_results(
     *,
     fields: Mapping[str, NDArray[Any]] | None = None,
     origin: Sequence[float] | None = None,
-    table: str | None = None,
 ) -> list[str]:
     """Write ``coord``, ``normal``, ``curvature``, ``plane`` as ``.npy``, and ``planes.json``.
 
     Into a folder that exists; ``coord`` ``(*, 3)`` in the dtype to be written, the segmentation of
     the same leading axes, further ``fields`` by name. ``origin`` is where the origin of the
-    segmentation is, in the coordinates of ``coord``, and ``table`` the name of a further table.
-    Returns the names of the files; those of others are never replaced, see
-    :func:`torchrg.datasets.pointcept.write_files`.
+    segmentation is, in the coordinates of ``coord``. Returns the names of the files; those of
+    others are never replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,
@@ -453,5 +452,5 @@ def write_results(
         "plane": segmentation.labels.numpy().astype(np.int32),
         **(fields or {}),
     }
-    contents = {f"{name}.npy": np.ascontiguousarray(values) for name, values in arrays.items()}
-    return write_files(folder, contents, segmentation.planes, origin=origin, table=table)
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    return write_arrays(folder, arrays, describe_planes(segmentation.planes, origin=origin))

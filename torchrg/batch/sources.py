@@ -113,17 +113,8 @@ class CloudSource(Source):
             begin=begin,
         )
         begin("write")
-        files = write_scan(
-            self.layout,
-            scan.name,
-            folder,
-            reading,
-            seg,
-            superpoints,
-            level=self.level,
-            place=_place_of(scan),
-            table=self.table,
-        )
+        what, place = (reading, seg, superpoints), _place_of(scan)
+        files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)
         return TaskReport(
             scan.name,
             "converted",
@@ -405,7 +396,7 @@ class RGBDSource(Source):
         seg = orient_image(seg, points, self.orient)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
-        files = tuple(write_results(folder, coord, seg, table=self.table))
+        files = tuple(write_results(folder, coord, seg))
         num_planes = len(seg.planes)
         notes = () if num_planes else ("no plane found",)
         return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)

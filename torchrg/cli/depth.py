@@ -14,22 +14,16 @@ from torchrg.batch.sources import orient_image
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
-from torchrg.cli.loop import (
-    check_apart,
-    note_input,
-    output_paths,
-    paths_beside,
-    run_each,
-    write_table,
-)
+from torchrg.cli.loop import check_apart, note_input, output_paths, paths_beside, run_each
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
 from torchrg.depth import DepthConfig, find_intrinsics, make_intrinsics, segment_depth
 from torchrg.depth.camera import points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
-from torchrg.plane_table import TABLE_SUFFIXES
+from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import color_planes, write_png
+from torchrg.result import write_table
 from torchrg.structures import Cloud, Segmentation
 
 _COLORED_FROM = 200
@@ -46,8 +40,8 @@ class Arguments:
     """Label the planes of depth images, or of organised clouds taken as such.
 
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
-    and a table of the planes beside it, or as a cloud, all in camera coordinates. For folders and
-    sequences of depth images there is torchrg convert rgbd.
+    and a table of the planes, .json, beside it, or as a cloud, all in camera coordinates. For
+    folders and sequences of depth images there is torchrg convert rgbd.
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
@@ -66,14 +60,7 @@ class Arguments:
     picture: Path | None = None
     """Place of the coloured picture, a .png file; for several inputs a directory. Default: beside
     labels that are written as .png, with _planes in its name."""
-    table: Annotated[
-        Path | None,
-        Argument(
-            metavar="PLANES.csv",
-            text="Table of the planes, .csv or .json; for several inputs a directory. Default: "
-            "beside labels that are written as .png, with .json in place of .png.",
-        ),
-    ] = None
+    table: flags.TableFlag = None
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
     orient: flags.ImageOrientFlag = "auto"
@@ -143,7 +130,7 @@ def _label(
     else:
         _write_cloud(arguments, source, target, cloud, seg)
     if table is not None:
-        write_table(table, seg.planes, cloud.origin.tolist())
+        write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
     say(

@@ -79,9 +79,9 @@ TableFlag = Annotated[
     Argument(
         metavar="PLANES.csv",
         text="Table of the planes to write too, .csv or .json; for several inputs a directory. CSV "
-        "has a line for each plane: role, normal and offset, centroid, area, dip, root mean square "
-        "distance, outline as WKT POLYGON Z, in the coordinates of the input. Roles and dip take z "
-        "as up, but for --planes.up; outlines need shapely (pip install 'torchrg[outline]').",
+        "has a line for each plane, in the coordinates of the input: role, normal, offset, "
+        "centroid, area, dip, root mean square distance, outline as WKT POLYGON Z. Up is z. Of "
+        "clouds it asks for roles and outlines (pip install 'torchrg[outline]').",
     ),
 ]
 WithinFlag = Annotated[

@@ -13,10 +13,9 @@ from torchrg.datasets.folder import folded_name
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import notes_on_results
-from torchrg.io.files import atomic_path, check_place, make_folder
-from torchrg.plane_table import encode_table
+from torchrg.io.files import check_place, make_folder
 from torchrg.render.page import check_library
-from torchrg.structures import Cloud, Planes
+from torchrg.structures import Cloud
 
 DRAWINGS = (".png", ".html")
 """Suffixes of pictures and pages."""
@@ -112,13 +111,6 @@ def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
     check_place(path)
     if is_page(path):
         check_library()
-
-
-def write_table(path: Path, planes: Planes, origin: Sequence[float]) -> None:
-    """Write a table of planes about an origin, whole or not at all."""
-    content = encode_table(path.suffix, planes, origin=origin)
-    with atomic_path(path) as beside:
-        beside.write_bytes(content)
 
 
 def is_page(path: Path) -> bool:

@@ -39,7 +39,6 @@ from torchrg.cli.loop import (
     paths_beside,
     run_each,
     stage_bar,
-    write_table,
 )
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets.layouts import check_layout
@@ -55,10 +54,10 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.files import check_space
-from torchrg.plane_table import TABLE_SUFFIXES
+from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
-from torchrg.result import Result
+from torchrg.result import Result, write_table
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 _DATASET = "ScanNet"
@@ -230,7 +229,7 @@ def _segment(
     else:
         _write_layout(arguments, target, cloud, seg, superpoints)
     if table is not None:
-        write_table(table, seg.planes, cloud.origin.tolist())
+        write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
     if picture is not None:
         _draw(arguments, picture, Result.of(cloud, seg, superpoints))
     if superpoints is not None:

@@ -27,6 +27,7 @@ from torchrg.datasets.pointcept import write_files
 from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.errors import ConfigError, FormatError
+from torchrg.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Planes, Superpoints
 
 Files = dict[str, NDArray[Any] | bytes]
@@ -136,10 +137,7 @@ def stem_of(layout: str, name: str, folder: str) -> str:
 
 
 def check_layout(layout: str, dataset: str, what: str) -> None:
-    """Raise ConfigError if a layout has no form for a data set, which messages call ``what``.
-
-    Raise MissingDependencyError if it needs a package that is not installed.
-    """
+    """Raise if a layout has no form for a data set, called ``what``, or no package to write it."""
     known = [name for name, forms in LAYOUTS.items() if dataset in forms]
     if layout not in ("pointcept", *known):
         raise ConfigError(
@@ -151,13 +149,7 @@ def check_layout(layout: str, dataset: str, what: str) -> None:
 
 
 def write_layout(
-    layout: str,
-    place: Path,
-    out: Path,
-    scan: LayoutScan,
-    planes: Planes,
-    origin: NDArray[Any],
-    table: str | None = None,
+    layout: str, place: Path, out: Path, scan: LayoutScan, planes: Planes, origin: NDArray[Any]
 ) -> list[str]:
     """Write the files of a scan in a layout, and ``planes.json`` in a folder of the scan.
 
@@ -168,7 +160,6 @@ def write_layout(
         scan: The scan.
         planes: Its plane table.
         origin: Where the origin of the table is; see :func:`torchrg.result.describe_planes`.
-        table: As of :func:`torchrg.datasets.write_pointcept_scene`.
 
     Returns:
         Names of the files written, as paths from ``place``.
@@ -186,7 +177,7 @@ def write_layout(
     up = "../" * len(place.relative_to(out).parts)
     files = LAYOUTS[layout][scan.dataset](scan)
     contents = {f"{up}{path}": content for path, content in files.items()}
-    return write_files(place, contents, planes, origin=origin.tolist(), table=table)
+    return write_files(place, contents, describe_planes(planes, origin=origin.tolist()))
 
 
 def _scannet(scan: LayoutScan) -> Files:

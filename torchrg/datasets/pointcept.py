@@ -24,9 +24,8 @@ from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import DAMAGES, make_folder
 from torchrg.io.npy import check_rows, map_array, map_folder
-from torchrg.plane_table import describe_planes, encode_table
-from torchrg.result import PLANES_FILE
-from torchrg.structures import Array, Planes, Segmentation
+from torchrg.result import PLANES_FILE, describe_planes
+from torchrg.structures import Array, Segmentation
 
 POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "segment20", "segment200", "instance",
@@ -75,7 +74,6 @@ def write_pointcept_scene(
     *,
     superpoint: Tensor | NDArray[np.integer] | None = None,
     origin: Sequence[float] | None = None,
-    table: str | None = None,
 ) -> list[str]:
     """Write a scene folder, or complete one that Pointcept wrote.
 
@@ -94,8 +92,6 @@ def write_pointcept_scene(
         origin: Where the origin of ``coord`` is, for the plane table; see
             :func:`torchrg.result.describe_planes`. Default: ``coord`` is in the coordinates of the
             data set.
-        table: Name of a table of the planes to be written too, a key of its form is its suffix; see
-            :data:`torchrg.plane_table.TABLE_SUFFIXES`. Default: ``planes.json`` alone.
 
     Returns:
         Names of the files written.
@@ -115,17 +111,18 @@ def write_pointcept_scene(
     }
     _check_kept(place, arrays, kept)
     new = {name: values for name, values in arrays.items() if name not in kept}
-    contents = {f"{name}.npy": values for name, values in new.items()}
-    return write_files(place, contents, segmentation.planes, origin=origin, table=table)
+    return write_arrays(place, new, describe_planes(segmentation.planes, origin=origin))
+
+
+def write_arrays(
+    place: Path, arrays: Mapping[str, Array], planes: Mapping[str, object]
+) -> list[str]:
+    """Write arrays by name as ``.npy`` and the table of planes; see :func:`write_files`."""
+    return write_files(place, {f"{name}.npy": values for name, values in arrays.items()}, planes)
 
 
 def write_files(
-    place: Path,
-    contents: Mapping[str, Array | bytes],
-    planes: Planes,
-    *,
-    origin: Sequence[float] | None = None,
-    table: str | None = None,
+    place: Path, contents: Mapping[str, Array | bytes], planes: Mapping[str, object]
 ) -> list[str]:
     """Write files and the table of planes of a scene, beside what others have there.
 
@@ -136,8 +133,6 @@ def write_files(
         place: Folder of the scene; it is made.
         contents: Bytes, or arrays to be written as ``.npy``, by their paths from there.
         planes: The table.
-        origin: Where the origin of the table is; see :func:`torchrg.result.describe_planes`.
-        table: As of :func:`write_pointcept_scene`.
 
     Returns:
         Names of the files written.
@@ -145,9 +140,6 @@ def write_files(
     Raises:
         FormatError: If a file from elsewhere is in the way, or a folder cannot be written.
     """
-    if table not in (None, PLANES_FILE):
-        encoded = encode_table(Path(table).suffix, planes, origin=origin)
-        contents = {**contents, table: encoded}
     paths = {name: Path(os.path.normpath(place / name)) for name in contents}
     owned = _owned(place, contents)
     # Those of another layout stay, and are known again when it is asked for.
@@ -174,8 +166,7 @@ def write_files(
         claim = stack.enter_context(atomic_path(place / PLANES_FILE))
         written = [name.removesuffix(".npy") if "/" not in name else name for name in contents]
         written += others
-        described = {"written": written, **describe_planes(planes, origin=origin)}
-        claim.write_text(json.dumps(described, indent=1), encoding="utf-8")
+        claim.write_text(json.dumps({"written": written, **planes}, indent=1), encoding="utf-8")
     return [*contents, PLANES_FILE]
 
 

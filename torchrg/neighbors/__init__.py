@@ -1,12 +1,6 @@
 """Neighbourhoods: exact search, canonical order, patches, voxels."""
 
-from torchrg.neighbors.knn import (
-    gather_columns,
-    gather_patches,
-    keep_within,
-    search_knn,
-    search_nearest,
-)
+from torchrg.neighbors.knn import gather_columns, gather_patches, search_knn, search_nearest
 from torchrg.neighbors.order import canonical_order, finite_rows, restore_rows
 from torchrg.neighbors.sampling import measure_sampling
 from torchrg.neighbors.voxels import Voxels, restore_points, sample_voxels
@@ -17,7 +11,6 @@ __all__ = [
     "finite_rows",
     "gather_columns",
     "gather_patches",
-    "keep_within",
     "measure_sampling",
     "restore_points",
     "restore_rows",

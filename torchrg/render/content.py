@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
-from torchrg.plane_table import describe_planes, encode_table
+from torchrg.plane_table import Json, describe_planes
 from torchrg.regions.table import classify_planes, summarize_planes
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import Sides, find_sides
@@ -138,10 +138,9 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     angle and along which length. Kinds go by the upward direction of the page where the result has
     none.
     """
-    planes, origin = _with_kinds(result, frame), result.cloud.origin
-    if planes is None:
+    planes, origin, table = result.planes, result.cloud.origin, describe_shown(result, frame)
+    if not planes:
         return []
-    table = describe_planes(planes, origin=origin.tolist())
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
     for found in table.get("adjacency", []):
         for own, other in (found["pair"], found["pair"][::-1]):
@@ -151,31 +150,26 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     return [
         {name: value for name, value in row.items() if name not in _NOT_SHOWN}
         | {
-            "name": label,
+            "name": row["id"],
             "kind": PLANE_KINDS.index(row["kind"]),
             "rings": [rounded(frame.place(ring, origin)) for ring in own or (rectangle,)],
             "meets": met,
         }
-        for row, label, own, rectangle, met in zip(
-            table["planes"], result.names.tolist(), rings, corners, meets, strict=True
-        )
+        for row, own, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
     ]
 
 
-def table_of_page(result: Result, frame: Frame) -> bytes:
-    """Return the table of the planes as CSV, which a page gives to other programs."""
-    planes, origin = _with_kinds(result, frame), result.cloud.origin.tolist()
-    if planes is None:
-        return b""
-    return encode_table(".csv", planes, origin=origin, names=result.names.tolist())
-
-
-def _with_kinds(result: Result, frame: Frame) -> Planes | None:
-    """Return the table of a result with the roles that it has on a page; None without planes."""
-    planes = result.planes or None
-    if planes is None or planes.kind is not None:
-        return planes
-    return replace(planes, kind=classify_planes(planes, frame.rotation[2]))
+def describe_shown(result: Result, frame: Frame) -> Json:
+    """Return the table of a result as a page has it, its ids the labels of the file."""
+    planes = result.planes
+    if not planes:
+        return {"planes": []}
+    if planes.kind is None:
+        planes = replace(planes, kind=classify_planes(planes, frame.rotation[2]))
+    described = describe_planes(planes, origin=result.cloud.origin.tolist())
+    for row, name in zip(described["planes"], result.names.tolist(), strict=True):
+        row["id"] = name
+    return described
 
 
 def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:

@@ -40,7 +40,7 @@ def _result_of(segmentation: Segmentation) -> Result:
 def as_frame(planes: Planes) -> Any:  # noqa: ANN401
     """Return a table of planes as a ``pandas.DataFrame``."""
     pandas = require("pandas", extra="report", purpose="make data frames")
-    return pandas.DataFrame(tabulate_planes(planes))
+    return pandas.DataFrame(tabulate_planes(describe_planes(planes)))
 
 
 def as_html(segmentation: Segmentation) -> str:
