@@ -133,7 +133,7 @@ def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
     assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels").code == 0
     assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels.png").code == 0
     results = contents(tmp_path / "labels")
-    assert sorted(results) == ["frame.png", "frame_planes.png"]
+    assert sorted(results) == ["frame.json", "frame.png", "frame_planes.png"]
     assert results["frame.png"] == (tmp_path / "labels.png").read_bytes()
 
 
