@@ -83,15 +83,19 @@ def test_a_lens_that_bends_lines_is_told(tmp_path):
         (
             "a.json",
             '{"fov": 60}',
-            "of Open3D, nerfstudio or ROS, got none in fov; pass fx,fy,cx,cy",
+            "or a matrix, got none in fov; add it, or pass --intrinsics",
         ),
-        ("a.json", '{"frames": [{"fl_x": 1}]}', "got one for each frame, or none; give its folder"),
+        (
+            "a.json",
+            '{"frames": [{"fl_x": 1}]}',
+            "expected one camera, got one for each frame, or none; give",
+        ),
         (
             "a.json",
             '{"intrinsic_matrix": [1, 2]}',
-            "expected intrinsic_matrix of 3 x 3 or 3 x 4 or",
+            "expected intrinsic_matrix to be a matrix, got",
         ),
-        ("a.json", '{"intrinsic_matrix": [[1], [2, 3]]}', "numbers, got"),
+        ("a.json", '{"intrinsic_matrix": [[1], [2, 3]]}', "to be a matrix, got"),
         ("a.json", '{"K": [1, 0, 0, 0, 0, 0, 0, 0, 1]}', "K: expected intrinsics of rows"),
         ("a.json", '{"fx": 1, "fy": NaN, "cx": 0, "cy": 0}', "expected a number for fy, got nan"),
         ("a.json", '{"fx": 1, "fy": 1, "cx": 0, "cy": 0, "w": 0, "h": 1}', "w and h above 0"),
