@@ -117,6 +117,11 @@ def with_words(shared):
     shared["frames"][1]["transform_matrix"][2][3] = "far"
 
 
+def with_a_turn_alone(shared):
+    frame = shared["frames"][0]
+    frame["transform_matrix"] = [row[:3] for row in frame["transform_matrix"][:3]]
+
+
 def with_no_focus(shared):
     shared["fl_y"] = 0
 
@@ -134,6 +139,7 @@ def with_a_huge_number(shared):
         (without_frames, "expected a list of frames"),
         (with_wide_images, "as its camera's, or in their ratio, got 128 x 96; pass the camera"),
         (with_words, "expected transform_matrix to be a matrix, got [["),
+        (with_a_turn_alone, "expected transform_matrix to be a matrix, got [["),
         (with_no_focus, "expected fl_x and fl_y other than 0"),
         (with_a_huge_number, "expected a number for cx, got 10000"),
     ],

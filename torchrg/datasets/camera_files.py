@@ -115,7 +115,7 @@ def camera_of(path: Path, record: Record) -> Pinhole:
             matrix = matrix_of(path, record, name)[:3, :3]
             # Open3D's numbers run along columns.
             matrix = matrix.T if matrix[2, :2].any() else matrix
-            check_camera(f"{path}: {name}", matrix)
+            check_camera(f"{path}", matrix)
             (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
             return Pinhole(fx, fy, cx, cy, size)
     raise FormatError(
@@ -127,7 +127,7 @@ def camera_of(path: Path, record: Record) -> Pinhole:
 def matrix_of(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
     """Return a matrix of 3 or 4 rows and at least so many columns, nested or flat in a record."""
     given = record.get(key)
-    with suppress(TypeError, ValueError):
+    with suppress(TypeError, ValueError, OverflowError):
         data = given.get("data") if isinstance(given, dict) else given
         values = torch.from_numpy(np.asarray(data, dtype=np.float64).ravel())
         if len(values) in _SHAPES and _SHAPES[len(values)][1] >= columns:

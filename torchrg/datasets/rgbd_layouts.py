@@ -24,7 +24,7 @@ from torchrg.datasets.rgbd_files import (
     read_timed,
     read_trajectory,
 )
-from torchrg.depth.camera import Pinhole, check_camera
+from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import refusing
 
@@ -161,10 +161,7 @@ def _same_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
 def _scannet_camera(folder: Path) -> tuple[Pinhole, tuple[Path, ...]]:
     """Return the camera matrix of a scan."""
     calibration = folder / "intrinsic" / "intrinsic_depth.txt"
-    camera = read_matrix(calibration)[:3, :3]
-    check_camera(str(calibration), camera)
-    (fx, _, cx), (_, fy, cy) = camera[:2].tolist()
-    return Pinhole(fx, fy, cx, cy), (calibration,)
+    return camera_of(calibration, {"intrinsic": read_matrix(calibration)}), (calibration,)
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
