@@ -47,19 +47,8 @@ from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import PLANES_FILE, RECORD, read_result
 
-FrameLayoutName = Literal[
-    "auto",
-    "scannetpp",
-    "arkitscenes",
-    "3rscan",
-    "replica",
-    "tum",
-    "icl-nuim",
-    "scannet",
-    "7-scenes",
-    "nerfstudio",
-    "images",
-]
+_Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
+_Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
 
 
 @dataclass(frozen=True)
@@ -216,10 +205,9 @@ class RGBDArguments(Arguments):
         torchrg convert rgbd capture results
     """
 
-    layout: FrameLayoutName = "auto"
-    """Data set whose folders ROOT has, auto for the one that its files show; nerfstudio is any
-    transforms.json, as Polycam and COLMAP are imported; images are all depth images below ROOT, of
-    one camera."""
+    layout: Literal["auto", _Benchmark, _Capture, "images"] = "auto"
+    """Data set whose folders ROOT has, auto for what its files show; nerfstudio is transforms.json,
+    as of Polycam and COLMAP; images are all depth images below ROOT, of one camera."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)

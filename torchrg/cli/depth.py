@@ -121,8 +121,12 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
     if path.suffix.lower() not in DEPTH_SUFFIXES:
         return None
     if camera is None or arguments.depth_scale is None:
-        flag = "--intrinsics fx,fy,cx,cy" if camera is None else "--depth-scale"
-        raise ConfigError(f"{path}: expected {flag}, which depth images do not hold; pass it.")
+        flag, hint = "--depth-scale", "1000 for millimetres, 1 for metres"
+        if camera is None:
+            flag, hint = "--intrinsics fx,fy,cx,cy", "or the file of the camera"
+        raise ConfigError(
+            f"{path}: expected {flag}, which depth images do not hold; pass it, {hint}."
+        )
     return RGBDFrame(path, camera.matrix(image_size(path)), arguments.depth_scale)
 
 

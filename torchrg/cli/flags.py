@@ -73,17 +73,14 @@ IntrinsicsFlag = Annotated[
     str | None,
     Argument(
         metavar="CAMERA",
-        text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or a "
-        "file: Open3D's or nerfstudio's .json, camera_info of ROS as .yaml. Those of images of "
-        "another size are scaled. Default: that of the folder's layout.",
+        text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or its "
+        "file: Open3D's or nerfstudio's .json, ROS's .yaml. One of larger images is scaled. "
+        "Default: that of the folder.",
     ),
 ]
 DepthScaleFlag = Annotated[
     float | None,
-    Argument(
-        text="Stored value of one metre: 1000 for depth in millimetres, 5000 for TUM, 1 for "
-        "metres. Default: that of the folder's layout.",
-    ),
+    Argument(text="Stored value of one metre: 1000 for millimetres. Default: that of the folder."),
 ]
 ImageOrientFlag = Annotated[
     _Side,
