@@ -1,8 +1,9 @@
 """From points to planes, and to superpoints: each in one function."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torchrg._checks import (
     of_clouds,
 )
 from torchrg._parallel import return_freed_memory, sequential_operations
-from torchrg.config import PipelineConfig, SuperpointsConfig, settings_of
+from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ShapeError
 from torchrg.neighbors import (
     canonical_order,
@@ -29,6 +30,7 @@ from torchrg.neighbors import (
     sample_voxels,
     search_knn,
 )
+from torchrg.neighbors.knn import keep_within
 from torchrg.normals import ESTIMATORS
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
@@ -55,11 +57,13 @@ are about as many as of its own in depth frames with noise, meshed, and more in 
 @sequential_operations()
 def segment_planes(
     points: Tensor | NDArray[np.floating],
-    config: PipelineConfig | str | None = None,
+    config: AnyConfig | None = None,
     *,
     voxel: float | None = None,
+    within: Tensor | NDArray[np.integer] | None = None,
     keep_neighbors: bool = False,
     on_stage: Callable[[str], None] | None = None,
+    **changes: Any,  # noqa: ANN401
 ) -> Segmentation:
     """Segment a cloud into planes: neighbours, normals, regions, plane table.
 
@@ -74,14 +78,19 @@ def segment_planes(
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64. Clouds far from the origin should be
             float64, or moved to it first, as :func:`torchrg.read_cloud` does.
-        config: Settings, or the name of a preset. Default: that of :func:`torchrg.load_config`.
+        config: Settings, a dictionary of them, or the name of a preset or a file. Default: that of
+            :func:`torchrg.load_config`.
         voxel: Side of voxels, in the unit of the cloud: one point of each is segmented, and every
             point has the result of its voxel. Sizes of regions are counted in voxels then; planes
             are described from all points and numbered by their number, and which of them meet is
             found on the voxels. Default: all points are segmented.
+        within: Object of each point, shape ``(N,)``, integers, to keep planes within objects: no
+            plane has points of two of them, and the table names that of each. Points of voxels of
+            another object have no label. Default: planes go across.
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
+        **changes: Single settings, as in ``**{"normals.k": 30}``.
 
     Returns:
         Labels, normals, curvature and masks in the order of the points, and the table of planes. A
@@ -89,8 +98,8 @@ def segment_planes(
         cloud with fewer points than ``k`` uses those it has; fewer than three points give no plane.
 
     Raises:
-        ShapeError: If ``points`` has another shape or dtype.
-        ConfigError: If ``voxel`` is not positive.
+        ShapeError: If ``points`` or ``within`` has another shape or dtype.
+        ConfigError: If ``voxel`` is not positive, or a setting is wrong.
         FormatError: If arrays are kept on a disk, and it is full.
 
     Warns:
@@ -104,12 +113,20 @@ def segment_planes(
         ([400], [[0.0, 0.0, 1.0]])
         >>> segment_planes(grid, "classic", voxel=2.0).planes.count.tolist()
         [400]
+        >>> halves = segment_planes(grid, "classic", within=torch.arange(400) // 200 + 5).planes
+        >>> halves.count.tolist(), halves.object.tolist()
+        ([200, 200], [5, 6])
     """
     points = as_tensor("segment_planes", "points", points).detach()
     check_points("segment_planes", points)
     warn_of_steps("segment_planes", points)
-    if not isinstance(config, PipelineConfig):
-        config = settings_of("segment_planes", PipelineConfig, config)
+    objects = None if within is None else as_tensor("segment_planes", "within", within)
+    check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
+    if objects is not None and (objects.is_floating_point() or objects.is_complex()):
+        raise ShapeError(
+            f"segment_planes: expected within of integers, got {objects.dtype}; number the objects."
+        )
+    settings = settings_of("segment_planes", PipelineConfig, config, changes)
 
     def begin(stage: str) -> None:
         if scratch.is_active():
@@ -117,7 +134,8 @@ def segment_planes(
         if on_stage is not None:
             on_stage(stage)
 
-    seg = _segment(points, config, voxel, begin)
+    objects = None if objects is None else objects.long().to(points.device)
+    seg = _segment(points, settings, voxel, objects, begin)
     return seg if keep_neighbors else seg._replace(neighbors=None)
 
 
@@ -148,7 +166,11 @@ class _CanonicalCloud(NamedTuple):
 
 
 def _segment(
-    points: Tensor, config: PipelineConfig, voxel: float | None, begin: Callable[[str], None]
+    points: Tensor,
+    config: PipelineConfig,
+    voxel: float | None,
+    objects: Tensor | None,
+    begin: Callable[[str], None],
 ) -> Segmentation:
     """Do what :func:`segment_planes` says: the steps, in their order."""
     begin("neighbors")
@@ -167,11 +189,15 @@ def _segment(
     fit = estimate(cloud.points, neighbors, config.normals, config.chunk_size)
 
     begin("regions")
+    beside = neighbors
+    if objects is not None:
+        # Growth, and all steps after it, join neighbours alone.
+        beside = keep_within(neighbors, objects[cloud.rows], config.chunk_size)
     labels = grow_regions(
         cloud.points,
         fit.normals,
         fit.curvature,
-        neighbors,
+        beside,
         config.growing,
         valid=fit.valid,
         residual_rms=fit.residual_rms,
@@ -188,11 +214,18 @@ def _segment(
         cloud.restore(values, len(points))
         for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
+    if objects is not None and cloud.inverse is not None:
+        labels = labels.where(objects == objects[cloud.rows][cloud.inverse], UNLABELED)
     if voxel is not None:
-        labels, place = _numbered_by_points(labels, len(planes.count))
+        labels, place = _numbered_by_points(labels, len(planes))
         rows = finite_rows(points)
         adjacency = _renumbered(planes.adjacency, place)
-        planes = describe(points[rows], normals[rows], labels[rows])._replace(adjacency=adjacency)
+        planes = describe(points[rows], normals[rows], labels[rows])
+        planes = replace(planes, adjacency=adjacency)
+    if objects is not None:
+        own = objects.new_zeros(len(planes))
+        own[labels[labels >= 0]] = objects[labels >= 0]
+        planes = replace(planes, object=own)
     begin("done")
     kept = neighbors if voxel is None else None
     return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
@@ -225,10 +258,11 @@ def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacen
 def make_superpoints(
     points: Tensor | NDArray[np.floating],
     seg: Segmentation | None = None,
-    config: SuperpointsConfig | None = None,
+    config: SuperpointsConfig | Mapping[str, Any] | None = None,
     *,
     colors: Tensor | NDArray[np.generic] | None = None,
     voxel: float | None = None,
+    **changes: Any,  # noqa: ANN401
 ) -> Superpoints:
     """Partition a cloud into superpoints: every finite point in exactly one, in nested levels.
 
@@ -246,12 +280,13 @@ def make_superpoints(
         points: Points, shape ``(N, 3)``, float32 or float64.
         seg: What :func:`segment_planes` said about them. Default: it is asked, with the preset
             ``consensus``.
-        config: Settings.
+        config: Settings, or a dictionary of them.
         colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
             [0, 1]. Default: they play no part.
         voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
             partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
             voxels then, and superpoints numbered by their number. Default: all points are.
+        **changes: Single settings, as in ``counts=100``.
 
     Returns:
         The partition of the first strength, and those of the others. A superpoint smaller than
@@ -259,6 +294,7 @@ def make_superpoints(
 
     Raises:
         ShapeError: If a shape or dtype is wrong, or ``seg`` is of another number of points.
+        ConfigError: If a setting is wrong.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -277,16 +313,16 @@ def make_superpoints(
             f"make_superpoints: expected seg of {len(tensor):,} points, got {len(seg.labels):,}; "
             "pass the segmentation of these points."
         )
-    config = SuperpointsConfig() if config is None else config
+    settings = settings_of("make_superpoints", SuperpointsConfig, config, changes)
     if voxel is None:
         is_searched = seg.points is not None and seg.points.data_ptr() == tensor.data_ptr()
         neighbors = seg.neighbors if is_searched else None
         return partition_points(
-            tensor, seg.normals, seg.labels, config, shades, neighbors=neighbors
+            tensor, seg.normals, seg.labels, settings, shades, neighbors=neighbors
         )
     rows, inverse = sample_voxels(tensor, voxel)
     shades = None if shades is None else shades[rows]
-    found = partition_points(tensor[rows], seg.normals[rows], seg.labels[rows], config, shades)
+    found = partition_points(tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades)
     labels, *levels = (
         restore_points(level, inverse, fill=UNLABELED) for level in (found.labels, *found.levels)
     )
@@ -301,7 +337,7 @@ def segment_mesh(
     seg_min_verts: int = 20,
     *,
     colors: Tensor | NDArray[np.generic] | None = None,
-    config: PipelineConfig | str | None = None,
+    config: AnyConfig | None = None,
 ) -> Tensor:
     """Return superpoints of the vertices of a mesh, in the shape of ScanNet's Segmentator.
 
@@ -316,8 +352,7 @@ def segment_mesh(
             :class:`torchrg.config.SuperpointsConfig`.
         seg_min_verts: Smaller superpoints join a neighbour, in vertices.
         colors: As of :func:`make_superpoints`; Segmentator knows none.
-        config: How planes are found, settings or the name of a preset. Default: that of
-            :func:`torchrg.load_config`.
+        config: How planes are found, as of :func:`segment_planes`.
 
     Returns:
         Superpoint of each vertex, shape ``(V,)``, int64, consecutive from 0 on by descending size;

@@ -17,13 +17,19 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ShapeError
-from torchrg.io import read_cloud
+from torchrg.io import atomic_path, read_cloud
 from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
-from torchrg.plane_table import Arrays, arrays_of_description, planes_from_arrays
+from torchrg.plane_table import (
+    Arrays,
+    Json,
+    arrays_of_description,
+    encode_csv,
+    planes_from_arrays,
+)
 from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
@@ -138,12 +144,30 @@ class Result:
             and (name != "color" or values.dtype == np.uint8)
         }
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what is known as a sample of loaders and transforms.
+
+        ``coord`` ``(N, 3)``, float32, about ``origin`` ``(1, 3)``, float64, and as far as they are
+        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint``, and ``planes``, the
+        table.
+
+        Example:
+            >>> sample = Result(Cloud(np.zeros((2, 3)), {"labels": np.array([0, -1])})).to_dict()
+            >>> list(sample), sample["plane"].tolist(), len(sample["planes"])
+            (['coord', 'origin', 'plane', 'planes'], [0, -1], 1)
+        """
+        fields = {**self.fields, "labels": self.labels} if self.planes is not None else self.fields
+        origin = torch.from_numpy(self.cloud.origin)[None]
+        found = {key: fields[name] for key, name in _FOLDER_FIELDS.items() if name in fields}
+        table = {} if self.planes is None else {"planes": self.planes}
+        return {"coord": self.cloud.points, "origin": origin, **found, **table}
+
     @cached_property
     def _numbering(self) -> tuple[Tensor, Tensor]:
         """Label of each plane, and the plane of each point."""
         labels = self.fields.get("labels", torch.full((len(self.cloud),), UNLABELED)).long()
         if self.table is not None:
-            return torch.arange(len(self.table.count)), labels
+            return torch.arange(len(self.table)), labels
         known = torch.from_numpy(self.cloud.finite) & (labels >= 0)
         return number_labels(torch.where(known, labels, UNLABELED))
 
@@ -164,7 +188,7 @@ class Result:
     def planes(self) -> Planes | None:
         """The plane table; None without labels.
 
-        Of a result it is :attr:`table`. What that lacks, for labels from elsewhere all of it, for
+        Of a result it is ``table``. What that lacks, for labels from elsewhere all of it, for
         images which planes meet, is found once, from the labels.
         """
         table = self.table
@@ -183,14 +207,14 @@ class Result:
             cloud = (self.cloud.points, self._normals, self.labels)
             whole = neighbors if has_normals and len(some) == len(rows) else None
             table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
-            table = table._replace(curved=table.curved & has_normals)
+            table = replace(table, curved=table.curved & has_normals)
         if neighbors is None or not len(present) or table.adjacency is not None:
             return table
         normal, rms = (column[present].double() for column in (table.normal, table.rms))
         curved, dtype = table.curved[present], table.rms.dtype
         met = find_adjacency(points, labels, neighbors, normal, rms, curved=curved)
         sizes = (size.to(dtype) for size in (met.boundary_length, met.dihedral_deg))
-        return table._replace(adjacency=PlaneAdjacency(present[met.pairs], *sizes))
+        return replace(table, adjacency=PlaneAdjacency(present[met.pairs], *sizes))
 
     @property
     def _normals(self) -> Tensor:
@@ -205,7 +229,7 @@ class Result:
 
         What a file does not hold is zero or False; points with a normal are ``valid``.
         """
-        planes = self.table or self.planes
+        planes = self.planes if self.table is None else self.table
         if planes is None:
             return None
         points, normals = self.cloud.points, self.fields.get("normals", self._normals)
@@ -240,6 +264,14 @@ class Result:
         return Superpoints(labels, plane, tuple(levels))
 
 
+def write_table(path: Path, described: Json) -> None:
+    """Write what :func:`describe_planes` described, as JSON or CSV by its suffix."""
+    is_json = path.suffix.lower() == ".json"
+    content = json.dumps(described, indent=1).encode() if is_json else encode_csv(described)
+    with atomic_path(path) as beside:
+        beside.write_bytes(content)
+
+
 def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
     """Read what ``segment``, ``depth`` or ``convert`` wrote, or any other cloud.
 
@@ -248,10 +280,10 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         columns: As of :func:`torchrg.read_cloud`.
 
     Returns:
-        The cloud and what is known about it: ``.npz`` files hold all of a result, folders all but
+        The cloud and what is known about it. ``.npz`` files hold all of a result, folders all but
         the masks, other files what :func:`torchrg.write_cloud` puts beside each point. A plane
         table that is not of the labels, as somebody changed them since, is left out, and
-        :attr:`Cloud.notes` says so.
+        ``notes`` of the cloud say so.
 
     Raises:
         FormatError: If there is no such file, or it is damaged; see :func:`torchrg.read_cloud`.

@@ -1,8 +1,10 @@
 """Pages without a browser: what is in the file, what is escaped, and what is refused."""
 
 import base64
+import csv
 import functools
 import gzip
+import io
 import json
 import re
 
@@ -255,8 +257,12 @@ def test_missing_package_is_told_with_its_repair(monkeypatch):
 def test_view_writes_a_page(tmp_path, run):
     path, out = tmp_path / "room.npz", tmp_path / "room.html"
     np.savez(path, points=room().coordinates, **room().fields)
-    assert "1,600 and 1,600 points" in run("view", path, "--out", out, "--beside", path).out
-    assert len(described(Page(out.read_text(), ()))["clouds"]) == 2
+    flags = ("--out", out, "--beside", path, "--unit", "m")
+    assert "1,600 and 1,600 points" in run("view", path, *flags).out
+    what = described(Page(out.read_text(), ()))
+    assert len(what["clouds"]) == 2
+    assert what["unit"] == "m"
+    assert described(page_of_room())["unit"] == "units"
 
 
 @pytest.mark.parametrize(
@@ -309,3 +315,18 @@ def test_points_are_as_large_as_the_space_around_them():
     is_sparse = places(page)[:, 0] > 3
     octaves = (np.median(radii[is_sparse]) - np.median(radii[~is_sparse])) / 16
     assert octaves == pytest.approx(1, abs=0.25)
+
+
+def test_the_table_as_csv_names_planes_as_the_file_does():
+    cloud = room()
+    labels = np.where(cloud.fields["labels"] >= 0, cloud.fields["labels"] * 3 + 4, -1)
+    page = make_page(Result(Cloud(cloud.coordinates, {**cloud.fields, "labels": labels})))
+    text = unpacked(page)["table"].astype(np.uint8).tobytes().decode()
+    rows = list(csv.DictReader(io.StringIO(text)))
+    names, counts = np.unique(labels[labels >= 0], return_counts=True)
+    assert [int(row["id"]) for row in rows] == names.tolist()
+    assert [int(row["count"]) for row in rows] == counts.tolist()
+    shown = described(page)["clouds"][0]["planes"]
+    assert [float(row["area"]) for row in rows] == [plane["area"] for plane in shown]
+    bare = make_page(Result(Cloud(cloud.coordinates)))
+    assert "table" not in {entry["name"] for entry in described(bare)["clouds"][0]["arrays"]}

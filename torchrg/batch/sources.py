@@ -22,6 +22,7 @@ from torchrg.batch.scans import (
     Source,
     check_finite,
     check_stems,
+    find_objects,
     note_on_origin,
     segment_cloud,
     write_results,
@@ -46,7 +47,7 @@ from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import num_pixels, read_depth
 from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import make_intrinsics, points_of_image
+from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.io.npy import map_folder
@@ -71,6 +72,8 @@ class CloudSource(Source):
         partition: How superpoints are made.
         level: Which of their levels is written.
         orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
+        within: Array of objects that planes are kept within; see
+            :func:`torchrg.batch.scans.find_objects`. Default: planes go across.
     """
 
     settings: PipelineConfig
@@ -80,6 +83,7 @@ class CloudSource(Source):
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
     level: int = 0
     orient: CloudOrientation = "auto"
+    within: str | None = None
     bytes_per_point: ClassVar[int] = 104
     """Space of a point in the largest of the layouts."""
     kind: ClassVar[str]
@@ -99,8 +103,14 @@ class CloudSource(Source):
         notes = (*cloud.notes, *check_finite(cloud), *note_on_origin(self.layout, cloud))
         has_superpoints = self.superpoint or self.layout != "pointcept"
         partition = self.partition if has_superpoints else None
+        objects = find_objects({**cloud.fields, **reading.arrays}, self.within, cloud)
         seg, superpoints = segment_cloud(
-            cloud, self.settings, orient=self.orient, partition=partition, begin=begin
+            cloud,
+            self.settings,
+            orient=self.orient,
+            partition=partition,
+            within=objects,
+            begin=begin,
         )
         begin("write")
         what, place = (reading, seg, superpoints), _place_of(scan)
@@ -109,7 +119,7 @@ class CloudSource(Source):
             scan.name,
             "converted",
             len(cloud),
-            len(seg.planes.count),
+            len(seg.planes),
             tuple(files),
             repairs=reading.repairs,
             warnings=(*notes, *reading.notes),
@@ -126,6 +136,8 @@ class CloudSource(Source):
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
             partition = json.loads(json.dumps(dataclasses.asdict(self.partition)))
             changed |= {"partition": partition, "level": self.level}
+        if self.within is not None:
+            changed["within"] = self.within
         return changed
 
     def check_results(self, scans: Sequence[Scan], out: Path) -> None:
@@ -195,7 +207,8 @@ class FolderSource(CloudSource):
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
         # In place, nothing but the coordinates, for superpoints the colours, decides what is added.
-        decisive = ("coord", "color") if self.superpoint else ("coord",)
+        within = self.within or "coord"
+        decisive = ("coord", *["color"] * self.superpoint, within, f"{within}20")
         used = decisive if self.in_place else _COPIED
         files = tuple(file for file in scene.files if file.stem in used)
         return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))
@@ -257,7 +270,7 @@ class S3DISSource(CloudSource):
                 f"expected --class-order with --layout pointcept, got layout {self.layout}, which "
                 "has the order pointcept; leave it out."
             )
-        require("pyarrow", extra="s3dis", purpose="read S3DIS")
+        require("pyarrow", extra="text", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
@@ -278,6 +291,11 @@ class ScanNetSource(CloudSource):
     """
 
     kind: ClassVar[str] = "scannet"
+
+    @property
+    def in_place(self) -> bool:
+        """Whether results may go beside the folders of meshes, where programs look for them."""
+        return self.layout != "scannet"
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
@@ -336,7 +354,7 @@ class RGBDSource(Source):
 
     Args:
         layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
-        intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
+        intrinsics: The camera. Default: the layout's.
         depth_scale: Stored value of one metre. Default: the layout's.
         orient: To which side normals point: to the camera, unless it says ``"interior"`` or
             ``"up"``.
@@ -344,7 +362,7 @@ class RGBDSource(Source):
 
     settings: DepthConfig
     layout: str
-    intrinsics: tuple[float, float, float, float] | None = None
+    intrinsics: Pinhole | None = None
     depth_scale: float | None = None
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
@@ -361,9 +379,8 @@ class RGBDSource(Source):
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
-        matrix = None if self.intrinsics is None else make_intrinsics(*self.intrinsics)
         data = RGBDFrames.from_folder(
-            self.root, self.layout, intrinsics=matrix, depth_scale=self.depth_scale
+            self.root, self.layout, intrinsics=self.intrinsics, depth_scale=self.depth_scale
         )
         return [
             Scan(frame.name, (frame.depth, *frame.sources), num_pixels(frame.depth), _plain(frame))
@@ -384,7 +401,7 @@ class RGBDSource(Source):
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = tuple(write_results(folder, coord, seg))
-        num_planes = len(seg.planes.count)
+        num_planes = len(seg.planes)
         notes = () if num_planes else ("no plane found",)
         return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)
 

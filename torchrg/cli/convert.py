@@ -38,12 +38,17 @@ from torchrg.cli.ending import (
 from torchrg.cli.loop import Progress, tell_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig, Up
+from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
 from torchrg.io.files import check_place, free_space, make_folder
+from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
-from torchrg.result import read_result
+from torchrg.result import PLANES_FILE, RECORD, read_result
+
+_Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
+_Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,9 @@ class Arguments:
     and OUT under the same paths. Default: a cluster that is started for the command."""
     limit_memory: float | None = None
     """Gigabytes of memory that all scans at a time may take. Default: 80 % of what is free."""
+    table: str | None = None
+    """Name of a file with the table of planes in the folder of each scan, as planes.csv: as that of
+    torchrg segment --table. planes.json is written there in any case."""
     only: str | None = None
     """Pattern for the names of the scans to convert, as in a shell: "Area_5/*"."""
     force: bool = False
@@ -94,13 +102,15 @@ class CloudArguments(Arguments):
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
     in each level: --superpoint 1000,300."""
     orient: flags.OrientFlag = "auto"
+    within: flags.WithinFlag = None
     level: int = 0
-    """Level of the superpoints that is written; 0 is the finest."""
+    """Level of the superpoints that is written, of layout nag the first one; 0 is the finest."""
     layout: flags.Layout = "pointcept"
     """Files that are written: a folder for each scan (pointcept), bare arrays (npy), or superpoints
     with points, classes and objects where other programs look for them. These are OneFormer3D,
     UniDet3D and ESAM (mmdet3d), SPFormer (spformer), ISBNet, Open3DIS and SphericalMask (isbnet),
-    Mask3D (mask3d), and SAI3D and the preprocessing of others (scannet). The last writes segs.json
+    Mask3D (mask3d), Superpoint Transformer (nag, all levels in one .h5; pip install
+    'torchrg[nag]'), and SAI3D and the preprocessing of others (scannet). The last writes segs.json
     and, of annotated scans, aggregation.json, to replace those of ScanNet; superpoints end at
     objects there. S3DIS has neither scannet nor spformer, ScanNet++ no other with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
@@ -111,7 +121,7 @@ class CloudArguments(Arguments):
     @property
     def output(self) -> dict[str, Any]:
         """What is written of each cloud, as sources take it."""
-        names = ("superpoint", "layout", "partition", "level", "orient")
+        names = ("superpoint", "layout", "partition", "level", "orient", "within")
         return {name: getattr(self, name) for name in names}
 
 
@@ -192,15 +202,14 @@ class RGBDArguments(Arguments):
 
     Examples:
         torchrg convert rgbd frames results --intrinsics 525,525,319.5,239.5 --depth-scale 1000
-        torchrg convert rgbd rgbd_dataset_freiburg1_xyz results --layout tum
+        torchrg convert rgbd capture results
     """
 
-    layout: Literal["tum", "icl-nuim", "scannet", "7-scenes", "images"] = "images"
-    """Data set whose folders ROOT has; images are all .png and .npy below it, of one camera."""
-    intrinsics: str | None = None
-    """Camera, as fx,fy,cx,cy in pixels. Default: that of the layout; images have none."""
-    depth_scale: float | None = None
-    """Stored value of one metre. Default: that of the layout; images have none."""
+    layout: Literal["auto", _Benchmark, _Capture, "images"] = "auto"
+    """Data set whose folders ROOT has, auto for what its files show; nerfstudio is transforms.json,
+    as of Polycam and COLMAP; images are all depth images below ROOT, of one camera."""
+    intrinsics: flags.IntrinsicsFlag = None
+    depth_scale: flags.DepthScaleFlag = None
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
     orient: flags.ImageOrientFlag = "auto"
@@ -211,7 +220,8 @@ class RGBDArguments(Arguments):
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
-        options = (self.layout, camera, self.depth_scale, self.orient)
+        layout = find_layout(root) if self.layout == "auto" else self.layout
+        options = (layout, camera, self.depth_scale, self.orient)
         return RGBDSource(root, self.depth, *options)
 
 
@@ -230,7 +240,7 @@ Normals, curvature and plane labels of every scan of a data set.
   s3dis    the rooms of S3DIS as released, into Pointcept's layout
   folder   every cloud below a folder
   scannet  the scans of ScanNet or ScanNet++ as released, into Pointcept's layout
-  rgbd     depth frames, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any
+  rgbd     depth frames: captures of phones, folders of public data sets, or any images
 
 Superpoints where other programs look for them: --layout.
 
@@ -252,7 +262,7 @@ def run(argv: list[str]) -> int:
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with warnings_as_lines():
-        source = arguments.source(root, out)
+        source = dataclasses.replace(arguments.source(root, out), table=arguments.table)
         jobs = list_jobs(source, out, only=arguments.only)
     if arguments.dry_run:
         plan = _look_at(jobs, arguments)
@@ -276,6 +286,12 @@ def _check(arguments: Arguments) -> None:
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     flags.bytes_of_limit(arguments.limit_memory)
+    table = arguments.table or PLANES_FILE
+    if Path(table).name != table or Path(table).suffix not in TABLE_SUFFIXES or table == RECORD:
+        raise ConfigError(
+            "expected --table to be the name of a .csv or .json file in the folder of each scan, "
+            f"got {table}; use planes.csv."
+        )
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address together with --engine ray.")
     if _pages_of(arguments) is not None:

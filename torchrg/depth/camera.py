@@ -1,6 +1,6 @@
 """Pinhole cameras: depth images to points, through kornia, and back from organised clouds."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -130,6 +130,42 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
             f"{fx}, {fy}, {cx}, {cy}."
         )
     return matrix
+
+
+class Pinhole(NamedTuple):
+    """A pinhole camera in pixels, of images of a size, width and height, where that is known."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    size: tuple[int, int] | None = None
+
+    def matrix(self, size: tuple[int, int] | None = None) -> Tensor:
+        """Return the camera matrix ``(3, 3)``, float64, for images that are resized to ``size``.
+
+        Convention:
+            The middle of the first pixel is 0. An image that is resized keeps its outer edges, half
+            a pixel beyond the middles of its outermost pixels: ``cx + 0.5`` grows as ``fx`` does.
+
+        Raises:
+            ConfigError: If the sides of the images are in another ratio, by more than a pixel.
+
+        Example:
+            >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
+            [150.0, 0.0, 79.5]
+        """
+        fx, fy, cx, cy, own = self
+        if size is None or own is None:
+            return make_intrinsics(fx, fy, cx, cy)
+        across, down = size[0] / own[0], size[1] / own[1]
+        if abs(size[0] * own[1] - size[1] * own[0]) > max(own):
+            raise ConfigError(
+                f"Pinhole: expected images of {own[0]} x {own[1]} pixels, as its camera's, or in "
+                f"their ratio, got {size[0]} x {size[1]}; pass the camera of the depth images."
+            )
+        middle = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+        return make_intrinsics(fx * across, fy * down, *middle)
 
 
 def find_intrinsics(points: Tensor) -> Tensor | None:

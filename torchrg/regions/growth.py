@@ -3,6 +3,7 @@
 import math
 from array import array
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torchrg._parallel import (
     return_freed_memory,
     sequential_operations,
 )
-from torchrg.config import GrowingConfig, PipelineConfig, settings_of
+from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import blocks, canonical_order, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
@@ -55,7 +56,7 @@ def grow_regions(
     normals: Tensor | NDArray[np.floating],
     curvature: Tensor | NDArray[np.floating],
     neighbors: Neighbors,
-    config: GrowingConfig | PipelineConfig | str | None = None,
+    config: GrowingConfig | AnyConfig | None = None,
     *,
     valid: Tensor | None = None,
     residual_rms: Tensor | NDArray[np.floating] | None = None,
@@ -64,6 +65,7 @@ def grow_regions(
     signed_normals: bool = False,
     canonical: bool = False,
     chunk_size: int = CHUNK_SIZE,
+    **changes: Any,  # noqa: ANN401
 ) -> Tensor:
     """Grow regions of similar normals, in the order of ascending curvature (Algorithm 2) [1].
 
@@ -85,8 +87,8 @@ def grow_regions(
         normals: Unit normals, shape ``(N, 3)``; their sign only matters with ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
-        config: Settings, a whole configuration, or the name of a preset. Default: that of
-            :func:`torchrg.load_config`, which needs ``residual_rms``.
+        config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
+            Default: that of :func:`torchrg.load_config`, which needs ``residual_rms``.
         valid: Points that have a normal, shape ``(N,)``, bool; no region passes through others, nor
             through points whose normal or curvature is not finite. Default: all.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
@@ -95,10 +97,10 @@ def grow_regions(
         max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
             unit of the colours) does not join. Default: colours play no part.
         signed_normals: Whether opposite normals, if oriented, differ by 180 degrees instead of 0,
-        so
-            that the two faces of a thin wall never join.
+            so that the two faces of a thin wall never join.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
+        **changes: Single settings, as in ``max_angle_deg=7``.
 
     Returns:
         Labels, shape ``(N,)``, int64; :data:`torchrg.UNLABELED` for points of no region and of
@@ -106,7 +108,7 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If residuals or colours are needed, and there are none.
+        ConfigError: If residuals or colours are needed, and there are none, or a setting is wrong.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -123,9 +125,8 @@ def grow_regions(
         >>> labels.unique()
         tensor([0])
     """
-    if not isinstance(config, GrowingConfig):
-        config = settings_of("grow_regions", GrowingConfig, config)
-    cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
+    settings = settings_of("grow_regions", GrowingConfig, config, changes)
+    cloud = checked_cloud(settings, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:
         cloud = _with_colors(cloud, colors, max_color_distance)
@@ -134,9 +135,9 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    if "auto" in (config.min_size, config.facet_tolerance):
-        config = config.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
-    labels = label_regions(cloud, grow(cloud, config, chunk_size), config, chunk_size)
+    if "auto" in (settings.min_size, settings.facet_tolerance):
+        settings = settings.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
+    labels = label_regions(cloud, grow(cloud, settings, chunk_size), settings, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 

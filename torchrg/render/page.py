@@ -30,6 +30,7 @@ from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
 from torchrg.neighbors.order import restore_rows
+from torchrg.plane_table import encode_csv
 from torchrg.render.channels import MODES, channels_of, encode_directions
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
@@ -37,6 +38,7 @@ from torchrg.render.content import (
     Frame,
     Shown,
     choose_points,
+    describe_shown,
     frame_of,
     planes_of_page,
     radii_of,
@@ -86,6 +88,7 @@ def make_page(
     up: tuple[float, float, float] | None = None,
     azimuth_deg: float | None = None,
     max_points: int = MAX_POINTS,
+    unit: str = "units",
 ) -> Page:
     """Make a page that shows a result, or two of them with one camera.
 
@@ -106,6 +109,7 @@ def make_page(
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
         max_points: Most points of a cloud that are shown; of a larger one it is a random sample,
             and the page says so.
+        unit: Name of the unit of the coordinates, for the scale bar.
 
     Returns:
         The page.
@@ -150,6 +154,7 @@ def make_page(
             "scale": frame.scale,
         },
         "kinds": PLANE_KINDS,
+        "unit": unit,
         "clouds": scenes,
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)
@@ -233,6 +238,8 @@ def _describe_cloud(
     arrays["covered"] = covered.numpy()
     radii = radii_of(shown.surface)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
+    if planes:
+        arrays["table"] = np.frombuffer(encode_csv(describe_shown(result, frame)), np.uint8)
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
