@@ -34,9 +34,12 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
     repair = ""
     if isinstance(values, list | tuple):
-        repair = "; torch.tensor makes one of numbers"
+        repair = "; torch.tensor makes one of numbers, with_format('torch') those of a data set"
     elif name == "points" and not isinstance(values, np.ndarray):
-        repair = "; read_cloud(path).points is that of a file"
+        repair = (
+            "; read_cloud(path).points is that of a file, numpy.asarray(cloud.points) that of a "
+            "cloud of Open3D"
+        )
     raise ShapeError(
         f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{repair}."
     )
@@ -68,6 +71,11 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
             raise ShapeError(
                 f"{caller}: expected {name} of float32 or float64, got {dtype}{repair}."
             )
+        if tensor.is_nested:
+            raise ShapeError(
+                f"{caller}: expected {name} to be dense, got a nested tensor; pass "
+                f"torch.nested.to_padded_tensor({name}, 0.0), and a mask of what is there."
+            )
         if tensor.layout is not torch.strided:
             raise ShapeError(
                 f"{caller}: expected {name} to be dense, got a sparse tensor; pass "
@@ -88,6 +96,11 @@ def check_points(caller: str, points: Tensor) -> None:
         raise ShapeError(
             f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "
             "of an image to torchrg.transforms.SegmentDepth, or points.reshape(-1, 3)."
+        )
+    if points.ndim == 2 and points.shape[1] > 3:
+        raise ShapeError(
+            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass "
+            "points[:, :3]."
         )
     check_shapes(caller, points=(points, "N 3"))
     check_floating(caller, points=points)

@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
@@ -157,6 +157,14 @@ def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa:
     return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
 
 
+def refuse_forward_mode(caller: str) -> NoReturn:
+    """Say which derivatives there are, to ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
+    raise NotImplementedError(
+        f"{caller}: has derivatives in reverse mode only; use torch.func.jacrev, vjp or grad in "
+        "place of jacfwd, jvp or hessian."
+    )
+
+
 class _Differentiable(torch.autograd.Function):
     """An opaque function with its gradient, which is another one."""
 
@@ -183,6 +191,10 @@ class _Differentiable(torch.autograd.Function):
             first = _Once.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
         return None, first, *[None] * (len(ctx.saved_tensors) - 1)
 
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
+        refuse_forward_mode(ctx.call.split("|")[0])
+
 
 class _Once(torch.autograd.Function):
     """The gradient of an opaque function, which has none itself."""
@@ -200,4 +212,8 @@ class _Once(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
+        raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
         raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")

@@ -222,6 +222,8 @@ class MVE(_Function):
 class DetS(_Function):
     """Deterministic S-estimator of patches, with settings of :func:`torchrg.robust.fit_dets`.
 
+    Its gradients are those of the last step, with the weights of the points held fixed.
+
     Example:
         >>> DetS()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
         tensor(True)
@@ -240,6 +242,8 @@ class DetS(_Function):
 @dataclass(eq=False, repr=False)
 class DetMM(_Function):
     """Deterministic MM-estimator of patches, with settings of :func:`torchrg.robust.fit_detmm`.
+
+    Its gradients are those of the last step, with the weights of the points held fixed.
 
     Example:
         >>> DetMM()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit

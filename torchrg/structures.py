@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, SupportsIndex
+from typing import TYPE_CHECKING, Any, NamedTuple, SupportsIndex
 
 import numpy as np
 import torch
@@ -86,6 +86,13 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.coordinates)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name):  # noqa: ANN001, ANN204
+            """Say where the values of points are, to who asks for them by name."""
+            known = ", ".join(f"fields[{field!r}]" for field in vars(self).get("fields", ()))
+            raise AttributeError(f"Cloud has no attribute {name!r}; it has {known or 'no fields'}.")
 
     @cached_property
     def finite(self) -> NDArray[np.bool_]:

@@ -289,7 +289,7 @@ def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path
 def test_the_command_knows_kind_and_layouts(root, room, tmp_path, capsys):
     assert set(get_args(Layout)) == {"pointcept", *LAYOUTS}
     command = ["convert", "scannet", str(root), str(tmp_path), "--preset", "classic"]
-    command += ["--only", f"*{SCAN}", "--layout", "npy", "--superpoint", str(NUM_PARTS)]
+    command += ["--only", f"*{SCAN}", "--layout", "npy", "--superpoints", str(NUM_PARTS)]
     assert main(command) == 0
     assert "1 converted" in capsys.readouterr().out
     found = np.load(tmp_path / "superpoints" / f"{SCAN}.npy")

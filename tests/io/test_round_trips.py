@@ -158,6 +158,16 @@ def test_own_superpoints_are_kept_aside_too(tmp_path, make_cloud):
         np.testing.assert_array_equal(fields["superpoints_input"], own["superpoints"])
 
 
+def test_result_files_keep_the_colours_of_the_cloud(tmp_path, make_cloud, make_segmentation):
+    cloud = make_cloud(dtype="f8")
+    color = np.arange(180, dtype=np.uint8).reshape(60, 3)
+    cloud = replace(cloud, fields={"color": color, "intensity": np.zeros(60)})
+    write_cloud(tmp_path / "a.npz", cloud, make_segmentation(60))
+    fields = read_cloud(tmp_path / "a.npz").fields
+    np.testing.assert_array_equal(fields["color"], color)
+    assert "intensity" not in fields
+
+
 def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, make_segmentation):
     seg = make_segmentation(60)
     cloud = make_cloud(dtype="f8", origin=UTM)

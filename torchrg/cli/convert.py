@@ -90,9 +90,9 @@ class CloudArguments(Arguments):
     pages: Path | None = None
     """Directory for a picture and a page of each scan that is done, and for index.html, in which
     the pictures are links to the pages (pip install 'torchrg[view]'). Default: none are made."""
-    superpoint: bool = False
+    superpoints: bool = False
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
-    in each level: --superpoint 1000,300."""
+    in each level: --superpoints 1000,300."""
     orient: flags.OrientFlag = "auto"
     level: int = 0
     """Level of the superpoints that is written; 0 is the finest."""
@@ -111,8 +111,8 @@ class CloudArguments(Arguments):
     @property
     def output(self) -> dict[str, Any]:
         """What is written of each cloud, as sources take it."""
-        names = ("superpoint", "layout", "partition", "level", "orient")
-        return {name: getattr(self, name) for name in names}
+        names = ("layout", "partition", "level", "orient")
+        return {"superpoint": self.superpoints, **{name: getattr(self, name) for name in names}}
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class S3DISArguments(CloudArguments):
 
     Examples:
         torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --dry-run
-        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --workers 4 --superpoint
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --workers 4 --superpoints
         torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --areas 5 --pages pages
     """
 
@@ -175,7 +175,7 @@ class ScanNetArguments(CloudArguments):
 
     Examples:
         torchrg convert scannet scannet out --dry-run
-        torchrg convert scannet scannet out --workers 4 --superpoint
+        torchrg convert scannet scannet out --workers 4 --superpoints
         torchrg convert scannet scannet out --layout mmdet3d
     """
 
@@ -242,7 +242,7 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else USAGE_ERROR)
-    kind, *rest = flags.spell_counts(argv, "--superpoint")
+    kind, *rest = flags.spell_counts(argv)
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
@@ -287,10 +287,10 @@ def _check(arguments: Arguments) -> None:
                 "expected --orient auto, interior, up or none, as this data set names no places of "
                 "scanners, got viewpoint; use auto."
             )
-        has_superpoints = arguments.superpoint or arguments.layout != "pointcept"
+        has_superpoints = arguments.superpoints or arguments.layout != "pointcept"
         usual = (SuperpointsConfig(), 0)
         if not has_superpoints and (arguments.partition, arguments.level) != usual:
-            raise ConfigError("expected --superpoint with --partition or --level; add it.")
+            raise ConfigError("expected --superpoints with --partition or --level; add it.")
         if arguments.pages is not None and arguments.layout != "pointcept":
             raise ConfigError("expected --pages with --layout pointcept, which pages are made of.")
 

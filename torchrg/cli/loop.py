@@ -14,6 +14,7 @@ from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import notes_on_results
 from torchrg.io.files import check_place, make_folder
+from torchrg.io.npy import KEPT_FIELDS
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
 
@@ -178,7 +179,8 @@ def note_input(
 
 def left_out(target: Path, fields: Collection[str]) -> str:
     """Return the words for a report on which fields of a cloud its result does not hold."""
-    return f" (without its own {', '.join(fields)})" if fields and is_archive(target) else ""
+    names = [name for name in fields if name not in KEPT_FIELDS and is_archive(target)]
+    return f" (without its own {', '.join(names)})" if names else ""
 
 
 @contextlib.contextmanager

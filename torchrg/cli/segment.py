@@ -115,7 +115,7 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _refuse_images(argv)
-    argv = flags.spell_counts(argv, "--superpoints")
+    argv = flags.spell_counts(argv)
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):

@@ -157,10 +157,10 @@ def write_cloud(
         cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. A field of
         the cloud whose name a result takes is kept under another: ``label_input``,
         ``normals_input`` and so on; where there is such a field already, it is that which stays.
-        ``.npz`` holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the
-        table of planes as
-        :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's
-        coordinates, and ``provenance``. Equal input gives equal bytes. Superpoints are
+        ``.npz`` holds ``points``, ``color`` of the cloud, ``labels``, ``normals``, ``curvature``,
+        ``sharp``, ``valid``, the table of planes as
+        :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's coordinates, and
+        ``provenance``. Equal input gives equal bytes. Superpoints are
         ``superpoints``, and ``superpoints_1`` and so on for the coarser levels; in ``.npz`` also
         ``plane_of_superpoint``. ``.vg`` holds coordinates, colours, normals and the planes as
         vertex groups, see :mod:`torchrg.io.vg`; it is not read.

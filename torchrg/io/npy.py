@@ -46,6 +46,8 @@ _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 _COORDINATES = ("points", "coord")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 """What a segmentation says of each point."""
+KEPT_FIELDS = ("color",)
+"""Fields of a cloud that are kept beside its result, as pages and pictures show them."""
 _NOT_PER_POINT = {
     *(f"plane_{name}" for name in (*(part.name for part in fields(Planes)), "of_superpoint")),
     *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
@@ -163,6 +165,7 @@ def write_npz(
                 )
             arrays[name] = values
     else:
+        arrays |= {name: cloud.fields[name] for name in KEPT_FIELDS if name in cloud.fields}
         arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in POINT_RESULTS}
         arrays |= planes_to_arrays(segmentation.planes, cloud.origin)
     if superpoints is not None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_floating, check_shapes, has_values
+from torchrg._opaque import refuse_forward_mode
 
 _JACOBI_SWEEPS = 5
 """Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
@@ -131,6 +132,10 @@ class _Eigh3(torch.autograd.Function):
         whole: Tensor = vectors @ inner @ vectors.mT
         # Only the upper triangle is read, but both stand for one number, as in torch.linalg.eigh.
         return (whole + whole.mT) / 2
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
+        refuse_forward_mode("eigh3")
 
 
 def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:

@@ -141,7 +141,8 @@ def orient_normals(
         )
     if (towards == "viewpoint") != (viewpoint is not None):
         wanted = "a viewpoint" if viewpoint is None else "no viewpoint"
-        raise ConfigError(f"orient_normals: expected {wanted} with towards={towards!r}.")
+        repair = "" if viewpoint is None else "; pass towards='viewpoint' to look at one"
+        raise ConfigError(f"orient_normals: expected {wanted} with towards={towards!r}{repair}.")
     if viewpoint is not None:
         place = as_tensor("orient_normals", "viewpoint", viewpoint).to(cloud)
         pattern = "3" if place.ndim == 1 else "N 3"
