@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
-from typing import Any, ParamSpec, TypeGuard, TypeVar, get_args
+from typing import Any, NoReturn, ParamSpec, TypeGuard, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -166,6 +166,14 @@ def has_values(*tensors: Tensor | None) -> bool:
         return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in given)
     except RuntimeError:  # the answer of what stands for another tensor
         return False
+
+
+def refuse_forward_mode(caller: str) -> NoReturn:
+    """Say which derivatives there are, to ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
+    raise NotImplementedError(
+        f"{caller}: has derivatives in reverse mode only; use torch.func.jacrev, vjp or grad in "
+        "place of jacfwd, jvp or hessian."
+    )
 
 
 def _plain(value: object) -> object:

@@ -10,12 +10,12 @@ import inspect
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg._checks import Arguments, Result, has_values, is_tensor
+from torchrg._checks import Arguments, Result, has_values, is_tensor, refuse_forward_mode
 from torchrg.errors import ConfigError
 
 
@@ -155,14 +155,6 @@ def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa:
 @_backward.register_vmap
 def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
     return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
-
-
-def refuse_forward_mode(caller: str) -> NoReturn:
-    """Say which derivatives there are, to ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
-    raise NotImplementedError(
-        f"{caller}: has derivatives in reverse mode only; use torch.func.jacrev, vjp or grad in "
-        "place of jacfwd, jvp or hessian."
-    )
 
 
 class _Differentiable(torch.autograd.Function):

@@ -158,23 +158,13 @@ def test_own_superpoints_are_kept_aside_too(tmp_path, make_cloud):
         np.testing.assert_array_equal(fields["superpoints_input"], own["superpoints"])
 
 
-def test_result_files_keep_the_colours_of_the_cloud(tmp_path, make_cloud, make_segmentation):
-    cloud = make_cloud(dtype="f8")
-    color = np.arange(180, dtype=np.uint8).reshape(60, 3)
-    cloud = replace(cloud, fields={"color": color, "intensity": np.zeros(60)})
-    write_cloud(tmp_path / "a.npz", cloud, make_segmentation(60))
-    fields = read_cloud(tmp_path / "a.npz").fields
-    np.testing.assert_array_equal(fields["color"], color)
-    assert "intensity" not in fields
-
-
 def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, make_segmentation):
     seg = make_segmentation(60)
     cloud = make_cloud(dtype="f8", origin=UTM)
     write_cloud(tmp_path / "a.npz", cloud, seg, provenance={"torchrg": "1", "config": {"k": 50}})
     with np.load(tmp_path / "a.npz", allow_pickle=False) as result:
         arrays = dict(result)
-    points = ["points", "labels", "normals", "curvature", "sharp", "valid"]
+    points = ["points", "color", "labels", "normals", "curvature", "sharp", "valid"]
     planes = ["normal", "offset", "centroid", "area", "count", "rms"]
     planes += ["extent", "axes", "center", "curved"]
     assert list(arrays) == [*points, *(f"plane_{name}" for name in planes), "provenance"]
@@ -239,7 +229,8 @@ def test_reading_a_result_gives_fields_of_points_only(tmp_path, make_cloud, make
     cloud = make_cloud(3)
     write_cloud(tmp_path / "a.npz", cloud, seg)
     fields = read_cloud(tmp_path / "a.npz").fields
-    assert set(fields) == {"labels", "normals", "curvature", "sharp", "valid"}
+    assert set(fields) == {"color", "labels", "normals", "curvature", "sharp", "valid"}
+    np.testing.assert_array_equal(fields["color"], cloud.fields["color"])
 
 
 def test_segmentation_of_another_cloud_is_refused(tmp_path, make_cloud, make_segmentation):

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_floating, check_shapes, has_values
-from torchrg._opaque import refuse_forward_mode
+from torchrg._checks import check_floating, check_shapes, has_values, refuse_forward_mode
 
 _JACOBI_SWEEPS = 5
 """Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
