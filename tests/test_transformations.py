@@ -213,7 +213,7 @@ def test_what_does_not_fit_into_an_operation_is_refused(patches):
 
 
 @functions
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")
 def test_forward_mode_is_refused_in_our_words(patches, name):
     patch = patches[0].double()
     if name == "covariance":

@@ -51,7 +51,7 @@ _KEPT_BYTES = 31 * 2**20
 
 @contextmanager
 def in_empty_folder() -> Iterator[None]:
-    """Start processes in a folder without modules, as Python 3.10 and Ray import from where it is.
+    """Start processes in a folder without modules, as Python 3.10 and libraries import from there.
 
     Paths that they are given have to be absolute.
     """

@@ -112,7 +112,9 @@ def segment_planes(
     points = as_tensor("segment_planes", "points", points).detach()
     check_points("segment_planes", points)
     warn_of_steps("segment_planes", points)
-    settings = settings_of("segment_planes", PipelineConfig, config, changes)
+    settings = config
+    if not isinstance(settings, PipelineConfig) or changes:
+        settings = settings_of("segment_planes", PipelineConfig, config, changes)
 
     def begin(stage: str) -> None:
         if scratch.is_active():

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import signal
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
@@ -89,8 +88,7 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         # What ends it before its first scan is a line of a report, no traceback on the terminal.
         self.errors, errors = os.pipe()
-        apart = in_empty_folder() if sys.version_info < (3, 11) else contextlib.nullcontext()
-        with apart, _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
+        with in_empty_folder(), _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
             self.process = context.Process(target=_serve, args=(theirs, stderr))
             self.process.start()
         os.close(errors)
