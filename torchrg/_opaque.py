@@ -49,7 +49,9 @@ def opaque(
 
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            given: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)} | kwargs
+            # Compilers of torch 2.5 follow neither a zip of unequal lengths nor a union of dicts.
+            given: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
+            given = {**given, **kwargs}
             tensors = {key: given[key] for key in parameters if is_tensor(given.get(key))}
             if has_values(*tensors.values()):
                 return function(*args, **kwargs)
