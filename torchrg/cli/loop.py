@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import RLock
 from typing import Any, NoReturn
 
 from tqdm import tqdm
@@ -17,6 +18,9 @@ from torchrg.io.files import check_place, make_folder
 from torchrg.io.npy import KEPT_FIELDS
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
+
+# Tqdm's own lock starts a process in Python 3.14, which would import from the folder of a command.
+tqdm.set_lock(RLock())
 
 DRAWINGS = (".png", ".html")
 """Suffixes of pictures and pages."""
