@@ -48,7 +48,7 @@ from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
+from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.npy import map_folder
 from torchrg.normals.sides import CloudOrientation, orient_cloud
 from torchrg.structures import Cloud, Segmentation
@@ -157,12 +157,12 @@ class FolderSource(CloudSource):
             no other folder below it can be.
         columns: Names for the columns of text and of bare ``.npy`` arrays; see
             :func:`torchrg.read_cloud`.
-        suffixes: Which files are clouds. Default: all that can be read.
+        suffixes: Which files are clouds. Default: all that can be read but ``.csv``.
     """
 
     out: Path
     columns: tuple[str, ...] | None = None
-    suffixes: tuple[str, ...] = tuple(FORMATS)
+    suffixes: tuple[str, ...] = FOLDER_SUFFIXES
     kind: ClassVar[str] = "folder"
 
     @property

@@ -40,7 +40,7 @@ from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig, Up
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import FORMATS
+from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
@@ -144,9 +144,9 @@ class FolderArguments(CloudArguments):
     """
 
     columns: flags.ColumnsFlag = None
-    suffixes: tuple[str, ...] = tuple(FORMATS)
-    """Suffixes of the files that are clouds, by default all that torchrg segment reads. Name fewer
-    where two files differ in the suffix alone."""
+    suffixes: tuple[str, ...] = FOLDER_SUFFIXES
+    """Suffixes of the files that are clouds, by default all that torchrg segment reads but .csv.
+    Name fewer where two files differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
