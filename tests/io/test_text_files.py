@@ -281,7 +281,10 @@ def test_written_text_says_what_its_columns_are(tmp_path):
             "ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n63 1.6 0.1 0.7 115 121 122 1.33 16 6542\n",
             "line 2: expected points, got those of COLMAP with their images; colmap model_conv",
         ),
-        ("x y z label\n0 1 2 0.5\n", "expected labels to be whole numbers of 64 bits; rename"),
+        (
+            "x y z label\n0 1 2 0.5\n",
+            "expected labels to be whole numbers of 64 bits, got others; rename",
+        ),
         ("x y z label\n0 1 2 1e30\n", "expected labels to be whole numbers of 64 bits"),
     ],
 )

@@ -375,7 +375,9 @@ class RGBDSource(Source):
         frame = _frame(scan.item)
         depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         if not bool((depth > 0).any()):
-            raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
+            raise FormatError(
+                f"{frame.depth}: expected pixels with depth, got none; take this frame out."
+            )
         begin("planes")
         seg = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
         points = points_of_image(depth, frame.intrinsics, frame.pose)

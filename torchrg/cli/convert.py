@@ -293,7 +293,7 @@ def _check(arguments: Arguments) -> None:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     flags.bytes_of_limit(arguments.limit_memory)
     if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
+        raise ConfigError("expected --ray-address together with --engine ray, got none; add it.")
     if _pages_of(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
@@ -306,9 +306,14 @@ def _check(arguments: Arguments) -> None:
         has_superpoints = arguments.superpoint or arguments.layout != "pointcept"
         usual = (SuperpointsConfig(), 0)
         if not has_superpoints and (arguments.partition, arguments.level) != usual:
-            raise ConfigError("expected --superpoint with --partition or --level; add it.")
+            raise ConfigError(
+                "expected --superpoint with --partition or --level, got none; add it."
+            )
         if arguments.pages is not None and arguments.layout != "pointcept":
-            raise ConfigError("expected --pages with --layout pointcept, which pages are made of.")
+            raise ConfigError(
+                "expected --pages with --layout pointcept, which pages are made of, got "
+                f"{arguments.layout}; leave one of them out."
+            )
 
 
 def _pages_of(arguments: Arguments) -> Path | None:

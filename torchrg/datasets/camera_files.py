@@ -100,7 +100,10 @@ def camera_of_numbers(
     """Return the camera whose focal lengths and axis a record has under some names."""
     fx, fy, cx, cy = (number_of(path, record, name) for name in names)
     if 0 in (fx, fy):
-        raise FormatError(f"{path}: expected {names[0]} and {names[1]} other than 0.")
+        raise FormatError(
+            f"{path}: expected {names[0]} and {names[1]} other than 0, got {fx:g} and {fy:g}; "
+            "correct them."
+        )
     return Pinhole(fx, fy, cx, cy, _size_of(path, record))
 
 
@@ -167,6 +170,9 @@ def _size_of(path: Path, record: Record) -> tuple[int, int] | None:
         if names[0] in record:
             width, height = (int(number_of(path, record, name)) for name in names)
             if min(width, height) < 1:
-                raise FormatError(f"{path}: expected {names[0]} and {names[1]} above 0.")
+                raise FormatError(
+                    f"{path}: expected {names[0]} and {names[1]} above 0, got {width} and "
+                    f"{height}; correct them."
+                )
             return width, height
     return None

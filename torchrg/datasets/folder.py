@@ -162,7 +162,9 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     """
     paths = [path for path in files_below(Path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
-        raise FormatError(f"{folder}: expected folders with coord.npy, got none.")
+        raise FormatError(
+            f"{folder}: expected folders with coord.npy, got none; name the folder of an area."
+        )
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
     for key in _NUMBERED & set(scenes[0]):
         first = 0

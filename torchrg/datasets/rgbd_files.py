@@ -186,7 +186,8 @@ def _read_npy(source: Path) -> NDArray[np.number]:
         values: NDArray[np.number] = np.load(source, allow_pickle=False)
     if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
         raise FormatError(
-            f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}."
+            f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}; "
+            "save one number a pixel."
         )
     return values
 
@@ -195,15 +196,18 @@ def read_matrix(path: Path) -> Tensor:
     """Read a matrix of four rows of four numbers, shape ``(4, 4)``, float64."""
     rows = _words(path)
     if [len(row) for row in rows] != [4] * 4:
-        raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
+        widths = ", ".join(str(len(row)) for row in rows[:5]) or "no"
+        raise FormatError(
+            f"{path}: expected 4 rows of 4 numbers, a pose, got {len(rows)} rows of {widths} "
+            "numbers; fetch the file again."
+        )
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)
 
 
 def read_numbers(path: Path, count: int, what: str) -> list[list[float]]:
     """Read rows of so many numbers; ``what`` says which they are."""
     rows = _words(path)
-    if not rows or any(len(row) != count for row in rows):
-        raise FormatError(f"{path}: expected {what} in each row.")
+    _check_widths(path, rows, count, what)
     return _numbers(path, rows)
 
 
@@ -286,13 +290,20 @@ def _rotations(quaternions: Tensor) -> Tensor:
 def _rows_by_time(path: Path, num_words: int, what: str) -> list[list[str]]:
     """Return the words of each row, which are so many, by the time that the first of them is."""
     rows = _words(path)
-    if not rows or any(len(row) != num_words for row in rows):
-        raise FormatError(f"{path}: expected {what} in each row.")
+    _check_widths(path, rows, num_words, what)
     times = [time for (time,) in _numbers(path, [row[:1] for row in rows])]
     wrong = next((time for time in times if not math.isfinite(time)), None)
     if wrong is not None:
         raise FormatError(f"{path}: expected finite times, got {wrong}; repair or delete its row.")
     return [rows[i] for i in sorted(range(len(rows)), key=times.__getitem__)]
+
+
+def _check_widths(path: Path, rows: list[list[str]], num_words: int, what: str) -> None:
+    """Check that there are rows, and that each has so many words."""
+    wrong = next((row for row in rows if len(row) != num_words), [])
+    if wrong or not rows:
+        got = repr(" ".join(wrong)[:60]) if wrong else "none"
+        raise FormatError(f"{path}: expected {what} in each row, got {got}; fetch the file again.")
 
 
 def _words(path: Path) -> list[list[str]]:
@@ -307,4 +318,4 @@ def _numbers(path: Path, rows: list[list[str]]) -> list[list[float]]:
     try:
         return [[float(word) for word in row] for row in rows]
     except ValueError as error:
-        raise FormatError(f"{path}: expected numbers: {error}.") from error
+        raise FormatError(f"{path}: expected numbers: {error}; fetch the file again.") from error

@@ -197,7 +197,9 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
     shared = read_record(path)
     frames = shared.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise FormatError(f"{path}: expected a list of frames; is it one of nerfstudio?")
+        raise FormatError(
+            f"{path}: expected a list of frames, as nerfstudio writes, got none; export it again."
+        )
     records = sorted(
         ({**shared, **frame} for frame in frames if frame.get("depth_file_path")),
         key=lambda record: natural_key(str(record["depth_file_path"])),
@@ -251,7 +253,9 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     try:
         times = [float(seconds) for _, _, seconds in stamps]
     except ValueError as error:
-        raise FormatError(f"{folder}: expected names like 40753679_6791.2.png: {error}.") from None
+        raise FormatError(
+            f"{folder}: expected names like 40753679_6791.2.png: {error}; rename or remove it."
+        ) from None
     poses = read_nearest(times, track, read_axis_angles)
     for (name, image), (video, _, _), time, pose in zip(images, stamps, times, poses, strict=True):
         cameras = [folder / "lowres_wide_intrinsics" / f"{name}.pincam"]
@@ -306,7 +310,9 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
     for name, image in _depth_images(folder, "depth/*"):
         record = records.get(name)
         if not isinstance(record, dict):
-            raise FormatError(f"{path}: expected {name}, of which there is depth, got no such.")
+            raise FormatError(
+                f"{path}: expected {name}, of which there is depth, got no such; fetch it again."
+            )
         camera = camera_of_matrix(path, record, "intrinsic", _SCANNETPP_COLOR)
         pose = None
         if record.get("aligned_pose") is not None:

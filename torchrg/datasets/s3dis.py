@@ -157,7 +157,8 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
         bare = [path.name for path in entries if path not in rooms]
         without = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
         warnings.warn(
-            f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}.",
+            f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}; "
+            "fetch the others unless you mean to go without.",
             stacklevel=3,
         )
     return [SceneFiles(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]

@@ -91,7 +91,11 @@ def assemble_cloud(
             raise FormatError(f"{path}: expected fields x, y, z, got {found}; rename or add them.")
         axes = [rest.pop(name) for name in names]
         if any(axis.ndim != 1 for axis in axes):
-            raise FormatError(f"{path}: expected one number a point in each of x, y, z.")
+            shapes = ", ".join(map(_row_shape, axes))
+            raise FormatError(
+                f"{path}: expected one number a point in each of x, y, z, got {shapes}; flatten "
+                "or rename them."
+            )
         places = _stacked(path, axes)
     else:
         places = rest.pop(coordinates)
@@ -350,7 +354,8 @@ def _labels(path: Path, labels: Values) -> NDArray[np.int64]:
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
     if not are_whole(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
-            f"{path}: expected labels to be whole numbers of 64 bits; rename or remove that field."
+            f"{path}: expected labels to be whole numbers of 64 bits, got others; rename or remove "
+            "that field."
         )
     if flat.dtype.kind == "f" and largest >= LARGEST_WHOLE:
         raise FormatError(
