@@ -274,7 +274,7 @@ def test_written_text_says_what_its_columns_are(tmp_path):
         (
             "x,y,z,room\n1,2,3,7\n4,5,6,hall\n",
             "line 3: expected 4 numbers, got '4,5,6,hall'; repair or delete this line, or leave "
-            "out a column of words, _ in --columns",
+            "a column of words out, _ in --columns",
         ),
         (
             "# 3D point list with one line of data per point:\n#   POINT3D_ID, X, Y, Z, R, G, B, "

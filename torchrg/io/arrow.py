@@ -1,4 +1,4 @@
-"""Lines of plain numbers through pyarrow, which takes a tenth of the time that NumPy does."""
+"""Lines of plain numbers through pyarrow, which is faster than NumPy the more digits they have."""
 
 import importlib
 from contextlib import suppress
