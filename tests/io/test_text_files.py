@@ -359,9 +359,9 @@ def broken_text(rng):
         ]
         for _ in range(rng.randrange(2, 40))
     ]
-    for _ in range(rng.choice([1, 1, 2])):
+    for _ in range(rng.choice([0, 1, 2])):
         row = rng.choice(rows)
-        match rng.randrange(4):
+        match rng.randrange(5):
             case 0:
                 row[rng.randrange(len(row))] = rng.choice(NO_NUMBERS)
             case 1:
@@ -369,16 +369,27 @@ def broken_text(rng):
             case 2:
                 row[rng.randrange(len(row)) :] = rng.choice([[], ["1", "2"]])
     lines = [mark.join(row) for row in rows]
-    for _ in range(rng.choice([0, 1, 2])):
-        extra = ["", "  ", "# a b", "// a", "7", " ".join(rows[0]), ";".join(rows[0]), "\0"]
+    for _ in range(rng.choice([0, 0, 1])):
+        extra = [
+            "",
+            "  ",
+            "\t",
+            "# a b",
+            "# a",
+            "// a",
+            "7",
+            " ".join(rows[0]),
+            ";".join(rows[0]),
+            "\0",
+        ]
         lines.insert(rng.randrange(len(lines)), rng.choice(extra))
-    if rng.random() < 0.3:
+    if rng.random() < 0.1:
         lines = [line.replace(".", ",") for line in lines]
     if rng.random() < 0.3:
         lines.insert(0, mark.join(["x", "y", "z", "a", "b", "c", "d"][:num_columns]))
     data = rng.choice(["\n", "\n", "\r\n", "\r"]).join(lines).encode()
     data = rng.choice([b"", b"", b"\xef\xbb\xbf"]) + data
-    match rng.randrange(4):
+    match rng.randrange(6):
         case 0:
             data = data[: rng.randrange(1, len(data))]
         case 1:
