@@ -198,7 +198,7 @@ def read_matrix(path: Path) -> Tensor:
     if [len(row) for row in rows] != [4] * 4:
         widths = ", ".join(str(len(row)) for row in rows[:5]) or "no"
         raise FormatError(
-            f"{path}: expected 4 rows of 4 numbers, a pose, got {len(rows)} rows of {widths} "
+            f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows of {widths} "
             "numbers; fetch the file again."
         )
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)

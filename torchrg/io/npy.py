@@ -209,8 +209,7 @@ def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
     if values.shape[: len(shape)] != shape:
         rows = " x ".join(map(str, shape))
         raise FormatError(
-            f"{path}: expected {rows} rows, as coord.npy has, got shape {values.shape}; write both "
-            "from the same points."
+            f"{path}: expected {rows} rows, got shape {values.shape}; write it of the same points."
         )
 
 
