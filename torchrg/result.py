@@ -17,13 +17,19 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ShapeError
-from torchrg.io import read_cloud
+from torchrg.io import atomic_path, read_cloud
 from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
-from torchrg.plane_table import Arrays, arrays_of_description, planes_from_arrays
+from torchrg.plane_table import (
+    Arrays,
+    Json,
+    arrays_of_description,
+    encode_csv,
+    planes_from_arrays,
+)
 from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
@@ -256,6 +262,14 @@ class Result:
         if plane is None or len(plane) != labels.max() + 1:
             plane = main_planes(labels, self.labels)
         return Superpoints(labels, plane, tuple(levels))
+
+
+def write_table(path: Path, described: Json) -> None:
+    """Write what :func:`describe_planes` described, as JSON or CSV by its suffix."""
+    is_json = path.suffix.lower() == ".json"
+    content = json.dumps(described, indent=1).encode() if is_json else encode_csv(described)
+    with atomic_path(path) as beside:
+        beside.write_bytes(content)
 
 
 def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
