@@ -188,7 +188,7 @@ class Result:
     def planes(self) -> Planes | None:
         """The plane table; None without labels.
 
-        Of a result it is :attr:`table`. What that lacks, for labels from elsewhere all of it, for
+        Of a result it is ``table``. What that lacks, for labels from elsewhere all of it, for
         images which planes meet, is found once, from the labels.
         """
         table = self.table
@@ -280,10 +280,10 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         columns: As of :func:`torchrg.read_cloud`.
 
     Returns:
-        The cloud and what is known about it: ``.npz`` files hold all of a result, folders all but
+        The cloud and what is known about it. ``.npz`` files hold all of a result, folders all but
         the masks, other files what :func:`torchrg.write_cloud` puts beside each point. A plane
         table that is not of the labels, as somebody changed them since, is left out, and
-        :attr:`Cloud.notes` says so.
+        ``notes`` of the cloud say so.
 
     Raises:
         FormatError: If there is no such file, or it is damaged; see :func:`torchrg.read_cloud`.

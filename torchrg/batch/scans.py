@@ -112,7 +112,7 @@ class Source:
 
     @property
     def in_place(self) -> bool:
-        """Whether results may go into :attr:`root` itself."""
+        """Whether results may go into ``root`` itself."""
         return False
 
     def describe(self) -> Record:
