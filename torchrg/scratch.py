@@ -1,9 +1,10 @@
 """Large arrays in a file without a name, for clouds that are larger than memory.
 
-Of the memory that a point takes while its planes are found, most is in two arrays: the lists of
-neighbours and the edges. Within :func:`on_disk` these are shared maps of temporary files that are
-unlinked as soon as they are open: they leave with the process, however it ends, and nothing can be
-left behind, be locked or be damaged. Whoever reads or writes such an array does not know.
+Of the memory that a point takes while its planes are found, most is in large arrays: the lists of
+neighbours and the bits of edges. Within :func:`on_disk` these are shared maps of temporary files
+that are unlinked as soon as they are open: they leave with the process, however it ends, and
+nothing can be left behind, be locked or be damaged. Whoever reads or writes such an array does not
+know.
 """
 
 import math
@@ -25,8 +26,8 @@ from torchrg.errors import FormatError
 
 _LEAST_BYTES = 2**24
 """Bytes of the smallest array that goes to the disk; all smaller ones together are few."""
-BYTES_PER_NEIGHBOR = 9
-"""Bytes that a neighbour of a point takes at most: four in its list, and an edge with a mark."""
+BYTES_PER_NEIGHBOR = 5
+"""Bytes that a neighbour of a point takes: four in its list, and two bits for the edge to it."""
 _RELEASE_SECONDS = 0.01
 """How often pages go back to the system. In that time some 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
@@ -44,7 +45,7 @@ def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep large arrays on the disk of a folder: results are the same, and memory is bounded.
 
     Segmenting a cloud then takes about 150 bytes of memory a point, beside pages of the files that
-    the system has not yet taken back, and up to nine bytes of disk for each neighbour of a point.
+    the system has not yet taken back, and some five bytes of disk for each neighbour of a point.
     Inside a result there is no such array, so it can be used afterwards. The folder should be on a
     disk, as some ``/tmp`` is not.
 
