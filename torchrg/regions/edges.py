@@ -87,7 +87,7 @@ def mark_edges(
             _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
 
     map_chunks(mark, num_points, chunk_size, cloud.points.device)
-    bits, of_seeds = (torch.from_numpy(part.view(np.int64)) for part in (joins, seeds))
+    bits, of_seeds = (torch.from_numpy(flags.view(np.int64)) for flags in (joins, seeds))
     return bits, None if free else of_seeds
 
 
@@ -198,9 +198,9 @@ def within_angle(
     near: Neighbors, rows: Tensor, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
 ) -> Tensor:
     """Tell which neighbours' normals ``(3, N)`` are within an angle of the point's, eq. (8)."""
-    own = [column[rows][:, None] for column in normals.unbind()]
+    ours = [column[rows][:, None] for column in normals.unbind()]
     theirs = [near.of(column) for column in normals.unbind()]
-    return sq_chords(own, theirs, signed=signed) <= max_sq_chord
+    return sq_chords(ours, theirs, signed=signed) <= max_sq_chord
 
 
 def within_distance(
@@ -218,13 +218,13 @@ def on_planes(
     near: Neighbors, rows: Tensor, points: Tensor, normals: Tensor, reach: Tensor
 ) -> Tensor:
     """Tell which neighbours are within reach ``(N,)`` of the point's plane, and it of theirs."""
-    own = theirs = points.new_zeros(())
+    ours = theirs = points.new_zeros(())
     for place, normal in zip(points.unbind(), normals.unbind(), strict=True):
         away = near.of(place) - place[rows][:, None]
-        own = (away * normal[rows][:, None]).add_(own)
+        ours = (away * normal[rows][:, None]).add_(ours)
         theirs = away.mul_(near.of(normal)).add_(theirs)
-    on_own = own.abs_() <= reach[rows][:, None]
-    return on_own & (theirs.abs_() <= near.of(reach))
+    on_ours = ours.abs_() <= reach[rows][:, None]
+    return on_ours & (theirs.abs_() <= near.of(reach))
 
 
 def are_coplanar(

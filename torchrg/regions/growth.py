@@ -245,18 +245,18 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
         return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
     sizes = np.bincount(old[old >= 0], minlength=len(old))
-    kept = np.flatnonzero(sizes >= max(min_size, 1))
-    sizes = sizes[kept]
+    large = np.flatnonzero(sizes >= max(min_size, 1))
+    sizes = sizes[large]
     # The last entry is what -1 finds.
     numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
-    numbers[kept] = np.arange(len(kept))
+    numbers[large] = np.arange(len(large))
     numbered = numbers[old]
-    firsts = np.full(len(kept) + 1, len(old))
+    firsts = np.full(len(large) + 1, len(old))
     for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
         firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
     order = np.lexsort((firsts[:-1], -sizes))
-    ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
-    ranks[order] = np.arange(len(kept))
+    ranks = np.full(len(large) + 1, UNLABELED, dtype=np.int64)
+    ranks[order] = np.arange(len(large))
     return torch.from_numpy(ranks[numbered]).to(regions.device)
 
 
@@ -277,7 +277,7 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     late = promotes_late(config)
     if kernels.serve(indices, masked, cloud.valid, cloud.curvature):
         return kernels.call("grow_regions", *edges, order, late)[0]
-    arrays = [None if part is None else part.cpu().numpy() for part in (*edges, order)]
+    arrays = [None if values is None else values.cpu().numpy() for values in (*edges, order)]
     return torch.from_numpy(grow_first_in_first_out(*arrays, late=late)).to(indices.device)
 
 

@@ -88,5 +88,5 @@ class SharedNeighbors:
         # What is no member falls into the last column.
         occurs.scatter_(1, torch.where(counted, columns, len(members)), 1.0)
         occurs = occurs[:, :-1]
-        own = torch.searchsorted(members, torch.arange(start, stop, device=members.device))
-        return (occurs[own] @ occurs.T).gather(1, places)
+        rows = torch.searchsorted(members, torch.arange(start, stop, device=members.device))
+        return (occurs[rows] @ occurs.T).gather(1, places)
