@@ -132,8 +132,8 @@ def estimate_normals(
     check_points("estimate_normals", tensor)
     warn_of_steps("estimate_normals", tensor)
     changes = {"method": method, "k": k}
-    given = {name: value for name, value in changes.items() if value is not None}
-    settings = settings_of("estimate_normals", NormalsConfig, config, given)
+    changed = {name: value for name, value in changes.items() if value is not None}
+    settings = settings_of("estimate_normals", NormalsConfig, config, changed)
     estimate = ESTIMATORS[settings.method]
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():
         names = ", ".join(sorted(ESTIMATORS.keys() - WITHOUT_GRADIENT))
@@ -151,4 +151,4 @@ def estimate_normals(
         size = min(settings.k, len(cloud))
         neighbors = search_knn(cloud, size, max_distance=max_distance, canonical=True)
     fit = estimate(cloud, neighbors, settings, chunk_size)
-    return fit.each(lambda part: restore_rows(part, rows, len(tensor)))
+    return fit.each(lambda values: restore_rows(values, rows, len(tensor)))
