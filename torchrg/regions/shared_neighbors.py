@@ -9,7 +9,7 @@ from torchrg import kernels
 from torchrg._parallel import chunks_of, map_tasks
 from torchrg.structures import Neighbors
 
-_BLOCK_SIZE = 128
+_BLOCK_SIZE = 64
 """Points of a block: smaller ones repeat the lists around them more often, larger ones have larger
 products of matrices."""
 
@@ -58,10 +58,7 @@ class SharedNeighbors:
             return asked.clone()
         k = asked.shape[1]
         if k <= _MOST_IN_KERNEL and kernels.serve(*self._neighbors, asked, k=k):
-            try:
-                numbers = self._buffers.pop()
-            except IndexError:
-                numbers = torch.empty(len(self._neighbors.indices), dtype=torch.int32, device="cpu")
+            numbers = self._buffer()
             edges = *self._neighbors, asked, numbers, rows.start, self._min_shared
             (joined,) = kernels.call("connected", *edges)
             self._buffers.append(numbers)
@@ -79,14 +76,27 @@ class SharedNeighbors:
 
     def _count(self, start: int, stop: int) -> Tensor:
         """Return the number of common neighbours along all edges of a block, shape ``(n, K)``."""
-        near = self._neighbors.at(slice(start, stop))
-        members, places = torch.unique(near.indices, return_inverse=True)
-        lists = self._neighbors.at(members.long())
-        columns = torch.searchsorted(members, lists.indices).clamp(max=len(members) - 1)
-        counted = (members[columns] == lists.indices) & lists.counted()
+        lists, numbers = self._neighbors.indices[start:stop].long(), self._buffer()
+        members = lists.flatten()
+        places = torch.arange(len(members), dtype=numbers.dtype, device=numbers.device)
+        numbers[members] = places
+        members = members[numbers[members] == places]
+        numbers[members] = places[: len(members)]
+        theirs = self._neighbors.at(members)
+        columns = numbers[theirs.indices.long()].long().clamp(max=len(members) - 1)
+        counted = (members[columns] == theirs.indices) & theirs.counted()
         occurs = torch.zeros(len(members), len(members) + 1, device=members.device)
         # What is no member falls into the last column.
         occurs.scatter_(1, torch.where(counted, columns, len(members)), 1.0)
         occurs = occurs[:, :-1]
-        rows = torch.searchsorted(members, torch.arange(start, stop, device=members.device))
-        return (occurs[rows] @ occurs.T).gather(1, places)
+        shared = (occurs[numbers[start:stop]] @ occurs.T).gather(1, numbers[lists].long())
+        self._buffers.append(numbers)
+        return shared
+
+    def _buffer(self) -> Tensor:
+        """Return room for a number of each point, of a block before if there is one."""
+        try:
+            return self._buffers.pop()
+        except IndexError:
+            indices = self._neighbors.indices
+            return torch.zeros(len(indices), dtype=torch.int32, device=indices.device)
