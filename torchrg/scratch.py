@@ -30,6 +30,8 @@ BYTES_PER_NEIGHBOR = 5
 """Bytes that a neighbour of a point takes: four in its list, and two bits for the edge to it."""
 _RELEASE_SECONDS = 0.01
 """How often pages go back to the system. In that time some 20 MB of an array are read."""
+_TIMES_AS_OFTEN = 20
+"""How much more often while reads are scattered: each brings 64 KB into memory."""
 _ZEROS = bytes(2**20)
 """What reserves a disk where the system has no call for that, as on macOS."""
 
@@ -37,7 +39,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 _folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
 _maps: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
-_lock = threading.Lock()
+_lock, _is_scattered = threading.Lock(), threading.Event()
 
 
 @contextmanager
@@ -106,9 +108,19 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
+@contextmanager
+def scattered_reads() -> Iterator[None]:
+    """Give pages back more often, as where reads are all over an array many come with each."""
+    _is_scattered.set()
+    try:
+        yield
+    finally:
+        _is_scattered.clear()
+
+
 def _release_until(is_done: threading.Event) -> None:
     """Let the system take back the pages of all maps again and again; it can read them again."""
-    while not is_done.wait(_RELEASE_SECONDS):
+    while not is_done.wait(_RELEASE_SECONDS / (_TIMES_AS_OFTEN if _is_scattered.is_set() else 1)):
         with _lock:
             maps = list(_maps)
         for memory in maps:

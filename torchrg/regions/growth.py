@@ -7,12 +7,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import (
     CHUNK_SIZE,
     ROWS_AT_ONCE,
     chunks_of,
+    return_freed_memory,
     sequential_operations,
 )
 from torchrg.config import GrowingConfig, PipelineConfig, settings_of
@@ -275,8 +276,11 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
         order = order[: int(torch.count_nonzero(growing <= limit))]
     edges = indices, joins, makes_seed, cloud.curvature <= limit, cloud.valid
     late = promotes_late(config)
+    if scratch.is_active():
+        return_freed_memory()
     if kernels.serve(indices, masked, cloud.valid, cloud.curvature):
-        return kernels.call("grow_regions", *edges, order, late)[0]
+        with scratch.scattered_reads():
+            return kernels.call("grow_regions", *edges, order, late)[0]
     arrays = [None if values is None else values.cpu().numpy() for values in (*edges, order)]
     return torch.from_numpy(grow_first_in_first_out(*arrays, late=late)).to(indices.device)
 
